@@ -1,0 +1,1 @@
+"""What leaves: a trained policy as an artefact that runs without JAX."""
