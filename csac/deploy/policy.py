@@ -8,6 +8,7 @@ import math
 import os
 import re
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -27,6 +28,22 @@ EVALUATION_POINTS = 3
 Activation = Literal["relu", "tanh"]
 Head = Literal["tanh_gaussian"]
 Which = Literal["last", "best"]
+
+
+class ActionBounds:
+    """The affine map from [-1, 1] to the environment's float32 bounds [action]."""
+
+    def __init__(self, low: np.ndarray, high: np.ndarray) -> None:
+        self._low, self._high = low, high
+        # Halved first, so that a wide range does not overflow.
+        self._half, self._centre = 0.5 * high - 0.5 * low, 0.5 * high + 0.5 * low
+
+    def scale(self, action: np.ndarray) -> np.ndarray:
+        """Return a new array of actions [..., action], clipped so that rounding does not leave the bounds."""
+        scaled = action * self._half
+        scaled += self._centre
+        np.maximum(scaled, self._low, out=scaled)
+        return np.minimum(scaled, self._high, out=scaled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +95,7 @@ class Contract:
 
     def to_environment(self, action: np.ndarray) -> np.ndarray:
         """Return actions of [-1, 1], [..., action], on the environment's scale: float32 [..., *action_shape]."""
-        low, high = self.action_low, self.action_high
-        # Halved first, so that a wide range does not overflow; clipped, so that rounding does not leave the box.
-        scaled = action * (0.5 * high - 0.5 * low) + (0.5 * high + 0.5 * low)
-        scaled = np.minimum(np.maximum(scaled, low, out=scaled), high, out=scaled)
-        return scaled.reshape(action.shape[:-1] + self.action_shape)
+        return self._bounds.scale(action).reshape(action.shape[:-1] + self.action_shape)
 
     def save(self, path: str | Path) -> None:
         """Write the contract as JSON, whole or not at all."""
@@ -115,6 +128,10 @@ class Contract:
         except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else error
             raise InputError(f"{path} is not a policy contract ({reason}): restore it from a copy") from error
+
+    @cached_property
+    def _bounds(self) -> ActionBounds:
+        return ActionBounds(self.action_low, self.action_high)
 
     def _flatten_dict(self, observation: Mapping[str | None, Any]) -> np.ndarray:
         if set(observation) != {key for key, _ in self.observation_parts}:
