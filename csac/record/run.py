@@ -1,0 +1,216 @@
+"""A run directory: its manifest, its tables, its log. The manifest is whole or absent, whenever the run is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from csac.record.tables import COLUMNS, append_rows, read_rows, structured
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+__all__ = ["RunDirectory", "Table", "default_directory", "find_runs", "read_rows", "write_atomically"]
+
+Table = Literal["evaluations", "episodes", "metrics"]
+
+SCHEMA_VERSION = 1
+MANIFEST = "manifest.json"
+REQUIRED_FIELDS: dict[str, type] = {
+    "task": str,
+    "algorithm": str,
+    "seeds": list,
+    "steps": int,
+    "state": str,
+    "steps_done": int,
+    "failures": dict,
+    "history": list,
+    "created": str,
+}
+
+
+class RunDirectory:
+    """One run on disk. `manifest` holds plain JSON values, so the keys of `failures` are strings."""
+
+    def __init__(self, path: Path, manifest: dict[str, Any]):
+        self.path = path
+        self.manifest = manifest
+
+    def __repr__(self) -> str:
+        return f"RunDirectory({str(self.path)!r})"
+
+    @classmethod
+    def create(cls, path: str | Path, manifest: Mapping[str, Any]) -> RunDirectory:
+        """Start a run in a new or empty directory.
+
+        Fills in `schema_version` and, where not given, `created`, `state`, `steps_done`, `failures` and `history`.
+        Raises InputError, and leaves no trace, where `path` holds a run, holds anything else, or cannot be written.
+        """
+        path = Path(path)
+        created = datetime.now().astimezone().isoformat(timespec="seconds")
+        progress = {"state": "running", "steps_done": 0, "failures": {}, "history": [], "created": created}
+        complete = _as_json({**progress, **manifest, "schema_version": SCHEMA_VERSION})
+        try:
+            _claim(path, complete)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise InputError(f"cannot write to {path}: {reason}; choose another directory") from None
+        return cls(path, complete)
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunDirectory:
+        """Open a run that exists. Raises InputError where there is none or its manifest is broken."""
+        path = Path(path)
+        try:
+            manifest = json.loads((path / MANIFEST).read_bytes())
+        except (FileNotFoundError, NotADirectoryError):
+            what = "holds no run" if path.exists() else "does not exist"
+            raise InputError(f"{path} {what}; give a run directory ('csac runs' lists them)") from None
+        except OSError as error:
+            raise InputError(f"cannot read {path / MANIFEST}: {error.strerror}; check its permissions") from None
+        except ValueError:
+            raise InputError(f"{path / MANIFEST} is broken: it is not JSON; restore it or train again") from None
+        if problem := _manifest_problem(manifest):
+            raise InputError(f"{path / MANIFEST} is broken: {problem}; restore it or train again")
+        return cls(path, manifest)
+
+    def update_manifest(self, **changes: Any) -> None:
+        """Change fields of the manifest, on disk and in `manifest`, at one stroke."""
+        manifest = _as_json({**self.manifest, **changes})
+        write_atomically(self.path / MANIFEST, _encode(manifest))
+        self.manifest = manifest
+
+    def append(self, name: Table, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Add rows to `<name>.csv`, flushed on return; the first rows written fix its columns (see `append_rows`)."""
+        append_rows(self._table(name), COLUMNS[name], rows)
+
+    def rows(self, name: Table) -> np.ndarray:
+        """Every row of `<name>.csv` as a structured array; an empty one where nothing was written yet."""
+        path = self._table(name)
+        return read_rows(path) if path.exists() else structured(COLUMNS[name], [])
+
+    @property
+    def evaluations(self) -> np.ndarray:
+        """The rows of evaluations.csv: one per evaluation episode, in the order written."""
+        return self.rows("evaluations")
+
+    def log(self, line: str) -> None:
+        """Add one line to log.txt."""
+        with open(self.path / "log.txt", "a", encoding="utf-8") as file:
+            file.write(line.rstrip("\n") + "\n")
+
+    def _table(self, name: Table) -> Path:
+        return self.path / f"{name}.csv"
+
+
+def find_runs(directory: str | Path) -> list[RunDirectory]:
+    """Every readable run in `directory` and below, sorted by path. Raises InputError where there is no directory."""
+    directory = Path(directory)
+    if not directory.is_dir():
+        raise InputError(f"there is no directory {directory}; give one that holds runs")
+    runs = []
+    for folder, below, files in os.walk(directory):
+        if MANIFEST in files:
+            with suppress(InputError):
+                runs.append(RunDirectory.open(folder))
+                below.clear()
+    return sorted(runs, key=lambda run: run.path)
+
+
+def default_directory(task_name: str, algorithm: str) -> Path:
+    """Name a fresh run directory, `runs/<task>/<algorithm>/<date-time>`; it is not created."""
+    moment = datetime.now().strftime("%Y%m%d-%H%M%S")
+    first = Path("runs", task_name.replace("/", "-"), algorithm, moment)
+    path, number = first, 1
+    while path.exists():
+        number += 1
+        path = first.with_name(f"{moment}-{number}")
+    return path
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write beside `path`, sync, rename: a reader meets the old file or the whole new one, never a part."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with open(aside, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def _claim(path: Path, manifest: dict[str, Any]) -> None:
+    """Make `path` a run, or raise and leave it as it was."""
+    _refuse_occupied(path)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    claimed = False
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        # Of two processes that found the same empty directory, only one gets past this line.
+        (path / MANIFEST).touch(exist_ok=False)
+        claimed = True
+        write_atomically(path / MANIFEST, _encode(manifest))
+    except FileExistsError:
+        _refuse_occupied(path)
+        raise
+    except BaseException:
+        if claimed:
+            (path / MANIFEST).unlink(missing_ok=True)
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
+
+
+def _refuse_occupied(path: Path) -> None:
+    if (path / MANIFEST).exists():
+        raise InputError(f"{path} already holds a run; type 'csac resume {path}' or choose another directory")
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path} is a file; choose another directory")
+    if path.exists() and any(path.iterdir()):
+        raise InputError(f"{path} is not empty and holds no run; choose a new or an empty directory")
+
+
+def _as_json(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Return what reading the written manifest gives back; refuse what could not be opened again."""
+    try:
+        plain = json.loads(json.dumps(manifest, default=_plain))
+    except TypeError as error:
+        raise InputError(f"the manifest cannot hold this: {error}; use numbers, strings, lists and dicts") from None
+    if problem := _manifest_problem(plain):
+        raise ValueError(f"not a manifest: {problem}")
+    return plain
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise TypeError(f"{value!r} is a {type(value).__name__}")
+
+
+def _encode(manifest: dict[str, Any]) -> bytes:
+    return (json.dumps(manifest, indent=2) + "\n").encode()
+
+
+def _manifest_problem(manifest: Any) -> str | None:
+    if not isinstance(manifest, dict):
+        return "it is not a JSON object"
+    version = manifest.get("schema_version")
+    if version != SCHEMA_VERSION:
+        return f"its schema version is {version!r}, and this csac reads {SCHEMA_VERSION}"
+    for field, kind in REQUIRED_FIELDS.items():
+        value = manifest.get(field)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            return f"{field!r} is {value!r}, not of type {kind.__name__}"
+    return None

@@ -1,0 +1,123 @@
+"""The CSV tables of a run: appended row by row, read back as structured arrays, equal byte for byte in equal runs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import operator
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "evaluations": ("seed", "step", "episode", "return", "length", "success"),
+    "episodes": ("seed", "step", "return", "length"),
+    "metrics": ("seed", "step"),
+}
+INTEGER_COLUMNS = frozenset({"seed", "step", "episode", "length"})
+
+
+def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Add rows to the table at `path`: all of them or, on an error, none; flushed to the system on return.
+
+    The first rows written fix the header: `columns`, then whatever else they hold. A value is None (an empty cell), an
+    integer, a boolean, or a float, written with the fewest digits that give it back in its own precision. Raises
+    RuntimeError for a column that the header lacks, or a value that is no number.
+    """
+    if not rows:
+        return
+    with open(path, "ab+") as file:
+        _drop_torn_line(file)
+        file.seek(0)
+        header = next(csv.reader([file.readline().decode()]))
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        if not header:
+            header = list(dict.fromkeys([*columns, *(column for row in rows for column in row)]))
+            writer.writerow(header)
+        writer.writerows(_cells(path, header, row) for row in rows)
+        file.write(text.getvalue().encode())
+
+
+def read_rows(path: str | Path) -> np.ndarray:
+    """Read a table of a run as a structured array [row].
+
+    `seed`, `step`, `episode` and `length` are int64, every other column is float64 with NaN for an empty cell. A last
+    line without its newline was cut off by a crash and is left out. Raises InputError where the file is missing or is
+    not such a table.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}; give the CSV file of a run") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not a text file; give the CSV file of a run") from None
+    try:
+        header, *body = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))) or [[]]
+    except csv.Error as error:
+        raise InputError(f"{path} is not a CSV file ({error}); give one csac wrote") from None
+    if not header and not body:
+        return structured(COLUMNS.get(path.stem, ("seed", "step")), [])
+    if len(set(header)) < len(header) or not {"seed", "step"} <= set(header):
+        raise InputError(
+            f"{path} is not a table of a run: its header is {','.join(header)!r}; give one that csac wrote"
+        )
+    for number, cells in enumerate(body, start=2):
+        if len(cells) != len(header):
+            raise InputError(f"{path}, line {number}: {len(cells)} cells instead of {len(header)}; remove that line")
+    try:
+        return structured(header, body)
+    except ValueError as error:
+        raise InputError(f"{path} is damaged ({error}); remove the line that holds it") from None
+
+
+def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarray:
+    """Return cells as a structured array [row]; ValueError where one is not the number its column asks for."""
+    rows = np.empty(len(body), [(name, np.int64 if name in INTEGER_COLUMNS else np.float64) for name in header])
+    for index, name in enumerate(header):
+        convert = int if name in INTEGER_COLUMNS else _float
+        rows[name] = [convert(cells[index]) for cells in body]
+    return rows
+
+
+def _float(cell: str) -> float:
+    return float(cell) if cell else np.nan
+
+
+def _cells(path: Path, header: list[str], row: Mapping[str, Any]) -> list[str]:
+    if unknown := row.keys() - set(header):
+        raise RuntimeError(f"{path.name} has no column {sorted(unknown)}: the first rows written fix its columns")
+    return [_cell(path, column, row.get(column)) for column in header]
+
+
+def _cell(path: Path, column: str, value: Any) -> str:
+    if column in INTEGER_COLUMNS:
+        if value is None:
+            raise RuntimeError(f"a row for {path.name} lacks {column!r}")
+        return str(operator.index(value))
+    if value is None:
+        return ""
+    number = np.asarray(value)
+    if number.shape or number.dtype.kind not in "buif":
+        raise RuntimeError(f"{path.name}, column {column!r}: {value!r} is not a number")
+    return str(int(number)) if number.dtype.kind in "bui" else str(number[()])
+
+
+def _drop_torn_line(file: BinaryIO) -> None:
+    """Cut off what follows the last newline: a line that a crash interrupted."""
+    end = file.seek(0, os.SEEK_END)
+    if not end:
+        return
+    file.seek(end - 1)
+    if file.read(1) == b"\n":
+        return
+    file.seek(0)
+    file.truncate(file.read().rfind(b"\n") + 1)

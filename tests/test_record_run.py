@@ -1,0 +1,350 @@
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from csac.record import run as record
+from csac.record.run import RunDirectory, default_directory, find_runs, read_rows, write_atomically
+from csac.types import InputError
+
+MANIFEST = {
+    "task": "HalfCheetah-v4",
+    "algorithm": "csac",
+    "hyperparameters": {"discount": 0.99, "hidden": (256, 256)},
+    "seeds": [0, 1],
+    "steps": 1000,
+}
+
+
+def evaluation(seed: Any = 0, step=5000, episode=0, value: Any = 1.5, length=1000, success=None, **events):
+    return {
+        "seed": seed,
+        "step": step,
+        "episode": episode,
+        "return": value,
+        "length": length,
+        "success": success,
+        **events,
+    }
+
+
+def everything_in(directory):
+    return sorted(path.relative_to(directory).as_posix() for path in directory.rglob("*"))
+
+
+@pytest.fixture
+def run(tmp_path):
+    return RunDirectory.create(tmp_path / "run", MANIFEST)
+
+
+@pytest.fixture
+def sealed_directory():
+    """An empty directory that this process may read but not write, also where the tests run as root."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o555)
+        user = os.geteuid()
+        if user == 0:
+            os.seteuid(65534)
+        yield Path(folder)
+        os.seteuid(user)
+        os.chmod(folder, 0o755)
+
+
+# The manifest
+
+
+def test_a_created_run_opens_again_with_the_same_manifest(run):
+    opened = RunDirectory.open(run.path)
+    assert opened.manifest == run.manifest
+    assert opened.manifest["hyperparameters"] == {"discount": 0.99, "hidden": [256, 256]}
+    assert [opened.manifest[field] for field in ("schema_version", "state", "steps_done")] == [1, "running", 0]
+    assert everything_in(run.path) == ["manifest.json"]
+
+
+def test_numpy_values_and_paths_become_plain_json(tmp_path):
+    extra = {"steps": np.int64(7), "seeds": np.arange(2), "command": Path("csac"), "failures": {1: "reward is nan"}}
+    run = RunDirectory.create(tmp_path / "run", {**MANIFEST, **extra})
+    written = json.loads((run.path / "manifest.json").read_text())
+    assert written == run.manifest
+    assert (written["steps"], written["seeds"], written["command"]) == (7, [0, 1], "csac")
+    assert written["failures"] == {"1": "reward is nan"}
+
+
+def test_updates_are_written_and_remembered(run):
+    run.update_manifest(state="finished", steps_done=1000)
+    assert run.manifest["state"] == "finished"
+    assert RunDirectory.open(run.path).manifest == run.manifest
+
+
+def test_an_update_that_fails_leaves_the_old_manifest(run, monkeypatch):
+    before = (run.path / "manifest.json").read_bytes()
+
+    def full_disk(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        run.update_manifest(state="finished")
+    assert run.manifest["state"] == "running"
+    assert (run.path / "manifest.json").read_bytes() == before
+    assert everything_in(run.path) == ["manifest.json"]
+
+
+def test_an_atomic_write_is_synced_before_it_takes_the_name(tmp_path, monkeypatch):
+    order = []
+    sync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda number: (order.append("sync"), sync(number)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (order.append("rename"), replace(*paths)))
+    write_atomically(tmp_path / "file", b"new")
+    assert order == ["sync", "rename"]
+    assert (tmp_path / "file").read_bytes() == b"new"
+
+
+# Where a run may be created
+
+
+def test_a_run_can_start_in_a_new_or_an_empty_directory(tmp_path):
+    (tmp_path / "empty").mkdir()
+    RunDirectory.create(tmp_path / "empty", MANIFEST)
+    RunDirectory.create(tmp_path / "deep" / "er", MANIFEST)
+    assert len(find_runs(tmp_path)) == 2
+
+
+def test_a_directory_that_holds_a_run_is_refused_and_kept(run):
+    before = (run.path / "manifest.json").read_bytes()
+    with pytest.raises(InputError, match=r"already holds a run; type 'csac resume .*run'"):
+        RunDirectory.create(run.path, {**MANIFEST, "task": "Ant-v4"})
+    assert (run.path / "manifest.json").read_bytes() == before
+
+
+def test_a_directory_that_holds_something_else_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(InputError, match="not empty and holds no run"):
+        RunDirectory.create(tmp_path, MANIFEST)
+    assert everything_in(tmp_path) == ["thesis.tex"]
+
+
+def test_a_file_is_refused_as_directory_and_as_parent(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="is a file; choose"):
+        RunDirectory.create(tmp_path / "file", MANIFEST)
+    with pytest.raises(InputError, match=r"cannot write to .*: Not a directory; choose"):
+        RunDirectory.create(tmp_path / "file" / "run", MANIFEST)
+    assert everything_in(tmp_path) == ["file"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX permissions")
+@pytest.mark.parametrize("below", ["", "run", "deep/run"])
+def test_a_read_only_directory_is_refused(sealed_directory, below):
+    with pytest.raises(InputError, match="Permission denied; choose another directory"):
+        RunDirectory.create(sealed_directory / below, MANIFEST)
+    assert everything_in(sealed_directory) == []
+
+
+def test_a_full_disk_leaves_no_trace(tmp_path, monkeypatch):
+    def full_disk(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(InputError, match="No space left on device"):
+        RunDirectory.create(tmp_path / "deep" / "run", MANIFEST)
+    assert everything_in(tmp_path) == []
+
+
+def test_of_two_runs_racing_for_a_directory_one_is_refused(tmp_path, monkeypatch):
+    look = record._refuse_occupied
+    looks = []
+
+    def look_then_lose_the_race(path):
+        look(path)
+        looks.append(path)
+        if len(looks) == 1:
+            RunDirectory.create(path, {**MANIFEST, "task": "winner"})
+
+    monkeypatch.setattr(record, "_refuse_occupied", look_then_lose_the_race)
+    with pytest.raises(InputError, match="already holds a run"):
+        RunDirectory.create(tmp_path / "run", MANIFEST)
+    assert RunDirectory.open(tmp_path / "run").manifest["task"] == "winner"
+
+
+def test_what_json_cannot_hold_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(InputError, match="is a function; use numbers"):
+        RunDirectory.create(tmp_path / "run", {**MANIFEST, "environment_arguments": {"reward": evaluation}})
+    with pytest.raises(ValueError, match="'task' is None"):
+        RunDirectory.create(tmp_path / "run", {"algorithm": "csac"})
+    assert everything_in(tmp_path) == []
+
+
+# Opening and finding
+
+
+def test_opening_where_there_is_no_run(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"nowhere does not exist; give a run directory"):
+        RunDirectory.open(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="holds no run"):
+        RunDirectory.open(tmp_path)
+    with pytest.raises(InputError, match="holds no run"):
+        RunDirectory.open(tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"", "not JSON"),
+        (b'{"task": ', "not JSON"),
+        (b"\xff\xfe", "not JSON"),
+        (b"[]", "not a JSON object"),
+        (b"{}", "schema version is None"),
+        (b'{"schema_version": 2}', "schema version is 2, and this csac reads 1"),
+        (b'{"schema_version": 1, "task": 3}', "'task' is 3, not of type str"),
+    ],
+)
+def test_a_broken_manifest_is_named(run, content, problem):
+    (run.path / "manifest.json").write_bytes(content)
+    with pytest.raises(InputError, match=f"manifest.json is broken: .*{problem}"):
+        RunDirectory.open(run.path)
+
+
+def test_runs_are_found_below_sorted_without_what_they_hold_or_what_is_not_ours(tmp_path):
+    for name in ("b/late", "a", "b/early"):
+        RunDirectory.create(tmp_path / name, MANIFEST)
+    (tmp_path / "a" / "checkpoint").mkdir()
+    (tmp_path / "a" / "checkpoint" / "manifest.json").write_bytes((tmp_path / "a" / "manifest.json").read_bytes())
+    (tmp_path / "manifest.json").write_text('{"name": "a web page"}')
+    assert [run.path for run in find_runs(tmp_path)] == [tmp_path / name for name in ("a", "b/early", "b/late")]
+    assert [run.path for run in find_runs(str(tmp_path / "a"))] == [tmp_path / "a"]
+
+
+def test_looking_for_runs_where_there_is_no_directory(tmp_path):
+    with pytest.raises(InputError, match="there is no directory"):
+        find_runs(tmp_path / "nowhere")
+
+
+def test_the_default_directory_is_always_a_fresh_one(tmp_path, monkeypatch):
+    class Noon(record.datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return cls(2024, 5, 6, 12, 30, 59)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(record, "datetime", Noon)
+    taken = []
+    for _ in range(3):
+        taken.append(default_directory("PyFlyt/QuadX-Waypoints-v1", "csac"))
+        taken[-1].mkdir(parents=True)
+    folder = Path("runs/PyFlyt-QuadX-Waypoints-v1/csac")
+    assert taken == [folder / f"20240506-123059{end}" for end in ("", "-2", "-3")]
+
+
+# Tables
+
+
+def test_a_table_without_rows_has_its_columns(run):
+    assert run.evaluations.dtype.names == ("seed", "step", "episode", "return", "length", "success")
+    assert run.rows("episodes").dtype.names == ("seed", "step", "return", "length")
+    assert len(run.rows("metrics")) == 0
+    run.append("metrics", [])
+    assert not (run.path / "metrics.csv").exists()
+
+
+def test_rows_are_written_plainly_and_read_back_typed(run):
+    run.append("evaluations", [evaluation(success=True, value=np.float32(0.1), collisions=np.int32(2))])
+    run.append("evaluations", [evaluation(seed=np.int64(1), value=-1e-20), evaluation(episode=1, value=float("nan"))])
+    assert (run.path / "evaluations.csv").read_text() == (
+        "seed,step,episode,return,length,success,collisions\n"
+        "0,5000,0,0.1,1000,1,2\n"
+        "1,5000,0,-1e-20,1000,,\n"
+        "0,5000,1,nan,1000,,\n"
+    )
+    rows = run.evaluations
+    assert [rows[name].dtype.kind for name in rows.dtype.names] == list("iiififf")
+    np.testing.assert_array_equal(rows["seed"], [0, 1, 0])
+    np.testing.assert_array_equal(rows["return"], [0.1, -1e-20, np.nan])
+    np.testing.assert_array_equal(rows["success"], [1, np.nan, np.nan])
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_every_float_comes_back_exactly_in_its_own_precision(run, kind):
+    generator = np.random.default_rng(0)
+    values = (generator.normal(size=200) * 10.0 ** generator.integers(-30, 30, size=200)).astype(kind)
+    run.append("metrics", [{"seed": 0, "step": 0, "loss": value} for value in values])
+    np.testing.assert_array_equal(run.rows("metrics")["loss"].astype(kind), values)
+
+
+def test_equal_rows_give_equal_bytes_however_they_are_batched(tmp_path):
+    rows = [evaluation(step=step, episode=episode, value=step / 7) for step in (1, 2) for episode in range(3)]
+    together, apart = (RunDirectory.create(tmp_path / name, MANIFEST) for name in ("together", "apart"))
+    together.append("evaluations", rows)
+    for row in rows:
+        RunDirectory.open(apart.path).append("evaluations", [row])
+    assert (together.path / "evaluations.csv").read_bytes() == (apart.path / "evaluations.csv").read_bytes()
+
+
+def test_a_column_that_the_header_lacks_stops_the_whole_batch(run):
+    run.append("metrics", [{"seed": 0, "step": 1, "loss": 0.5}])
+    before = (run.path / "metrics.csv").read_bytes()
+    with pytest.raises(RuntimeError, match=r"metrics.csv has no column \['entropy'\]"):
+        run.append("metrics", [{"seed": 0, "step": 2, "loss": 0.5}, {"seed": 0, "step": 2, "entropy": 0.5}])
+    assert (run.path / "metrics.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("row", "error"),
+    [
+        ({"step": 1}, "lacks 'seed'"),
+        ({"seed": 0, "step": 1, "loss": "high"}, "'high' is not a number"),
+        ({"seed": 0, "step": 1, "loss": np.zeros(2)}, "is not a number"),
+    ],
+)
+def test_what_is_no_row_is_not_written(run, row, error):
+    with pytest.raises(RuntimeError, match=error):
+        run.append("metrics", [{"seed": 0, "step": 0, "loss": 1.0}, row])
+    assert len(run.rows("metrics")) == 0
+
+
+@pytest.mark.parametrize("kept", range(len(b"seed,step,loss\n0,1,0.5\n")))
+def test_a_line_cut_by_a_crash_is_left_out_and_then_overwritten(run, kept):
+    rows = [{"seed": 0, "step": 1, "loss": 0.5}, {"seed": 1, "step": 1, "loss": 0.25}]
+    run.append("metrics", rows[:1])
+    file = run.path / "metrics.csv"
+    file.write_bytes(file.read_bytes()[:kept])
+    assert len(run.rows("metrics")) == 0
+    run.append("metrics", rows)
+    assert run.rows("metrics").tolist() == [(0, 1, 0.5), (1, 1, 0.25)]
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        ("a,b\n1,2\n", "not a table of a run"),
+        ("seed,step,step\n1,2,3\n", "not a table of a run"),
+        ("\n1,2\n", "not a table of a run"),
+        ("seed,step\n1,2\n1\n", "line 3: 1 cells instead of 2"),
+        ("seed,step\n1,x\n", "damaged .*'x'"),
+        ("seed,step,loss\n1,1,low\n", "damaged .*'low'"),
+        ("seed,step\n,1\n", "damaged"),
+    ],
+)
+def test_a_damaged_table_is_refused(tmp_path, content, error):
+    (tmp_path / "metrics.csv").write_text(content)
+    with pytest.raises(InputError, match=error):
+        read_rows(tmp_path / "metrics.csv")
+
+
+def test_what_is_no_table_at_all_is_refused(tmp_path):
+    (tmp_path / "picture.csv").write_bytes(b"\x89PNG\xff\n")
+    with pytest.raises(InputError, match="not a text file"):
+        read_rows(tmp_path / "picture.csv")
+    with pytest.raises(InputError, match="No such file"):
+        read_rows(tmp_path / "none.csv")
+
+
+def test_log_lines_follow_each_other(run):
+    run.log("first")
+    run.log("second\n")
+    assert (run.path / "log.txt").read_text() == "first\nsecond\n"
