@@ -1,0 +1,109 @@
+"""Statistics over seeds: returns per evaluation point, intervals, and the paper's scores."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy import special
+
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+FEWEST_SEEDS = 5  # a bootstrap over fewer has too few distinct resamples to say anything
+
+
+class Interval(NamedTuple):
+    """A mean and the bounds of its confidence interval, NaN where there is too little to tell."""
+
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def evaluation_matrix(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `(steps [t], seeds [s], returns [s, t])`, each return the mean over that evaluation's episodes.
+
+    NaN stands where a seed was not evaluated at a step. `rows` are those of evaluations.csv.
+    """
+    steps, step_index = np.unique(rows["step"], return_inverse=True)
+    seeds, seed_index = np.unique(rows["seed"], return_inverse=True)
+    shape = (len(seeds), len(steps))
+    cell = seed_index * len(steps) + step_index
+    total = np.bincount(cell, weights=rows["return"], minlength=shape[0] * shape[1]).reshape(shape)
+    episodes = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
+    return steps, seeds, _divide(total, episodes)
+
+
+def mean_and_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
+    """Mean over seeds and its t-interval, `mean ± t(n - 1) · s / √n`, for `values` [seed, ...].
+
+    NaNs are left out. One value alone has a mean but no interval.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    present = ~np.isnan(values)
+    count = present.sum(axis=0)
+    mean = _divide(np.where(present, values, 0.0).sum(axis=0), count)
+    squares = (np.where(present, values - mean, 0.0) ** 2).sum(axis=0)
+    freedom = np.maximum(count - 1, 0)
+    quantile = special.stdtrit(np.maximum(freedom, 1), 0.5 + confidence / 2)
+    reach = quantile * np.sqrt(_divide(_divide(squares, freedom), count))
+    return Interval(mean, mean - reach, mean + reach)
+
+
+def interquartile_mean(values: np.ndarray) -> float:
+    """Mean of the middle half of all values, NaNs left out; NaN where nothing is left."""
+    values = np.asarray(values, dtype=np.float64)
+    ordered = np.sort(values[~np.isnan(values)])
+    cut = len(ordered) // 4
+    return float(ordered[cut : len(ordered) - cut].mean()) if len(ordered) else np.nan
+
+
+def stratified_bootstrap_interval(
+    scores: np.ndarray,
+    statistic: Callable[[np.ndarray], float],
+    repetitions: int = 2000,
+    seed: int = 0,
+    confidence: float = 0.95,
+) -> tuple[float, float] | None:
+    """Percentile interval of `statistic`, resampling the seeds of `scores` [seed, ...] anew for every other index.
+
+    Seeds with a NaN are left out whole; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement
+    Learning at the Edge of the Statistical Precipice".
+    """
+    scores = np.asarray(scores, dtype=np.float64)
+    scores = scores[~np.isnan(scores).any(axis=tuple(range(1, scores.ndim)))]
+    if len(scores) < FEWEST_SEEDS:
+        return None
+    generator = np.random.default_rng(seed)
+    draws = (generator.integers(len(scores), size=scores.shape) for _ in range(repetitions))
+    resampled = [statistic(np.take_along_axis(scores, draw, axis=0)) for draw in draws]
+    low, high = np.quantile(resampled, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    return float(low), float(high)
+
+
+def maximum_average_return(rows: np.ndarray) -> tuple[float, int]:
+    """Return `(value, step)`: the highest mean over seeds among the evaluation points that hold every seed.
+
+    The first such point wins a tie. Raises InputError where no point holds every seed.
+    """
+    steps, _, returns = evaluation_matrix(rows)
+    average = returns.mean(axis=0) if returns.size else np.full(len(steps), np.nan)
+    if np.isnan(average).all():
+        raise InputError("no evaluation point holds every seed yet; train for longer")
+    best = int(np.nanargmax(average))
+    return float(average[best]), int(steps[best])
+
+
+def last_evaluations(rows: np.ndarray, points: int = 3) -> dict[int, float]:
+    """Return the mean return of each seed over its own last evaluation points, `points` of them or all there are."""
+    _, seeds, returns = evaluation_matrix(rows)
+    last = (line[~np.isnan(line)][-points:] for line in returns)
+    return {int(seed): float(line.mean()) for seed, line in zip(seeds, last, strict=True) if line.size}
+
+
+def _divide(numerator: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Quotient, NaN where the count is zero; a scalar for scalars."""
+    return np.where(count > 0, numerator / np.maximum(count, 1), np.nan)[()]

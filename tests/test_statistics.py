@@ -1,0 +1,119 @@
+import numpy as np
+import pytest
+from scipy import stats
+
+from csac.record.statistics import (
+    evaluation_matrix,
+    interquartile_mean,
+    last_evaluations,
+    maximum_average_return,
+    mean_and_interval,
+    stratified_bootstrap_interval,
+)
+from csac.types import InputError
+
+
+def rows_of(*evaluations):
+    """Rows from (seed, step, return) triples."""
+    return np.array(list(evaluations), [("seed", np.int64), ("step", np.int64), ("return", np.float64)])
+
+
+def test_the_matrix_averages_episodes_and_marks_what_is_missing():
+    rows = rows_of((7, 200, 5.0), (3, 100, 1.0), (3, 100, 3.0), (7, 100, -1.0))  # seed 3 was not evaluated at 200
+    steps, seeds, returns = evaluation_matrix(rows)
+    np.testing.assert_array_equal(steps, [100, 200])
+    np.testing.assert_array_equal(seeds, [3, 7])
+    np.testing.assert_array_equal(returns, [[2.0, np.nan], [-1.0, 5.0]])
+
+
+def test_the_matrix_of_no_rows_is_empty():
+    steps, seeds, returns = evaluation_matrix(rows_of())
+    assert (len(steps), len(seeds), returns.shape) == (0, 0, (0, 0))
+
+
+def test_the_t_interval_worked_by_hand():
+    # 2, 4, 6: mean 4, s = sqrt((4 + 0 + 4) / 2) = 2, t(0.975, 2) = 4.302653, reach = 4.302653 * 2 / sqrt(3) = 4.968275
+    mean, low, high = mean_and_interval(np.array([2.0, 4.0, 6.0]))
+    assert mean == pytest.approx(4.0)
+    assert low == pytest.approx(-0.968275, abs=1e-6)
+    assert high == pytest.approx(8.968275, abs=1e-6)
+
+
+def test_two_values_have_the_cauchy_quantile():
+    # t with one degree of freedom is Cauchy: t(0.75) = tan(pi / 4) = 1; s / sqrt(2) of 0 and 2 is 1
+    assert tuple(mean_and_interval(np.array([0.0, 2.0]), confidence=0.5)) == pytest.approx((1.0, 0.0, 2.0))
+
+
+def test_intervals_go_down_the_seed_axis_and_leave_nans_out():
+    nan = np.nan
+    values = np.array([[2.0, 2.0, nan, 1.0], [4.0, 4.0, nan, nan], [6.0, 6.0, nan, nan], [nan, 8.0, nan, nan]])
+    mean, low, high = mean_and_interval(values)
+    np.testing.assert_allclose(mean, [4.0, 5.0, nan, 1.0])
+    expected = stats.t.interval(0.95, 3, loc=5.0, scale=stats.sem([2, 4, 6, 8]))
+    np.testing.assert_allclose(low, [-0.968275, expected[0], nan, nan], atol=1e-6)
+    np.testing.assert_allclose(high, [8.968275, expected[1], nan, nan], atol=1e-6)
+
+
+@pytest.mark.parametrize("count", range(1, 13))
+def test_the_interquartile_mean_is_scipys_trimmed_mean(count):
+    values = np.random.default_rng(count).normal(size=count)
+    assert interquartile_mean(values) == pytest.approx(stats.trim_mean(values, 0.25))
+
+
+def test_the_interquartile_mean_pools_all_axes_and_leaves_nans_out():
+    scores = np.array([[-1e9, 1.0, 2.0, 1e9], [3.0, 4.0, np.nan, 0.0], [9.0, np.nan, np.nan, np.nan]])
+    assert interquartile_mean(scores) == pytest.approx((1 + 2 + 3 + 4) / 4)  # of -1e9 0 | 1 2 3 4 | 9 1e9
+    assert np.isnan(interquartile_mean(np.array([np.nan])))
+
+
+def test_the_bootstrap_depends_on_its_seed_alone():
+    scores = np.random.default_rng(0).normal(size=(8, 3))
+    first = stratified_bootstrap_interval(scores, interquartile_mean, repetitions=200)
+    assert first == stratified_bootstrap_interval(scores, interquartile_mean, repetitions=200)
+    assert first != stratified_bootstrap_interval(scores, interquartile_mean, repetitions=200, seed=1)
+
+
+def test_the_bootstrap_of_a_mean_has_the_width_of_its_normal_limit():
+    scores = np.random.default_rng(0).normal(5.0, 2.0, size=400)
+    low, high = stratified_bootstrap_interval(scores, np.mean) or (0.0, 0.0)
+    reach = 1.959964 * scores.std() / np.sqrt(400)
+    assert (low, high) == pytest.approx((scores.mean() - reach, scores.mean() + reach), abs=0.1 * reach)
+
+
+def test_the_bootstrap_resamples_within_a_task_and_each_task_for_itself():
+    scores = np.stack([np.full(5, 10.0), np.arange(5.0), np.arange(5.0)], axis=1)
+    seen = []
+    stratified_bootstrap_interval(scores, lambda resampled: seen.append(resampled) or 0.0, repetitions=50)
+    assert all((resampled[:, 0] == 10.0).all() for resampled in seen)
+    assert all(set(resampled[:, 1]) <= set(range(5)) for resampled in seen)
+    assert any((resampled[:, 1] != resampled[:, 2]).any() for resampled in seen)
+
+
+def test_there_is_no_bootstrap_interval_below_five_seeds():
+    assert stratified_bootstrap_interval(np.arange(4.0), np.mean) is None
+    assert stratified_bootstrap_interval(np.array([1.0, 2.0, 3.0, 4.0, np.nan]), np.mean) is None
+    assert stratified_bootstrap_interval(np.ones(5), np.mean) == (1.0, 1.0)
+
+
+def test_the_maximum_average_return_is_of_the_mean_over_seeds():
+    # means over seeds: 5 at step 100, 6 at 200, 6 at 300; a single seed reaches 10
+    rows = rows_of((0, 100, 10.0), (1, 100, 0.0), (0, 200, 5.0), (1, 200, 7.0), (0, 300, 6.0), (1, 300, 6.0))
+    assert maximum_average_return(rows) == (6.0, 200)
+
+
+def test_the_maximum_average_return_skips_points_that_lack_a_seed():
+    rows = rows_of((0, 100, 1.0), (1, 100, 3.0), (1, 200, 50.0))
+    assert maximum_average_return(rows) == (2.0, 100)
+
+
+@pytest.mark.parametrize("rows", [rows_of(), rows_of((0, 100, 1.0), (1, 200, 2.0))])
+def test_there_is_no_maximum_without_a_complete_point(rows):
+    with pytest.raises(InputError, match="no evaluation point holds every seed"):
+        maximum_average_return(rows)
+
+
+def test_the_last_evaluations_are_each_seeds_own():
+    rows = rows_of(*((0, step, float(step)) for step in (1, 2, 3, 4)), (5, 1, 8.0), (5, 2, 6.0), (6, 1, np.nan))
+    assert last_evaluations(rows) == {0: 3.0, 5: 7.0}
+    assert last_evaluations(rows, points=1) == {0: 4.0, 5: 6.0}
+    assert last_evaluations(rows_of()) == {}
