@@ -95,6 +95,11 @@ def test_a_seed_that_ended_early_and_a_single_point_are_drawn(tmp_path, figures)
     assert [line.get_marker() for line in (first, second, point)] == ["o", "o", "o"]
 
 
+def test_an_evaluation_before_the_first_step_is_drawn(tmp_path, figures):
+    learning_curve([("csac", evaluations(seeds=2, points=1, interval=0))], tmp_path / "curve.png")
+    assert figures[0].axes[0].lines[-1].get_xdata() == [0]
+
+
 @pytest.mark.parametrize("runs", [[], [("csac", evaluations(points=0))]])
 def test_nothing_to_draw_is_said(tmp_path, figures, runs):
     learning_curve(runs, tmp_path / "curve.png", "Ant-v4")

@@ -106,7 +106,7 @@ def _dress(axes: Axes, title: str, returns: list[np.ndarray]) -> None:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, "no evaluations yet", transform=axes.transAxes, ha="center", color="#777777")
         return
-    axes.set_xlim(0, axes.dataLim.x1 * 1.015)
+    axes.set_xlim(0, max(axes.dataLim.x1, 1) * 1.015)
     axes.set_ylim(*_limits(axes, returns))
     if several:
         note = "line: mean over seeds · band: 95 % t-interval · thin: single seeds"
