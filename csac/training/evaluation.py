@@ -1,0 +1,205 @@
+"""Returns of a policy, per episode, in environments of its own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from csac.deploy.policy import Policy
+from csac.training.environments import EVALUATION_SEED, FRESH_EVALUATION_SEED, Environment, EnvironmentFailure
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from csac.training.environments import Parts, Task
+
+ROWS = 10  # of every batch that the policy sees: rounding depends on its shape
+
+
+class EvaluationFailure(RuntimeError):  # noqa: N818
+    """An evaluation environment raised, or gave what is not finite. The message names the episode and is one line."""
+
+
+class EvaluationEpisode(NamedTuple):
+    """One evaluation episode; `success` is the task's own verdict (1 or 0), or None where it gives none."""
+
+    episode: int
+    episode_return: float
+    length: int
+    success: float | None
+
+
+class Evaluator:
+    """Evaluates policies on a task, always on the same episodes: episode j is reset with `first_seed + j`.
+
+    Episodes run side by side in batches of one fixed shape, so that an episode's numbers depend neither on when the
+    others end nor on how many there are. The environments are made at the first `run` and kept.
+
+    Raises:
+        InputError: fewer than one episode.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        environment_arguments: dict[str, Any] | None = None,
+        episodes: int = 10,
+        first_seed: int = EVALUATION_SEED,
+    ) -> None:
+        _check_episodes(episodes)
+        self._task, self._environment_arguments = task, environment_arguments
+        self._episodes, self._first_seed = episodes, first_seed
+        self._environments: list[Environment] = []
+
+    def run(self, policy: Policy, deterministic: bool = True) -> list[EvaluationEpisode]:
+        """Return the episodes in order; stochastic actions draw from a generator of the episode's own seed.
+
+        Raises:
+            InputError: the policy was trained on other observations or actions, or the task cannot be made.
+            EvaluationFailure: an environment raised, or gave what is not a finite number.
+        """
+        self._make_environments()
+        _check_contract(policy, self._environments[0])
+        finished: list[EvaluationEpisode] = []
+        for first in range(0, self._episodes, ROWS):
+            episodes = range(first, min(first + ROWS, self._episodes))
+            finished += self._run_batch(policy, episodes, deterministic)
+        return finished
+
+    def close(self) -> None:
+        """Close the environments; another `run` makes new ones."""
+        for environment in self._environments:
+            environment.close()
+        self._environments = []
+
+    def _make_environments(self) -> None:
+        while len(self._environments) < min(ROWS, self._episodes):
+            self._environments.append(Environment(self._task, self._environment_arguments))
+
+    def _run_batch(self, policy: Policy, numbers: range, deterministic: bool) -> list[EvaluationEpisode]:
+        observation_size, action_size = policy.contract.spec
+        observations = np.zeros((ROWS, observation_size), np.float32)
+        noise = None if deterministic else np.zeros((ROWS, action_size), np.float32)
+        episodes = [
+            _Episode(environment, number, self._first_seed + number)
+            for environment, number in zip(self._environments, numbers, strict=False)
+        ]
+        for row, episode in enumerate(episodes):
+            observations[row] = episode.start()
+        running = list(enumerate(episodes))
+        while running:
+            if noise is not None:
+                for row, episode in running:
+                    episode.generator.standard_normal(dtype=np.float32, out=noise[row])
+            actions = policy.contract.to_environment(policy.act(observations, deterministic, noise))
+            for row, episode in running:
+                observations[row] = episode.step(actions[row])
+            running = [(row, episode) for row, episode in running if not episode.ended]
+        return [episode.result() for episode in episodes]
+
+
+class _Episode:
+    """One episode on its way."""
+
+    def __init__(self, environment: Environment, number: int, seed: int) -> None:
+        self.environment, self._number, self._seed = environment, number, seed
+        self.generator = np.random.default_rng(seed)
+        self.ended = False
+        self._return, self._length = 0.0, 0
+        self._last_info: dict[str, Any] = {}
+
+    def start(self) -> np.ndarray:
+        try:
+            return self.environment.reset(self._seed)
+        except EnvironmentFailure as error:
+            raise self._failure(error) from error
+
+    def step(self, action: np.ndarray) -> np.ndarray:
+        try:
+            observation, reward, terminated, truncated, self._last_info = self.environment.step_environment_scale(
+                action
+            )
+        except EnvironmentFailure as error:
+            raise self._failure(error) from error
+        self._return += reward
+        self._length += 1
+        self.ended = terminated or truncated
+        return observation
+
+    def result(self) -> EvaluationEpisode:
+        return EvaluationEpisode(self._number, self._return, self._length, _success(self._last_info))
+
+    def _failure(self, error: EnvironmentFailure) -> EvaluationFailure:
+        place = f"evaluation episode {self._number}, reset with seed {self._seed}, at step {self._length}"
+        return EvaluationFailure(f"{place}: {error}")
+
+
+def evaluate(
+    policy: Any,
+    task: Task,
+    episodes: int = 100,
+    first_seed: int = FRESH_EVALUATION_SEED,
+    deterministic: bool = True,
+    environment_arguments: dict[str, Any] | None = None,
+) -> np.ndarray:
+    """Return the returns [episodes] of a policy on episodes reset with `first_seed`, `first_seed + 1`, ...
+
+    `policy` is a csac `Policy`, or any object whose `predict` has Stable-Baselines3's shape: that one is given the
+    task's raw observations one at a time and answers on the task's own action scale.
+
+    Raises:
+        InputError: as `Evaluator`, or a policy without `predict`.
+        EvaluationFailure: as `Evaluator.run`.
+    """
+    if isinstance(policy, Policy):
+        evaluator = Evaluator(task, environment_arguments, episodes, first_seed)
+        try:
+            return np.array([episode.episode_return for episode in evaluator.run(policy, deterministic)])
+        finally:
+            evaluator.close()
+    if not callable(getattr(policy, "predict", None)):
+        raise InputError(f"a {type(policy).__name__} has no predict: give a policy as csac.load returns it")
+    _check_episodes(episodes)
+    environment = Environment(task, environment_arguments)
+    try:
+        played = (_Episode(environment, number, first_seed + number) for number in range(episodes))
+        return np.array([_play(policy, episode, deterministic).episode_return for episode in played])
+    finally:
+        environment.close()
+
+
+def _play(policy: Any, episode: _Episode, deterministic: bool) -> EvaluationEpisode:
+    episode.start()
+    state, start = None, np.ones(1, bool)
+    while not episode.ended:
+        action, state = policy.predict(
+            episode.environment.raw_observation, state=state, episode_start=start, deterministic=deterministic
+        )
+        episode.step(action)
+        start = np.zeros(1, bool)
+    return episode.result()
+
+
+def _check_episodes(episodes: int) -> None:
+    if episodes < 1:
+        raise InputError(f"{episodes} evaluation episodes: run at least one")
+
+
+def _check_contract(policy: Policy, environment: Environment) -> None:
+    parts = environment.contract_parts
+    known = (policy.contract.observation_parts, policy.contract.action_shape)
+    given = (parts.observation_parts, parts.action_shape)
+    if known != given:
+        raise InputError(
+            f"the policy was trained on observations {_told(known[0])} and actions {known[1]}; "
+            f"{environment.task_name} has {_told(given[0])} and {given[1]}: evaluate it on its own task"
+        )
+
+
+def _told(parts: Parts) -> str:
+    return ", ".join(str(shape) if key is None else f"{key} {shape}" for key, shape in parts)
+
+
+def _success(info: dict[str, Any]) -> float | None:
+    verdict = info.get("is_success", info.get("success"))
+    return None if verdict is None else float(np.all(verdict))
