@@ -1,0 +1,59 @@
+# `make` lists the targets. Everything that is installed goes into .venv and .tools, in this folder.
+
+PYTHON ?= $(firstword $(foreach python,python3.11 python3.12 python3.13 python3,\
+	$(shell $(python) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(python))))
+UV ?= $(or $(shell command -v uv),.tools/bin/uv)
+UV_VERSION := 0.13.8
+
+TASK ?= HalfCheetah-v4
+ALGORITHM ?= csac
+STEPS ?= 60000
+SEEDS ?= 2
+ARGS ?=
+
+SETUP := .venv/.installed
+
+define require_python
+@test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
+endef
+
+.PHONY: help setup train test check lock clean
+
+help:  ## List the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
+
+setup: $(SETUP)  ## Install csac and its exact dependencies into .venv
+	@echo "csac is ready: .venv/bin/csac --help, or make train"
+
+train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=2 STEPS=60000 ALGORITHM=csac ARGS=
+	.venv/bin/csac train $(TASK) --algorithm $(ALGORITHM) --seeds $(SEEDS) --steps $(STEPS) $(ARGS)
+
+test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
+	.venv/bin/pytest $(ARGS)
+
+check: $(SETUP)  ## Check format, lint, types and the direction of imports
+	.venv/bin/ruff format --check .
+	.venv/bin/ruff check .
+	.venv/bin/pyright
+	.venv/bin/lint-imports
+
+lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml
+	$(UV) pip compile pyproject.toml --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
+		--no-emit-index-url --no-annotate --no-header --quiet --output-file requirements.lock
+
+clean:  ## Remove .venv, .tools and caches; runs stay
+	rm -rf .venv .tools .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+
+$(SETUP): requirements.lock pyproject.toml | $(UV)
+	$(require_python)
+	@echo "Installing csac into .venv"
+	@test -x .venv/bin/python || $(UV) venv --quiet --python "$$(command -v $(PYTHON))" .venv
+	@$(UV) pip sync --quiet --python .venv/bin/python --require-hashes requirements.lock
+	@$(UV) pip install --quiet --python .venv/bin/python --no-deps --editable .
+	@touch $@
+
+.tools/bin/uv:
+	$(require_python)
+	@echo "Installing uv $(UV_VERSION) into .tools"
+	@$(PYTHON) -m venv .tools
+	@.tools/bin/python -m pip install --quiet uv==$(UV_VERSION)
