@@ -165,7 +165,7 @@ class SeedEnvironments:
     """One environment per seed, reset by itself where an episode ends, each episode with its own derived seed.
 
     A seed fails alone: where its environment raises or gives what is not finite, it is reported once and never stepped
-    again. `alive` [seed] says which seeds still step.
+    again. `alive` [seed] says which seeds still step; it turns false with the report.
 
     Raises:
         InputError: as `Environment`.
@@ -218,7 +218,14 @@ class SeedEnvironments:
         for episode in episodes:
             self._reset(episode.index)
         failures, self._failures = self._failures, []
+        for failure in failures:
+            self.alive[failure.index] = False
         return Steps(next_observation, reward, terminated, truncated, self._observation, episodes, failures)
+
+    def stop(self, index: int) -> None:
+        """Step the seed at this place in the group no more."""
+        self.alive[index] = False
+        self._rest(index)
 
     def close(self) -> None:
         """Close every environment."""
@@ -234,9 +241,11 @@ class SeedEnvironments:
         except EnvironmentFailure as error:
             self._fail(index, error)
 
-    def _fail(self, index: int, error: EnvironmentFailure) -> None:
-        self.alive[index] = False
+    def _rest(self, index: int) -> None:
         self._running = [other for other in self._running if other != index]
+
+    def _fail(self, index: int, error: EnvironmentFailure) -> None:
+        self._rest(index)
         details = "".join(traceback.format_exception(error)) if error.__cause__ else ""
         self._failures.append(Failure(index, str(error), details))
 
