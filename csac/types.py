@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import jax
-    import numpy as np
 
-    from csac.algorithms.memory import Replay
-
-    Array = jax.Array | np.ndarray
-    Metrics = Mapping[str, jax.Array]
+Array: TypeAlias = Any  # a JAX array while learning, a NumPy array in what leaves
+Metrics: TypeAlias = dict[str, Any]  # name -> scalar JAX array
 
 
 class InputError(ValueError):
@@ -59,3 +54,50 @@ class PolicyNetwork(NamedTuple):
     actor: tuple[Layer, ...]
     activation: Literal["relu", "tanh"] = "relu"
     head: Literal["tanh_gaussian"] = "tanh_gaussian"
+
+
+class Algorithm(Protocol):
+    """What the training loop asks of an algorithm: a frozen dataclass whose fields are its hyperparameters.
+
+    Every method is pure and speaks of one seed; `training` adds the seed axis.
+    """
+
+    @property
+    def name(self) -> str:
+        """The name in `ALGORITHMS`, on the command line and in the manifest."""
+        ...
+
+    @property
+    def warmup_steps(self) -> int:
+        """Environment steps with uniform random actions and no update, before learning starts."""
+        ...
+
+    @property
+    def updates_per_step(self) -> int:
+        """Calls of `update` after each environment step once the warm-up is over."""
+        ...
+
+    @property
+    def batch_size(self) -> int:
+        """Transitions that one update draws from the memory."""
+        ...
+
+    def memory(self, spec: Spec, steps: int) -> Any:
+        """Return the memory that the algorithm wants for a run of `steps` environment steps."""
+        ...
+
+    def init(self, key: jax.Array, spec: Spec) -> Any:
+        """Return the first state. No two leaves of it share a buffer, so that it can be donated."""
+        ...
+
+    def act(self, state: Any, observation: jax.Array, key: jax.Array, explore: bool) -> jax.Array:
+        """Return the action in [-1, 1] for one observation: sampled to explore, else deterministic."""
+        ...
+
+    def update(self, state: Any, batch: Transition, key: jax.Array, step: jax.Array) -> tuple[Any, Metrics]:
+        """Return the state after one update and its metrics. `step` counts the updates before this one, unbatched."""
+        ...
+
+    def policy(self, state: Any) -> PolicyNetwork:
+        """Return the deterministic policy as plain layers."""
+        ...

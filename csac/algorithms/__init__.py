@@ -1,0 +1,6 @@
+"""What is learnt. To add an algorithm, write its file and announce it here."""
+
+from csac.algorithms.csac import CSAC
+from csac.algorithms.sac import SAC
+
+ALGORITHMS = {algorithm.name: algorithm for algorithm in (CSAC, SAC)}

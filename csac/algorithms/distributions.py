@@ -1,0 +1,72 @@
+"""The tanh-Gaussian policy distribution, for one example."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+LOG_TWO = 0.6931471805599453
+HALF_LOG_TWO_PI = 0.9189385332046727
+
+# The clipping bounds of PARL, which the paper builds on; SB3 and the authors of SAC use the same.
+MINIMUM_LOG_STD, MAXIMUM_LOG_STD = -20.0, 2.0
+
+
+class TanhGaussian(NamedTuple):
+    """The distribution of tanh(u), u ~ N(mean, exp(log_std)²) (the paper's Eq. actor).
+
+    Densities are evaluated at the pre-tanh value u, never at a stored action: atanh of a saturated action is infinite.
+    """
+
+    mean: jax.Array  # [action]
+    log_std: jax.Array  # [action]
+
+    @classmethod
+    def from_output(cls, output: jax.Array) -> TanhGaussian:
+        """Read mean and log standard deviation, side by side in a network's output [2 action], and clip the latter."""
+        mean, log_std = jnp.split(output, 2)
+        return cls(mean, jnp.clip(log_std, MINIMUM_LOG_STD, MAXIMUM_LOG_STD))
+
+    def pre_tanh(self, noise: jax.Array) -> jax.Array:
+        """Return the reparameterised sample u = mean + std ξ for noise ξ ~ N(0, I) [action]; the action is tanh(u)."""
+        return self.mean + jnp.exp(self.log_std) * noise
+
+    def gaussian_log_prob(self, pre_tanh: jax.Array) -> jax.Array:
+        """Return log N(u; mean, std²), the density beneath the tanh."""
+        noise = (pre_tanh - self.mean) * jnp.exp(-self.log_std)
+        return jnp.sum(-0.5 * noise**2 - self.log_std - HALF_LOG_TWO_PI)
+
+    def log_prob(self, pre_tanh: jax.Array) -> jax.Array:
+        """Return the log-density of the action tanh(u)."""
+        return self.gaussian_log_prob(pre_tanh) - jnp.sum(log_tanh_derivative(pre_tanh))
+
+    def mode(self) -> jax.Array:
+        """Return tanh(mean), the deterministic action."""
+        return jnp.tanh(self.mean)
+
+
+def log_tanh_derivative(pre_tanh: jax.Array) -> jax.Array:
+    """Return log(1 - tanh²u) elementwise, without the cancellation of the direct formula."""
+    return 2.0 * (LOG_TWO - pre_tanh - jax.nn.softplus(-2.0 * pre_tanh))
+
+
+def log_ratio(policy: TanhGaussian, reference: TanhGaussian, pre_tanh: jax.Array) -> jax.Array:
+    """Return log π(a) - log π̃(a) at a = tanh(u). The tanh is common to both, so its Jacobian cancels."""
+    return policy.gaussian_log_prob(pre_tanh) - reference.gaussian_log_prob(pre_tanh)
+
+
+def kl(policy: TanhGaussian, reference: TanhGaussian) -> jax.Array:
+    """Return KL(π ‖ π̃) in closed form: that of the Gaussians beneath, since tanh is invertible."""
+    log_scale = policy.log_std - reference.log_std
+    shift = (policy.mean - reference.mean) * jnp.exp(-reference.log_std)
+    return jnp.sum(0.5 * (jnp.exp(2.0 * log_scale) + shift**2 - 1.0) - log_scale)
+
+
+def policy_at(actor: Callable[[jax.Array], jax.Array], observation: jax.Array) -> TanhGaussian:
+    """Return the distribution that an actor network gives at one observation."""
+    return TanhGaussian.from_output(actor(observation))

@@ -1,0 +1,63 @@
+"""The ranges that hyperparameters may take, said once for every algorithm."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
+
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Limit = tuple["Callable[[Any], bool]", str]
+
+POSITIVE: Limit = (lambda value: value > 0, "more than 0")
+NOT_NEGATIVE: Limit = (lambda value: value >= 0, "0 or more")
+COUNT: Limit = (lambda value: value >= 1, "at least 1")
+RATE: Limit = (lambda value: 0 < value <= 1, "more than 0 and at most 1")
+WIDTHS: Limit = (lambda value: all(isinstance(width, int) and width >= 1 for width in value), "widths of at least 1")
+
+LIMITS: dict[str, Limit] = {
+    "entropy_weight": NOT_NEGATIVE,
+    "relative_entropy_weight": NOT_NEGATIVE,
+    "reference_period": COUNT,
+    "reference_rate": RATE,
+    "discount": (lambda value: 0 <= value < 1, "at least 0 and less than 1"),
+    "target_rate": RATE,
+    "actor_learning_rate": POSITIVE,
+    "critic_learning_rate": POSITIVE,
+    "temperature_learning_rate": POSITIVE,
+    "actor_hidden_sizes": WIDTHS,
+    "critic_hidden_sizes": WIDTHS,
+    "batch_size": COUNT,
+    "replay_size": COUNT,
+    "warmup_steps": NOT_NEGATIVE,
+    "updates_per_step": COUNT,
+    "max_gradient_norm": NOT_NEGATIVE,
+}
+
+
+def check_hyperparameters(algorithm: Any) -> None:
+    """Refuse a value outside its range or its choices.
+
+    Raises:
+        InputError: the first such field, its value and what it may be.
+    """
+    hints = get_type_hints(type(algorithm))
+    for field in dataclasses.fields(algorithm):
+        value = getattr(algorithm, field.name)
+        if get_origin(hints[field.name]) is Literal and value not in get_args(hints[field.name]):
+            raise InputError(f"{field.name} must be one of {', '.join(get_args(hints[field.name]))}, not {value!r}")
+        if hints[field.name] is int and (isinstance(value, bool) or not isinstance(value, int)):
+            raise InputError(f"{field.name} must be a whole number, not {value!r}")
+        if hints[field.name] in (float, float | None) and value is not None and not _is_finite(value):
+            raise InputError(f"{field.name} must be a finite number, not {value!r}")
+        accepts, words = LIMITS.get(field.name, (lambda _: True, ""))
+        if not accepts(value):
+            raise InputError(f"{field.name} must be {words}, not {value!r}")
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

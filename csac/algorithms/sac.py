@@ -1,0 +1,198 @@
+"""Soft Actor-Critic (Haarnoja et al. 2018), with the automatic temperature of its second paper or a fixed one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from csac.algorithms.distributions import policy_at
+from csac.algorithms.hyperparameters import check_hyperparameters
+from csac.algorithms.memory import Replay
+from csac.algorithms.networks import (
+    MLP,
+    begin_descent,
+    copy_tree,
+    descend,
+    make_critics,
+    make_mlp,
+    make_optimiser,
+    polyak,
+    q_values,
+)
+from csac.types import InputError, Metrics, PolicyNetwork, Spec, Transition
+
+
+class State(NamedTuple):
+    """Everything that one seed of SAC learns."""
+
+    actor: MLP
+    critics: tuple[MLP, MLP]
+    target_critics: tuple[MLP, MLP]
+    log_temperature: jax.Array  # []
+    actor_optimiser: Any
+    critic_optimiser: Any
+    temperature_optimiser: Any
+
+
+@dataclass(frozen=True)
+class SAC:
+    """Soft Actor-Critic."""
+
+    temperature: Literal["automatic", "fixed"] = "automatic"
+    """Whether the entropy's weight is learnt, to hold the policy's entropy at its target, or stays as it starts."""
+    entropy_weight: float = 1.0
+    """Weight of the entropy, to begin with or throughout (SAC's alpha, the paper's sigma)."""
+    target_entropy: float | None = None
+    """Entropy that the automatic temperature aims at, in nats; by default minus the number of action dimensions."""
+    discount: float = 0.99
+    """Discount factor (gamma)."""
+    target_rate: float = 0.005
+    """Soft update rate of the target critics (the paper's rho)."""
+    actor_learning_rate: float = 3e-4
+    """Learning rate of the actor."""
+    critic_learning_rate: float = 3e-4
+    """Learning rate of the critics."""
+    temperature_learning_rate: float = 3e-4
+    """Learning rate of the automatic temperature."""
+    actor_hidden_sizes: tuple[int, ...] = (256, 256)
+    """Widths of the actor's hidden layers."""
+    critic_hidden_sizes: tuple[int, ...] = (256, 256)
+    """Widths of each critic's hidden layers."""
+    batch_size: int = 256
+    """Transitions in one update."""
+    replay_size: int = 1_000_000
+    """Transitions that the replay keeps."""
+    warmup_steps: int = 10_000
+    """Environment steps with uniform random actions before learning starts."""
+    updates_per_step: int = 1
+    """Updates after each environment step."""
+    max_gradient_norm: float = 0.0
+    """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
+
+    name: ClassVar[str] = "sac"
+
+    def __post_init__(self) -> None:
+        check_hyperparameters(self)
+        if self.temperature == "automatic" and self.entropy_weight == 0:
+            raise InputError("entropy_weight must be more than 0 to begin an automatic temperature")
+
+    def memory(self, spec: Spec, steps: int) -> Replay:
+        """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
+        return Replay.create(min(self.replay_size, steps), spec)
+
+    def init(self, key: jax.Array, spec: Spec) -> State:
+        """Return random networks; the targets are copies."""
+        actor_key, critics_key = jax.random.split(key)
+        actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, 2 * spec.action_size)
+        critics = make_critics(critics_key, *spec, self.critic_hidden_sizes)
+        log_temperature = jnp.log(jnp.float32(self.entropy_weight))
+        return State(
+            actor=actor,
+            critics=critics,
+            target_critics=copy_tree(critics),
+            log_temperature=log_temperature,
+            actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
+            critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
+            temperature_optimiser=begin_descent(self._optimiser(self.temperature_learning_rate), log_temperature),
+        )
+
+    def act(self, state: State, observation: jax.Array, key: jax.Array, explore: bool) -> jax.Array:
+        """Return a sampled action to explore, else tanh(mean)."""
+        policy = policy_at(state.actor, observation)
+        return jnp.tanh(policy.pre_tanh(jax.random.normal(key, policy.mean.shape))) if explore else policy.mode()
+
+    def critic_target(
+        self,
+        actor: MLP,
+        target_critics: tuple[MLP, MLP],
+        temperature: jax.Array,
+        transition: Transition,
+        noise: jax.Array,
+    ) -> jax.Array:
+        """Return r + γ [min Q(s', a') - α log π(a'|s')] with a' = tanh(mean + std noise) (SAC, Eq. 3)."""
+        policy = policy_at(actor, transition.next_observation)
+        pre_tanh = policy.pre_tanh(noise)
+        q_value = jnp.minimum(*q_values(target_critics, transition.next_observation, jnp.tanh(pre_tanh)))
+        value = q_value - temperature * policy.log_prob(pre_tanh)
+        return transition.reward + self.discount * (1.0 - transition.terminated) * value
+
+    def actor_loss(
+        self, actor: MLP, critics: tuple[MLP, MLP], temperature: jax.Array, observation: jax.Array, noise: jax.Array
+    ) -> tuple[jax.Array, Metrics]:
+        """Return α log π - min Q at the reparameterised action (SAC, Eq. 9), and what to log."""
+        policy = policy_at(actor, observation)
+        pre_tanh = policy.pre_tanh(noise)
+        q_value = jnp.minimum(*q_values(critics, observation, jnp.tanh(pre_tanh)))
+        log_prob = policy.log_prob(pre_tanh)
+        return temperature * log_prob - q_value, {"q_mean": q_value, "entropy": -log_prob}
+
+    def temperature_loss(self, log_temperature: jax.Array, entropy: jax.Array, target_entropy: float) -> jax.Array:
+        """Return log α (entropy - target): SAC's Eq. 18 with log α for α, the form that everyone runs."""
+        return log_temperature * (entropy - target_entropy)
+
+    def update(self, state: State, batch: Transition, key: jax.Array, step: jax.Array) -> tuple[State, Metrics]:
+        """Take one gradient step on the critics, the actor and the temperature, then move the target critics."""
+        target_key, actor_key = jax.random.split(key)
+        target_noise = jax.random.normal(target_key, batch.action.shape)
+        actor_noise = jax.random.normal(actor_key, batch.action.shape)
+        temperature = jnp.exp(state.log_temperature)
+
+        targets = jax.vmap(self.critic_target, in_axes=(None, None, None, 0, 0))(
+            state.actor, state.target_critics, temperature, batch, target_noise
+        )
+
+        def critics_loss(critics: tuple[MLP, MLP]) -> tuple[jax.Array, Metrics]:
+            loss = jnp.mean(jax.vmap(critic_loss, in_axes=(None, 0, 0))(critics, batch, targets))
+            return loss, {"critic_loss": loss}
+
+        critics, critic_optimiser, critic_metrics = descend(
+            self._optimiser(self.critic_learning_rate), critics_loss, state.critics, state.critic_optimiser
+        )
+
+        def actor_loss(actor: MLP) -> tuple[jax.Array, Metrics]:
+            losses, metrics = jax.vmap(self.actor_loss, in_axes=(None, None, None, 0, 0))(
+                actor, critics, temperature, batch.observation, actor_noise
+            )
+            return jnp.mean(losses), jax.tree.map(jnp.mean, {"actor_loss": losses, **metrics})
+
+        actor, actor_optimiser, actor_metrics = descend(
+            self._optimiser(self.actor_learning_rate), actor_loss, state.actor, state.actor_optimiser
+        )
+
+        log_temperature, temperature_optimiser = state.log_temperature, state.temperature_optimiser
+        if self.temperature == "automatic":
+            target_entropy = self.target_entropy if self.target_entropy is not None else -float(batch.action.shape[-1])
+            log_temperature, temperature_optimiser, _ = descend(
+                self._optimiser(self.temperature_learning_rate),
+                lambda log: (self.temperature_loss(log, actor_metrics["entropy"], target_entropy), None),
+                log_temperature,
+                temperature_optimiser,
+            )
+
+        new_state = State(
+            actor=actor,
+            critics=critics,
+            target_critics=polyak(state.target_critics, critics, self.target_rate),
+            log_temperature=log_temperature,
+            actor_optimiser=actor_optimiser,
+            critic_optimiser=critic_optimiser,
+            temperature_optimiser=temperature_optimiser,
+        )
+        return new_state, {**critic_metrics, **actor_metrics, "temperature": temperature}
+
+    def policy(self, state: State) -> PolicyNetwork:
+        """Return the actor's layers."""
+        return PolicyNetwork(state.actor.layers)
+
+    def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
+        return make_optimiser(learning_rate, self.max_gradient_norm)
+
+
+def critic_loss(critics: tuple[MLP, MLP], transition: Transition, target: jax.Array) -> jax.Array:
+    """Return [Q₁(s, a) - y]² + [Q₂(s, a) - y]²."""
+    first, second = q_values(critics, transition.observation, transition.action)
+    return (first - target) ** 2 + (second - target) ** 2

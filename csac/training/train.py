@@ -1,0 +1,279 @@
+"""`train`: one call from a task to a run directory. The command line calls nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pickle
+import platform
+import signal
+import subprocess
+import threading
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import psutil
+
+from csac import __version__
+from csac.record.plots import learning_curve
+from csac.record.run import RunDirectory, default_directory
+from csac.training.environments import Environment, Task
+from csac.training.groups import choose_groups, run_groups, split_seeds
+from csac.training.logs import TensorBoardLog
+from csac.training.loop import Settings
+from csac.training.recorder import Recorder
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from csac.training.progress import Reporter
+    from csac.types import Algorithm, Spec
+
+    OnEvaluation = Callable[[int, dict[int, float]], Any]
+    StopWhen = Callable[[int, dict[int, float]], bool]
+
+# Measured resident size of a worker process with JAX, MuJoCo and the compiled programs, before its replay.
+BYTES_PER_PROCESS = 450 * 2**20
+
+
+class Interrupted(Exception):  # noqa: N818
+    """Training was stopped by a signal; what was learnt is saved in `run`."""
+
+    def __init__(self, run: RunDirectory, signal_number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(signal_number).name}; saved in {run.path}")
+        self.run, self.signal_number = run, signal_number
+
+
+def train(
+    algorithm: Algorithm,
+    task: Task,
+    *,
+    steps: int = 1_000_000,
+    seeds: int = 1,
+    first_seed: int = 0,
+    directory: str | Path | None = None,
+    groups: int | None = 1,
+    evaluation_interval: int = 5_000,
+    evaluation_episodes: int = 10,
+    environment_arguments: dict[str, Any] | None = None,
+    device: str = "cpu",
+    preset: str | None = None,
+    tensorboard: bool = True,
+    reporter: Reporter | None = None,
+    command: str | None = None,
+    on_evaluation: OnEvaluation | None = None,
+    stop_when: StopWhen | None = None,
+) -> RunDirectory:
+    """Train `seeds` controllers for `steps` environment steps each and return the finished run.
+
+    Args:
+        algorithm: a hyperparameter dataclass such as `CSAC()`.
+        task: a Gymnasium id, `module:Id`, or a callable that makes an environment.
+        steps: environment steps per seed, warm-up included.
+        seeds: how many independent seeds; they are `first_seed`, `first_seed + 1`, ...
+        first_seed: label of the first one.
+        directory: the run directory; by default `runs/<task>/<algorithm>/<date-time>`.
+        groups: processes to split the seeds over: 1 trains in this process, None chooses by the cores. With more
+            than one, a script needs the usual `if __name__ == "__main__":` guard.
+        evaluation_interval: environment steps between evaluations; there is one at the last step as well.
+        evaluation_episodes: episodes of each evaluation.
+        environment_arguments: keyword arguments for the environment.
+        device: "cpu" or "gpu".
+        preset: the name of the preset that the hyperparameters came from, for the manifest.
+        tensorboard: whether to write TensorBoard files.
+        reporter: where progress is shown; None is silent.
+        command: the command line, for the manifest.
+        on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation.
+        stop_when: called in the same way; training ends early, and counts as finished, once it returns True.
+
+    Raises:
+        InputError: a mistake in the arguments; nothing has been written then.
+        Interrupted: on SIGINT or SIGTERM, after everything was saved.
+    """
+    environment_arguments = dict(environment_arguments or {})
+    _check(steps=steps, seeds=seeds, evaluation_interval=evaluation_interval, evaluation_episodes=evaluation_episodes)
+    if first_seed < 0:
+        raise InputError(f"first_seed must be 0 or more, not {first_seed}")
+    _choose_device(device)
+    environment = Environment(task, environment_arguments)
+    spec, task_name = environment.spec, environment.task_name
+    environment.close()
+
+    labels = list(range(first_seed, first_seed + seeds))
+    parts = split_seeds(labels, groups if groups is not None else choose_groups(seeds, device))
+    settings = Settings(algorithm, task, environment_arguments, steps, evaluation_interval, evaluation_episodes)
+    if len(parts) > 1:
+        _check_picklable(settings)
+    notes = [_memory_note(algorithm, spec, steps, seeds, len(parts)), *_warmup_note(algorithm, steps)]
+
+    path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
+    manifest = {
+        "task": task_name,
+        "environment_arguments": environment_arguments,
+        "algorithm": algorithm.name,
+        "hyperparameters": dataclasses.asdict(algorithm),  # pyright: ignore[reportArgumentType]
+        "preset": preset,
+        "seeds": labels,
+        "groups": parts,
+        "steps": steps,
+        "evaluation": {"interval": evaluation_interval, "episodes": evaluation_episodes},
+        "device": device,
+        "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()},
+        "versions": _versions(),
+        "commit": _commit(),
+        "command": command,
+        "process": os.getpid(),
+    }
+    run = RunDirectory.create(path, manifest)
+    if reporter:
+        reporter.start(task_name, algorithm.name, labels, steps, path, notes)
+    log = TensorBoardLog(path / "tensorboard", labels) if tensorboard else None
+    recorder = Recorder(run, parts, reporter, log)
+    try:
+        with _signals() as (stop, received):
+            for group, event in run_groups(settings, parts, stop.is_set):
+                recorder.handle(group, event)
+                if _tell_caller(recorder, on_evaluation, stop_when):
+                    stop.set()
+        recorder.close()
+        _finish(run, recorder, "interrupted" if received else "failed" if recorder.failures else "finished")
+        if reporter:
+            reporter.finish(run)
+    except BaseException as error:
+        recorder.close()
+        run.update_manifest(state="interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+        raise
+    finally:
+        if log:
+            log.close()
+        if reporter:
+            reporter.close()
+    if received:
+        raise Interrupted(run, received[0])
+    return run
+
+
+def _tell_caller(recorder: Recorder, on_evaluation: OnEvaluation | None, stop_when: StopWhen | None) -> bool:
+    """Call the caller's functions for each new evaluation; return whether the run is to end early."""
+    enough = False
+    while recorder.evaluated:
+        step, returns = recorder.evaluated.pop(0)
+        if on_evaluation:
+            on_evaluation(step, returns)
+        enough = bool(stop_when and stop_when(step, returns)) or enough
+    return enough
+
+
+def _finish(run: RunDirectory, recorder: Recorder, state: str) -> None:
+    rows = run.evaluations
+    if len(rows):
+        name, task = run.manifest["algorithm"].upper(), run.manifest["task"]
+        learning_curve([(name, rows)], run.path / "curve.png", title=task)
+    run.update_manifest(state=state, failures=recorder.failures)
+
+
+@contextmanager
+def _signals() -> Iterator[tuple[threading.Event, list[int]]]:
+    """Yield (a request to stop, the signals behind it). A second SIGINT or SIGTERM is taken literally.
+
+    SIGHUP is ignored: a run outlives its terminal.
+    """
+    stop, received = threading.Event(), []
+    if threading.current_thread() is not threading.main_thread():
+        yield stop, received
+        return
+
+    def note(number: int, _: Any) -> None:
+        if received:
+            raise KeyboardInterrupt
+        received.append(number)
+        stop.set()
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    if hasattr(signal, "SIGHUP"):
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        yield stop, received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _check(**counts: int) -> None:
+    for name, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise InputError(f"{name} must be a whole number of at least 1, not {count!r}")
+
+
+def _check_picklable(settings: Settings) -> None:
+    try:
+        pickle.dumps(settings)
+    except Exception as error:
+        raise InputError(
+            "the task cannot be sent to another process, which several groups need: "
+            f"make it a module's function, or train with groups=1 ({error})"
+        ) from None
+
+
+def _choose_device(device: str) -> None:
+    if device not in ("cpu", "gpu"):
+        raise InputError(f"device must be cpu or gpu, not {device!r}")
+    platform_name = "cpu" if device == "cpu" else "cuda"
+    os.environ["JAX_PLATFORMS"] = platform_name  # for the workers
+    jax.config.update("jax_platforms", platform_name)
+    if device == "gpu":
+        try:
+            jax.devices()
+        except RuntimeError:
+            raise InputError("no GPU that JAX can use: install csac[cuda], or choose --device cpu") from None
+
+
+def _memory_note(algorithm: Algorithm, spec: Spec, steps: int, seeds: int, processes: int) -> str:
+    """Return the line that predicts the memory needed; refuse what cannot fit."""
+    shapes = jax.eval_shape(
+        lambda key: (algorithm.init(key, spec), algorithm.memory(spec, steps)), jax.ShapeDtypeStruct((2,), "uint32")
+    )
+    per_seed = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
+    needed = seeds * per_seed + processes * BYTES_PER_PROCESS
+    available = psutil.virtual_memory().available
+    text = f"memory: about {needed / 2**30:.1f} GiB of the {available / 2**30:.1f} GiB available"
+    if needed > available:
+        raise InputError(
+            f"this run needs about {needed / 2**30:.1f} GiB of memory and {available / 2**30:.1f} GiB are available: "
+            f"use fewer seeds, fewer groups or a smaller replay (one seed takes {per_seed / 2**30:.2f} GiB)"
+        )
+    return f"{text} ({seeds} x {per_seed / 2**20:.0f} MiB, {processes} process{'es' if processes > 1 else ''})"
+
+
+def _warmup_note(algorithm: Algorithm, steps: int) -> list[str]:
+    if steps >= algorithm.warmup_steps:
+        return []
+    return [
+        f"note: nothing will be learnt, since all {steps:,} steps are warm-up (warmup_steps={algorithm.warmup_steps:,})"
+    ]
+
+
+def _versions() -> dict[str, str]:
+    versions = {"csac": __version__, "python": platform.python_version()}
+    for package in ("jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+def _commit() -> str | None:
+    """Return the commit of csac's own checkout, if it runs from one."""
+    try:
+        folder = Path(__file__).parent
+        result = subprocess.run(
+            ["git", "-C", folder, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return result.stdout.strip() or None
