@@ -1,0 +1,52 @@
+"""Conservative Soft Actor-Critic and its baselines in JAX.
+
+    from csac import CSAC, train, evaluate, load
+
+    run = train(CSAC(), "HalfCheetah-v4", steps=60_000, seeds=2, directory="runs/cheetah")
+    policy = load("runs/cheetah")
+    returns = evaluate(policy, "HalfCheetah-v4", episodes=100)
+
+The names are resolved on first use: importing csac imports neither JAX nor Gymnasium.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from csac.algorithms.csac import CSAC
+    from csac.algorithms.sac import SAC
+    from csac.deploy.policy import Policy, load
+    from csac.training.evaluation import evaluate
+    from csac.training.train import train
+    from csac.types import InputError
+
+    __version__: str
+
+__all__ = ["CSAC", "SAC", "InputError", "Policy", "__version__", "evaluate", "load", "train"]
+
+_MODULES = {
+    "CSAC": "csac.algorithms.csac",
+    "SAC": "csac.algorithms.sac",
+    "InputError": "csac.types",
+    "Policy": "csac.deploy.policy",
+    "evaluate": "csac.training.evaluation",
+    "load": "csac.deploy.policy",
+    "train": "csac.training.train",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        value = import_module("importlib.metadata").version("csac")
+    elif name in _MODULES:
+        value = getattr(import_module(_MODULES[name]), name)
+    else:
+        raise AttributeError(f"module 'csac' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

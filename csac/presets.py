@@ -1,0 +1,67 @@
+"""Presets as data: (preset, algorithm, task) -> hyperparameters. `paper` is the paper's tables."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+# The paper's "Common hyper-parameter settings of compared approaches": its columns CSAC and SAC are equal.
+_PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
+    {
+        "actor_learning_rate": 3e-4,
+        "critic_learning_rate": 3e-4,
+        "actor_hidden_sizes": (256, 256),
+        "critic_hidden_sizes": (256, 256),
+        "target_rate": 0.005,
+        "batch_size": 256,
+        "replay_size": 1_000_000,
+        "warmup_steps": 10_000,
+        "discount": 0.99,
+        # Not in the table, but in the equations and in Algorithm 1: one update per step, no clipping.
+        "updates_per_step": 1,
+        "max_gradient_norm": 0.0,
+    }
+)
+
+_PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        # "For CSAC, sigma was set to 0.2 and tau to 0.5 across all MuJoCo tasks"; Algorithm 1 for the reference policy.
+        "csac": {
+            **_PAPER_COMMON,
+            "entropy_weight": 0.2,
+            "relative_entropy_weight": 0.5,
+            "reference_policy": "algorithm1",
+            "relative_entropy_estimator": "sampled",
+        },
+        # PARL's SAC, on which the paper built: a fixed temperature.
+        "sac": {**_PAPER_COMMON, "temperature": "fixed", "entropy_weight": 0.2},
+    }
+)
+
+# The paper's "Specific hyperparameters of CSAC"; its PandaReach row equals the MuJoCo tasks' values.
+_PAPER_TASKS: Mapping[tuple[str, str], Mapping[str, Any]] = MappingProxyType(
+    {("csac", "PyFlyt/QuadX-Waypoints-v1"): {"relative_entropy_weight": 0.1}}
+)
+
+PRESETS: tuple[str, ...] = ("paper",)
+
+
+def hyperparameters(preset: str, algorithm: str, task: str) -> dict[str, Any]:
+    """Return the hyperparameters, by field name, that `preset` gives `algorithm` on `task`.
+
+    `task` is a Gymnasium id, with or without the module in front; a task that the preset does not name gets what the
+    algorithm has in common on all tasks.
+
+    Raises:
+        InputError: no such preset, or one that says nothing of the algorithm.
+    """
+    if preset not in PRESETS:
+        raise InputError(f"no preset is called {preset!r}: choose {' or '.join(PRESETS)}")
+    if algorithm not in _PAPER:
+        raise InputError(f"the preset {preset!r} has no {algorithm!r}: it has {' and '.join(_PAPER)}")
+    return {**_PAPER[algorithm], **_PAPER_TASKS.get((algorithm, task.rpartition(":")[2]), {})}

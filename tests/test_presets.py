@@ -1,0 +1,76 @@
+import dataclasses
+
+import pytest
+
+from csac import presets
+from csac.algorithms import ALGORITHMS
+from csac.types import InputError
+
+PAPER_TABLE = {
+    "actor_learning_rate": 3e-4,
+    "critic_learning_rate": 3e-4,
+    "actor_hidden_sizes": (256, 256),
+    "critic_hidden_sizes": (256, 256),
+    "target_rate": 0.005,
+    "batch_size": 256,
+    "replay_size": 1_000_000,
+    "warmup_steps": 10_000,
+    "discount": 0.99,
+}
+
+
+@pytest.mark.parametrize("algorithm", ["csac", "sac"])
+def test_paper_gives_the_papers_table(algorithm):
+    given = presets.hyperparameters("paper", algorithm, "Walker2d-v4")
+
+    assert {name: given[name] for name in PAPER_TABLE} == PAPER_TABLE
+    assert given["entropy_weight"] == 0.2
+
+
+@pytest.mark.parametrize("algorithm", sorted(ALGORITHMS))
+def test_an_algorithm_takes_what_its_preset_gives(algorithm):
+    given = presets.hyperparameters("paper", algorithm, "Walker2d-v4")
+
+    made = ALGORITHMS[algorithm](**given)
+
+    assert {name: value for name, value in dataclasses.asdict(made).items() if name in given} == given
+
+
+def test_paper_csac_is_algorithm_1_with_the_sampled_log_ratio():
+    given = presets.hyperparameters("paper", "csac", "HalfCheetah-v4")
+
+    assert given["reference_policy"] == "algorithm1"
+    assert given["relative_entropy_estimator"] == "sampled"
+
+
+def test_paper_sac_has_a_fixed_temperature():
+    assert presets.hyperparameters("paper", "sac", "HalfCheetah-v4")["temperature"] == "fixed"
+
+
+@pytest.mark.parametrize(
+    ("task", "tau"),
+    [
+        ("HalfCheetah-v4", 0.5),
+        ("PandaReach-v3", 0.5),
+        ("PyFlyt/QuadX-Waypoints-v1", 0.1),
+        ("PyFlyt.gym_envs:PyFlyt/QuadX-Waypoints-v1", 0.1),
+    ],
+)
+def test_paper_tau_depends_on_the_task(task, tau):
+    assert presets.hyperparameters("paper", "csac", task)["relative_entropy_weight"] == tau
+
+
+def test_changing_what_was_given_changes_no_preset():
+    presets.hyperparameters("paper", "csac", "Ant-v4")["discount"] = 0.0
+
+    assert presets.hyperparameters("paper", "csac", "Ant-v4")["discount"] == 0.99
+
+
+def test_an_unknown_preset_is_named_with_those_there():
+    with pytest.raises(InputError, match=r"no preset is called 'papre': choose paper"):
+        presets.hyperparameters("papre", "csac", "Ant-v4")
+
+
+def test_an_algorithm_without_the_preset_is_named():
+    with pytest.raises(InputError, match=r"'paper' has no 'dqn': it has csac and sac"):
+        presets.hyperparameters("paper", "dqn", "Ant-v4")
