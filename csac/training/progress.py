@@ -1,0 +1,336 @@
+"""What a run shows while it trains and when it is over: a live display on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import time
+from collections import deque
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+from rich import box
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from csac.record.statistics import evaluation_matrix, last_evaluations, mean_and_interval
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from rich.console import RenderableType
+
+    from csac.record.run import RunDirectory
+
+BLOCKS = "▁▂▃▄▅▆▇█"
+CURVE_WIDTH = 24
+MOST_SEEDS_SHOWN = 12  # of more, only the mean and the range are shown
+SECONDS_OF_SILENCE = 30.0
+SPEED_WINDOW = 20.0  # seconds that the shown speed looks back
+
+
+class Reporter:
+    """Shows the progress of one run.
+
+    Args:
+        console: where to; by default a console on standard output that outlives its reader.
+        clock: seconds, for speed and time left.
+    """
+
+    def __init__(self, console: Console | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+        self.console = console or make_console()
+        self._clock = clock
+        self._live: Live | None = None
+        self._steps = 0
+        self._directory = ""
+        self._done: dict[int, int] = {}
+        self._curves: dict[int, list[float]] = {}
+        self._failed: dict[int, str] = {}
+        self._evaluated_at = 0
+        self._speed = Speed(clock)
+        self._began = self._spoke = clock()
+
+    def start(
+        self, task: str, algorithm: str, seeds: list[int], steps: int, directory: Path, notes: Sequence[str] = ()
+    ) -> None:
+        """Say what is trained and where it goes; `steps` are environment steps per seed."""
+        self._steps, self._directory = steps, str(directory)
+        self._done = dict.fromkeys(seeds, 0)
+        self._curves = {seed: [] for seed in seeds}
+        self._began = self._spoke = self._clock()
+        self._print(Text.assemble((f"{algorithm} on {task}", "bold"), f", {_seeds(seeds)}, {steps:,} steps each"))
+        self._print(Text(self._directory, "dim"))
+        for note in notes:
+            self._print(Text(note, "dim"))
+        if self.console.is_interactive:
+            self._print(Text())
+            self._live = Live(get_renderable=self._display, console=self.console, refresh_per_second=2, transient=True)
+            self._live.start()
+
+    def progress(self, steps_by_seed: Mapping[int, int]) -> None:
+        """Note how far each seed is."""
+        self._done.update(steps_by_seed)
+        self._speed.add(sum(self._done.values()))
+        if not self._live and self._clock() - self._spoke >= SECONDS_OF_SILENCE:
+            self._say(f"step {min(self._living().values(), default=0):,} of {self._steps:,}{self._pace()}")
+
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
+        """Show the mean return of each seed's evaluation episodes at `step`."""
+        self._evaluated_at = step
+        for seed, value in returns.items():
+            self._curves[seed].append(value)
+        if not self._live and returns:
+            mean = float(np.mean(list(returns.values())))
+            text = f"step {step:,} of {self._steps:,}: mean return {number(mean)}{_spread(returns)}"
+            self._say(text + self._pace())
+
+    def failed(self, seed: int, step: int, reason: str) -> None:
+        """Show that a seed has stopped; the others go on."""
+        self._failed[seed] = f"failed at step {step:,}: {reason}"
+        self._print(Text(f"seed {seed} {self._failed[seed]}", "red"))
+
+    def finish(self, run: RunDirectory) -> None:
+        """Replace the display by the results, and say where they are and what to type next."""
+        self.close()
+        self._print(Text())
+        self._print(Text(_outcome(run.manifest, duration(self._clock() - self._began)), "bold"))
+        evaluations = run.evaluations
+        if len(evaluations):
+            self._print(results_table(run))
+        else:
+            self._print(Text("no evaluations yet"))
+        for seed, reason in run.manifest["failures"].items():
+            self._print(Text(f"seed {seed} failed at {reason}", "red"))
+        self._print_next(run, bool(len(evaluations)))
+
+    def close(self) -> None:
+        """Give the terminal back as it was. May be called at any time, and again."""
+        if self._live:
+            self._live.stop()
+            self._live = None
+
+    def _print_next(self, run: RunDirectory, has_curve: bool) -> None:
+        directory = shlex.quote(str(run.path))
+        lines = [("curve", str(run.path / "curve.png"))] if has_curve else []
+        if (run.path / "policy").exists():
+            lines += [
+                ("test it", f"csac evaluate {directory}"),
+                ("watch it", f"csac play {directory} --video {shlex.quote(str(run.path / 'play.mp4'))}"),
+            ]
+        for label, line in lines:
+            self._print(Text.assemble((f"{label:<9}", "dim"), line))
+
+    def _print(self, renderable: RenderableType) -> None:
+        # A path or a command that is cut into lines could not be copied.
+        self.console.print(renderable, soft_wrap=isinstance(renderable, Text))
+        self._spoke = self._clock()
+
+    def _say(self, text: str) -> None:
+        self._print(Text(text))
+
+    def _living(self) -> dict[int, int]:
+        return {seed: step for seed, step in self._done.items() if seed not in self._failed}
+
+    def _pace(self) -> str:
+        """Return how fast it goes and how long it will take, as soon as both are known."""
+        speed = self._speed.per_second()
+        if not speed:
+            return ""
+        unit = "steps/s" if len(self._done) == 1 else "seed-steps/s"
+        left = sum(self._steps - step for step in self._living().values()) / speed
+        return f", {speed:,.0f} {unit}" + (f", {duration(left)} left" if left else "")
+
+    def _display(self) -> RenderableType:
+        return Group(self._bar(), Text(), self._returns()) if any(self._curves.values()) else self._bar()
+
+    def _bar(self) -> RenderableType:
+        living = self._living() or self._done
+        done, total = sum(living.values()), self._steps * len(living)
+        step = f"step {short(min(living.values()))} of {short(self._steps)}"
+        text = f"{100 * done // total} %, {step}{self._pace()}"
+        width = min(CURVE_WIDTH, max(self.console.width - len(text) - 2, 4))
+        grid = Table.grid(padding=(0, 2))
+        grid.add_row(ProgressBar(total=total, completed=done, width=width), Text(text))
+        return grid
+
+    def _returns(self) -> RenderableType:
+        """One line per seed, its returns so far as a curve, then the mean over the seeds that are still training."""
+        shown = {seed: curve for seed, curve in self._curves.items() if curve or seed in self._failed}
+        known = [value for curve in shown.values() for value in curve if math.isfinite(value)]
+        low, high = min(known, default=0.0), max(known, default=0.0)
+        table = Table.grid(padding=(0, 2))
+        table.add_column(justify="right", style="dim")
+        table.add_column(style="cyan", no_wrap=True)
+        table.add_column(justify="right")
+        table.add_column(style="dim", no_wrap=True)
+
+        def add(label: str, curve: list[float], note: str = "", style: str = "") -> None:
+            picture = "" if self.console.options.ascii_only else sparkline(curve, low, high, CURVE_WIDTH)
+            latest = number(curve[-1], largest=max(abs(low), abs(high))) if curve else ""
+            table.add_row(Text(label), Text(picture), Text(latest), Text(note), style=style)
+
+        if len(shown) <= MOST_SEEDS_SHOWN:
+            for seed, curve in shown.items():
+                note, style = ("stopped", "red") if seed in self._failed else ("", "")
+                add(f"seed {seed}", list(curve), note, style)
+        living = [curve for seed, curve in shown.items() if curve and seed not in self._failed]
+        if len(living) > 1:
+            shortest = min(len(curve) for curve in living)
+            values = np.array([curve[:shortest] for curve in living])
+            note = (
+                ""
+                if len(shown) <= MOST_SEEDS_SHOWN
+                else f"{number(values[:, -1].min())} to {number(values[:, -1].max())}"
+            )
+            add("mean", list(values.mean(axis=0)), note, "bold")
+        return Group(Text(f"return at step {self._evaluated_at:,}", "dim"), table)
+
+
+class Speed:
+    """Steps per second over the last `SPEED_WINDOW` seconds."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._samples: deque[tuple[float, int]] = deque()
+
+    def add(self, total: int) -> None:
+        """Note the number of steps made so far."""
+        now = self._clock()
+        self._samples.append((now, total))
+        while now - self._samples[1 if len(self._samples) > 2 else 0][0] > SPEED_WINDOW:
+            self._samples.popleft()
+
+    def per_second(self) -> float | None:
+        """Return the speed, or None as long as there is too little to tell."""
+        if len(self._samples) < 2:
+            return None
+        (begin, first), (end, last) = self._samples[0], self._samples[-1]
+        return (last - first) / (end - begin) if end > begin and last > first else None
+
+
+def results_table(run: RunDirectory) -> Table:
+    """Return the results of a run, one row per seed: last evaluation, mean of the last three, best, episodes trained.
+
+    Below them the mean, standard deviation and 95 % t-interval over the seeds that did not fail. Their best is the best
+    evaluation of all seeds together (the paper's maximum average return), not the mean of each seed's own.
+    """
+    rows, failures = run.evaluations, run.manifest["failures"]
+    steps, seeds, returns = evaluation_matrix(rows)
+    trained, last_three = run.rows("episodes")["seed"], last_evaluations(rows, points=3)
+    largest = float(np.nanmax(np.abs(returns), initial=0.0))
+    table = Table(box=box.SIMPLE, pad_edge=False)
+    for heading in ("seed", "last return", "last three", "best", "at step", "episodes"):
+        table.add_column(heading, justify="right")
+    for seed, line in zip(seeds.tolist(), returns, strict=True):
+        best = int(np.nanargmax(line))
+        values = (line[~np.isnan(line)][-1], last_three[seed], line[best])
+        cells = [*(number(value, largest) for value in values), f"{steps[best]:,}"]
+        style = "red" if str(seed) in failures else None
+        table.add_row(str(seed), *cells, f"{np.count_nonzero(trained == seed):,}", style=style)
+    sound = np.array([str(seed) not in failures for seed in seeds])
+    together = ~np.isnan(returns[sound]).any(axis=0)
+    if sound.sum() > 1 and together.any():
+        steps, returns = steps[together], returns[sound][:, together]
+        best = int(returns.mean(axis=0).argmax())
+        three = np.array([last_three[seed] for seed in seeds[sound].tolist()])
+        table.add_section()
+        for label, cells in _over_seeds(np.stack([returns[:, -1], three, returns[:, best]], axis=1), largest):
+            table.add_row(label, *cells, f"{steps[best]:,}" if label == "mean" else "", "")
+    return table
+
+
+def _over_seeds(values: np.ndarray, largest: float) -> Iterable[tuple[str, list[str]]]:
+    """Yield the summary rows for `values` [seed, column]."""
+    mean, _, high = mean_and_interval(values)
+    for label, row in (("mean", mean), ("± std", values.std(axis=0, ddof=1)), ("± 95 %", high - mean)):
+        yield label, [number(value, largest) for value in row]
+
+
+def number(value: float, largest: float | None = None) -> str:
+    """Return a return as people read it; `largest` sets the decimals for a whole column."""
+    size = abs(value) if largest is None else largest
+    return f"{value:,.{1 if size >= 100 else 2}f}"
+
+
+def short(steps: int) -> str:
+    """Return a number of steps in little room: 500, 12.5k, 1M."""
+    for size, suffix in ((1_000_000, "M"), (1_000, "k")):
+        if steps >= size:
+            return f"{steps / size:.4g}{suffix}"
+    return str(steps)
+
+
+def duration(seconds: float) -> str:
+    """Return a length of time with the two units that matter: 45 s, 3 min 20 s, 1 h 42 min, 2 d 3 h."""
+    whole = round(seconds)
+    for size, unit, smaller_size, smaller in ((86400, "d", 3600, "h"), (3600, "h", 60, "min"), (60, "min", 1, "s")):
+        if whole >= size:
+            count, rest = divmod(whole, size)
+            return f"{count} {unit}" + (f" {rest // smaller_size} {smaller}" if rest // smaller_size else "")
+    return f"{whole} s"
+
+
+def sparkline(values: Sequence[float], low: float, high: float, width: int) -> str:
+    """Draw values between `low` and `high` in at most `width` characters, each the mean of its share; NaN is blank."""
+    array = np.asarray(values, dtype=np.float64)
+    parts = np.array_split(array, min(width, len(array))) if len(array) else []
+    span = high - low
+    drawn = ""
+    for part in parts:
+        level = (part.mean() - low) / span if span > 0 else 0.5
+        drawn += BLOCKS[min(max(int(level * len(BLOCKS)), 0), len(BLOCKS) - 1)] if math.isfinite(level) else " "
+    return drawn
+
+
+def make_console() -> Console:
+    """Return a console on standard output that takes text as it is, and that goes quiet when nobody reads any more."""
+    console = Console(markup=False, emoji=False, highlight=False)
+    console.file = _Outliving(console.file)  # pyright: ignore[reportAttributeAccessIssue]
+    return console
+
+
+class _Outliving:
+    """A text file that swallows what can no longer be written: a run goes on after its terminal or pipe is gone."""
+
+    def __init__(self, file: IO[str]) -> None:
+        self._file = file
+
+    def write(self, text: str) -> int:
+        try:
+            return self._file.write(text)
+        except OSError:
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            self._file.flush()
+        except OSError:
+            return
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def _outcome(manifest: Mapping[str, Any], time_taken: str) -> str:
+    steps, failed, seeds = f"{manifest['steps_done']:,}", len(manifest["failures"]), len(manifest["seeds"])
+    if manifest["state"] == "interrupted":
+        return f"stopped at step {steps} of {manifest['steps']:,} after {time_taken}"
+    if failed == seeds:
+        return f"failed at step {steps} after {time_taken}"
+    return f"finished {steps} steps in {time_taken}" + (f", but {failed} of {seeds} seeds failed" if failed else "")
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}"
+
+
+def _spread(returns: Mapping[int, float]) -> str:
+    if len(returns) == 1:
+        return ""
+    if len(returns) > MOST_SEEDS_SHOWN:
+        return f" ({number(min(returns.values()))} to {number(max(returns.values()))})"
+    return " (" + ", ".join(f"seed {seed} {number(value)}" for seed, value in returns.items()) + ")"
