@@ -315,12 +315,14 @@ def _check_layers(network: PolicyNetwork, contract: Contract) -> None:
         raise InputError(f"the policy's activation {network.activation!r} or head {network.head!r} is not known")
     if (network.activation, network.head) != (contract.activation, contract.head):
         raise InputError(f"the policy is {network.activation}/{network.head}, not as the contract says")
+    if not network.actor:
+        raise InputError("the policy has no layers")
     width = observation_size
     for index, (weight, bias) in enumerate(network.actor):
         if weight.ndim != 2 or bias.shape != weight.shape[1:] or weight.shape[0] != width:
             raise InputError(f"actor layer {index} has shapes {weight.shape} and {bias.shape} after {width} inputs")
         width = weight.shape[1]
-    if not network.actor or width != 2 * action_size:
+    if width != 2 * action_size:
         raise InputError(f"the policy gives {width} outputs where the task's {action_size} actions take twice as many")
 
 

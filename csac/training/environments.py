@@ -364,8 +364,8 @@ def _inner_float32(bound: np.ndarray, direction: int) -> np.ndarray:
     exact = bound.reshape(-1)
     with np.errstate(over="ignore"):
         rounded = exact.astype(np.float32)
-    outside = (rounded - exact) * direction < 0
-    return np.where(outside, np.nextafter(rounded, np.float32(direction * np.inf)), rounded)
+    outside = rounded < exact if direction > 0 else rounded > exact
+    return np.where(outside & np.isfinite(rounded), np.nextafter(rounded, np.float32(direction * np.inf)), rounded)
 
 
 def _size(parts: Parts) -> int:
@@ -384,7 +384,7 @@ def _part(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
         array = np.asarray(value)
         flat = array.reshape(-1)
         # One product finds a nan, an inf or what float32 cannot hold in a third of the time of np.isfinite().all().
-        if array.shape == shape and flat.dot(flat) <= _FLOAT32_MAX:
+        if array.shape == shape and float(flat.dot(flat)) <= _FLOAT32_MAX:
             return flat.astype(np.float32)
         with np.errstate(over="ignore"):
             flat = flat.astype(np.float32)

@@ -1,0 +1,501 @@
+"""Environments: what is refused, what a step gives, how a seed fails alone, and that nothing is printed."""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import probes
+import pytest
+from gymnasium import spaces
+
+from csac.training.environments import (
+    EVALUATION_SEED,
+    FRESH_EVALUATION_SEED,
+    Environment,
+    EnvironmentFailure,
+    SeedEnvironments,
+    training_seed,
+)
+from csac.types import InputError, Spec
+
+UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+class Scripted(gymnasium.Env):
+    """Gives what it is told and remembers the actions."""
+
+    def __init__(
+        self, observation_space=UNIT, action_space=UNIT, observation: Any = (0.0,), ending: Any = (0, 0)
+    ) -> None:
+        self.observation_space, self.action_space = observation_space, action_space
+        self.observation, self.ending = observation, ending
+        self.reward: Any = 1.0
+        self.actions: list[np.ndarray] = []
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return self.observation, {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.actions.append(action)
+        return self.observation, self.reward, *self.ending, {"note": 1}
+
+
+def scripted(**settings: Any) -> Environment:
+    return Environment(lambda: Scripted(**settings))
+
+
+def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) -> list:
+    actions = np.full((len(environments.seeds), 1), action, np.float32)
+    return [environments.step(actions) for _ in range(count)]
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("HalfCheeta-v4", "no task is called HalfCheeta-v4: did you mean HalfCheetah-v4"),
+        ("halfcheetah-V4", "did you mean HalfCheetah-v4"),
+        ("HalfCheetah", r"did you mean HalfCheetah-v4 or HalfCheetah-v5\?"),
+        ("HalfCheetah-v3", r"did you mean HalfCheetah-v4 or HalfCheetah-v5\?"),
+        ("Nothing/Like-this-v7", "write module:Id"),
+        ("", "write module:Id"),
+        ("no_such_module:Task-v0", "the module no_such_module cannot be imported: ModuleNotFoundError"),
+        ("probes:ConstantRewards-v0", "did you mean ConstantReward-v0"),
+        ("CartPole-v1", r"CartPole-v1: the action space is Discrete\(2\)"),
+        (lambda: 3, "gave a int: a task's callable returns a gymnasium.Env"),
+    ],
+)
+def test_a_task_that_cannot_be_learnt_is_refused(task, message):
+    with pytest.raises(InputError, match=message) as refusal:
+        Environment(task)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "space", "message"),
+    [
+        ("action_space", spaces.Box(-np.inf, np.inf, (2,)), "no bounds"),
+        ("action_space", spaces.Box(-1e300, 1e300, (2,), np.float64), "no bounds"),
+        ("action_space", spaces.Box(np.array([-1.0, -np.inf]), np.ones(2), dtype=np.float64), "no bounds"),
+        ("action_space", spaces.Box(0, 5, (2,), np.int64), "continuous"),
+        ("action_space", spaces.MultiDiscrete([2, 3]), "continuous"),
+        ("action_space", spaces.Tuple([UNIT]), "continuous"),
+        ("action_space", spaces.Box(-1.0, 1.0, (0,)), "empty"),
+        ("observation_space", spaces.Discrete(4), "a Discrete and csac takes Boxes.*FlattenObservation"),
+        ("observation_space", spaces.Tuple([UNIT]), "a Tuple"),
+        ("observation_space", spaces.Dict(a=spaces.Dict(b=UNIT)), r"observation\['a'\] is a Dict"),
+        ("observation_space", spaces.Dict(a=spaces.Text(3)), r"observation\['a'\] is a Text"),
+        ("observation_space", spaces.Box(0, 255, (8, 8, 3), np.uint8), "image"),
+        ("observation_space", spaces.Dict(camera=spaces.Box(0, 255, (8, 8, 3), np.uint8)), "camera.*image"),
+        ("observation_space", spaces.Dict(), "empty"),
+        ("observation_space", spaces.Box(-1.0, 1.0, (0,)), "empty"),
+    ],
+)
+def test_a_space_that_cannot_be_learnt_is_refused(name, space, message):
+    with pytest.raises(InputError, match=message):
+        scripted(**{name: space})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"colour": "red"}, "unexpected keyword argument 'colour'"), ({"at": 1, "where": []}, "unhashable")],
+)
+def test_arguments_that_the_environment_refuses(arguments, message):
+    class Choosy(probes.Failing):
+        def __init__(self, at: int = 1, where: Any = "step") -> None:
+            super().__init__(at=at, where=where)
+            self.count[where] = 0
+
+    with pytest.raises(InputError, match=f"Choosy could not be made with the arguments.*{message}"):
+        Environment(Choosy, arguments)
+
+
+def test_a_render_mode_that_the_task_lacks_is_refused():
+    with pytest.raises(InputError, match="no render mode 'hologram': it has human, rgb_array"):
+        Environment("Pendulum-v1", render_mode="hologram")
+    assert Environment("Pendulum-v1", render_mode="rgb_array").raw.render_mode == "rgb_array"
+
+
+def test_a_module_that_breaks_is_an_input_error(tmp_path, monkeypatch):
+    (tmp_path / "broken_tasks.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match="broken_tasks cannot be imported: ZeroDivisionError: division by zero"):
+        Environment("broken_tasks:Task-v0")
+
+
+# What an environment is
+
+
+@pytest.mark.parametrize(
+    ("task", "name"),
+    [
+        ("Pendulum-v1", "Pendulum-v1"),
+        ("probes:Endless-v0", "probes:Endless-v0"),
+        (probes.Endless, "Endless"),
+        (functools.partial(gymnasium.make, "Pendulum-v1"), "Pendulum-v1"),
+        (lambda: probes.Endless(), "Endless"),
+    ],
+)
+def test_every_task_has_a_name(task, name):
+    assert Environment(task).task_name == name
+
+
+def test_a_module_is_imported_for_its_tasks(tmp_path, monkeypatch):
+    (tmp_path / "my_tasks.py").write_text(
+        "import gymnasium, probes\ngymnasium.register('Mine-v3', entry_point=probes.Endless, max_episode_steps=2)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert Environment("my_tasks:Mine-v3", {"length": 7}).raw.unwrapped.length == 7  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    ("task", "spec"),
+    [("HalfCheetah-v4", (17, 6)), ("Walker2d-v4", (17, 6)), ("Ant-v4", (27, 8)), ("Hopper-v4", (11, 3))],
+)
+def test_the_paper_tasks_have_the_paper_sizes(task, spec):
+    assert Environment(task).spec == Spec(*spec)
+
+
+@pytest.mark.parametrize(
+    ("space", "observation", "flat"),
+    [
+        (spaces.Box(-9, 9, (2,), np.float64), np.array([1.0, 2.0]), [1, 2]),
+        (spaces.Box(-9, 9, (2,), np.float32), [1, 2.5], [1, 2.5]),
+        (spaces.Box(-9, 9, (), np.float32), 3.5, [3.5]),
+        (spaces.Box(-9, 9, (2, 2), np.float16), np.array([[1, 2], [3, 4]], np.float16), [1, 2, 3, 4]),
+        (spaces.Box(0, 255, (2,), np.uint8), np.array([255, 255], np.uint8), [255, 255]),
+        (spaces.Box(-9, 9, (2,), np.int64), np.array([3, -4]), [3, -4]),
+        (spaces.Box(-np.inf, np.inf, (2,), np.float64), np.array([1e30, -1e30]), [1e30, -1e30]),
+        (spaces.Dict(z=UNIT, a=spaces.Box(-9, 9, (1, 2))), {"z": [1.0], "a": [[2.0, 3.0]]}, [2, 3, 1]),
+    ],
+)
+def test_observations_become_flat_float32(space, observation, flat):
+    environment = scripted(observation_space=space, observation=observation)
+    first = environment.reset(0)
+    second, *_ = environment.step(np.zeros(1, np.float32))
+    np.testing.assert_array_equal(first, np.array(flat, np.float32))
+    np.testing.assert_array_equal(second, np.array(flat, np.float32))
+    assert first.dtype == second.dtype == np.float32
+    assert environment.spec.observation_size == len(flat)
+    assert environment.raw_observation is observation
+
+
+def test_an_array_that_the_environment_reuses_is_copied():
+    reused = np.array([1.0], np.float32)
+    environment = scripted(observation=reused)
+    first = environment.reset(0)
+    reused[0] = 2.0
+    assert first[0] == 1.0
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (6,), (2, 3)])
+def test_actions_reach_the_environment_in_its_shape_and_bounds(shape):
+    low, high = np.full(shape, -1.0, np.float32), np.full(shape, 3.0, np.float32)
+    environment = scripted(action_space=spaces.Box(low, high))
+    environment.step(np.linspace(-1, 1, max(1, int(np.prod(shape))), dtype=np.float32))
+    (action,) = environment.raw.unwrapped.actions  # pyright: ignore
+    expected = np.linspace(-1, 3, 6).reshape(shape) if shape in ((6,), (2, 3)) else np.full(shape, -1.0)
+    np.testing.assert_allclose(action, expected, rtol=1e-6)
+    assert action.shape == shape
+    assert action.dtype == np.float32
+
+
+def test_actions_lie_in_a_box_of_doubles_too():
+    space = spaces.Box(np.array([0.1, -0.3]), np.array([0.7, 1 / 3]), dtype=np.float64)
+    environment = scripted(action_space=space)
+    for action in ([-1, -1], [1, 1], [0, 0]):
+        environment.step(np.array(action, np.float32))
+    assert all(space.contains(action) for action in environment.raw.unwrapped.actions)  # pyright: ignore
+    np.testing.assert_allclose(environment.contract_parts.action_high, space.high, rtol=1e-6)
+
+
+def test_both_scales_are_one_environment():
+    one, other = Environment("Pendulum-v1"), Environment("Pendulum-v1")
+    np.testing.assert_array_equal(one.reset(3), other.reset(3))
+    inside, outside = one.step(np.array([0.25])), other.step_environment_scale(np.array([0.5]))
+    np.testing.assert_array_equal(inside[0], outside[0])
+    assert inside[1:4] == outside[1:4]
+
+
+@pytest.mark.parametrize("reward", [2, 2.0, np.float32(2), np.float64(2), np.array(2.0), np.int64(2)])
+def test_rewards_become_floats_and_flags_bools(reward):
+    environment = scripted(ending=(np.bool_(True), 1))
+    environment.raw.unwrapped.reward = reward  # pyright: ignore
+    environment.reset(0)
+    _, value, terminated, truncated, info = environment.step(np.zeros(1, np.float32))
+    assert (type(value), value) == (float, 2.0)
+    assert (terminated, truncated) == (True, True)
+    assert type(terminated) is type(truncated) is bool
+    assert info == {"note": 1}
+
+
+def test_a_time_limit_can_fall_on_the_terminal_step():
+    arguments = {"max_episode_steps": 1}
+    environment = Environment("probes:ConstantReward-v0", arguments)
+    environment.reset(0)
+    assert environment.step(np.zeros(1, np.float32))[2:4] == (True, True)
+    environment = Environment("probes:DelayedReward-v0", arguments)
+    environment.reset(0)
+    assert environment.step(np.zeros(1, np.float32))[2:4] == (False, True)
+
+
+# What fails
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("space", "observation", "message"),
+    [
+        (spaces.Box(-9, 9, (3,)), np.array([0, 1, NAN]), "observation[2] is nan"),
+        (spaces.Box(-9, 9, (2, 2)), np.array([[0, 1], [-INF, 1]]), "observation[1, 0] is -inf"),
+        (spaces.Box(-9, 9, ()), np.array(INF), "observation is inf"),
+        (spaces.Box(-9, 9, (1,), np.float64), np.array([1e39]), "observation[0] is inf"),
+        (spaces.Box(-9, 9, (3,)), np.zeros(2), "observation has shape (2,) where its space has (3,)"),
+        (spaces.Box(-9, 9, (3,)), np.zeros((1, 3)), "observation has shape (1, 3) where its space has (3,)"),
+        (spaces.Box(-9, 9, (3,)), None, "observation has shape () where its space has (3,)"),
+        (spaces.Box(-9, 9, (3,)), ["a", "b", "c"], "observation is not an array of numbers"),
+        (spaces.Box(-9, 9, (2,)), [[1], [1, 2]], "observation is not an array of numbers"),
+        (spaces.Dict(a=UNIT, b=UNIT), {"a": [0.0], "b": [NAN]}, "observation['b'][0] is nan"),
+        (spaces.Dict(a=UNIT, b=UNIT), {"a": [0.0]}, "observation has no 'b'"),
+        (spaces.Dict(a=UNIT), np.zeros(1), "observation has no 'a'"),
+    ],
+)
+def test_a_bad_observation_is_named(space, observation, message):
+    environment = scripted(observation_space=space, observation=observation)
+    with pytest.raises(EnvironmentFailure) as failure:
+        environment.step(np.zeros(1, np.float32))
+    assert str(failure.value).startswith(message)
+    with pytest.raises(EnvironmentFailure, match=r"after reset$"):
+        environment.reset(0)
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (NAN, "reward is nan"),
+        (-INF, "reward is -inf"),
+        (1e39, r"reward is 1e\+39"),
+        (np.float32(NAN), "reward is nan"),
+        (np.ones(1), r"reward has shape \(1,\)"),
+        (None, "reward is a NoneType"),
+        ("high", "reward is a str"),
+    ],
+)
+def test_a_bad_reward_is_named(reward, message):
+    environment = scripted()
+    environment.raw.unwrapped.reward = reward  # pyright: ignore
+    with pytest.raises(EnvironmentFailure, match=message):
+        environment.step(np.zeros(1, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [([NAN], r"action\[0\] is nan"), ([0.0, 0.0], r"action has shape \(2,\)"), ([[0.0]], r"shape \(1, 1\)")],
+)
+def test_a_bad_action_never_reaches_the_environment(action, message):
+    environment = scripted()
+    with pytest.raises(EnvironmentFailure, match=message):
+        environment.step_environment_scale(np.array(action))
+    assert environment.raw.unwrapped.actions == []  # pyright: ignore
+
+
+def test_the_old_step_of_four_is_a_failure_in_words():
+    class Old(Scripted):
+        def step(self, action):
+            return [0.0], 1.0, False, {}
+
+    with pytest.raises(EnvironmentFailure, match="step raised ValueError: not enough values to unpack"):
+        Environment(Old).step(np.zeros(1, np.float32))
+
+
+# Several seeds
+
+
+def test_each_episode_has_a_reset_seed_of_its_own():
+    seeds = [training_seed(seed, episode) for seed in range(20) for episode in range(50)]
+    assert len(set(seeds)) == len(seeds)
+    assert min(seeds) > max(EVALUATION_SEED, FRESH_EVALUATION_SEED) + 1_000_000
+    assert max(seeds) < 2**31
+    assert training_seed(3, 4) == training_seed(3, 4)
+
+
+def test_steps_keep_the_true_final_observation_and_both_flags():
+    environments = SeedEnvironments(probes.IdEncoded, None, [7, 9])
+    observations = environments.reset()
+    finished = []
+    episode, step = 0, 0
+    for count in range(12):
+        action = np.array([[0.1], [0.2]], np.float32) + np.float32(count / 100)
+        instances = [training_seed(seed, episode) % 65536 for seed in (7, 9)]
+        np.testing.assert_array_equal(observations[:, :3], [[instance, episode, step] for instance in instances])
+        outcome = environments.step(action)
+        step += 1
+        ends = step == 2 + episode % 3
+        expected = [[instance, episode, step] for instance in instances]
+        np.testing.assert_array_equal(outcome.next_observation[:, :3], expected)
+        np.testing.assert_array_equal(outcome.next_observation[:, 3:], action)
+        np.testing.assert_array_equal(outcome.reward, [step, step])
+        assert outcome.terminated.tolist() == [ends and episode % 3 in (0, 2)] * 2
+        assert outcome.truncated.tolist() == [ends and episode % 3 in (1, 2)] * 2
+        finished += [(episode, *row) for row in outcome.episodes]
+        if ends:
+            episode, step = episode + 1, 0
+        else:
+            np.testing.assert_array_equal(outcome.observation, outcome.next_observation)
+        observations = outcome.observation
+    lengths = {0: 2, 1: 3, 2: 4, 3: 2}
+    assert finished == [(e, i, n * (n + 1) / 2, n) for e, n in lengths.items() for i in (0, 1)]
+
+
+def test_arrays_have_their_types_and_stay_as_they_were():
+    environments = SeedEnvironments(probes.IdEncoded, None, [0, 1, 2])
+    first = environments.reset()
+    (outcome,) = steps_of(environments, 1)
+    kept = [array.copy() for array in (first, *outcome[:5])]
+    steps_of(environments, 5)
+    for array, copy in zip((first, *outcome[:5]), kept, strict=True):
+        np.testing.assert_array_equal(array, copy)
+    assert [array.dtype for array in outcome[:5]] == [np.float32, np.float32, bool, bool, np.float32]
+    assert [array.shape for array in outcome[:5]] == [(3, 4), (3,), (3,), (3,), (3, 4)]
+    assert not np.shares_memory(outcome.observation, outcome.next_observation)
+
+
+def test_a_seed_steps_the_same_alone_and_beside_others():
+    alone = SeedEnvironments("Hopper-v4", None, [5])
+    beside = SeedEnvironments("Hopper-v4", None, [4, 5, 6])
+    np.testing.assert_array_equal(alone.reset()[0], beside.reset()[1])
+    actions = np.random.default_rng(0).uniform(-1, 1, (200, 1, 3)).astype(np.float32)
+    for action in actions:
+        one, other = alone.step(action), beside.step(np.repeat(action, 3, axis=0))
+        np.testing.assert_array_equal(one.next_observation[0], other.next_observation[1])
+        np.testing.assert_array_equal(one.observation[0], other.observation[1])
+        assert one.reward[0] == other.reward[1]
+
+
+def test_a_seed_that_breaks_fails_alone_and_is_not_stepped_again():
+    environments = SeedEnvironments(probes.Failing, {"at": 3, "seeds": [training_seed(1, 0)]}, [0, 1, 2])
+    environments.reset()
+    before, last, broken, after = steps_of(environments, 4)
+    assert before.failures == last.failures == after.failures == []
+    ((index, reason, details),) = broken.failures
+    assert (index, reason) == (1, "step raised RuntimeError: the simulator broke")
+    assert "maybe_fail" in details
+    assert environments.alive.tolist() == [True, False, True]
+    raws = [environment.raw.unwrapped for environment in environments.environments]
+    assert [raw.count["step"] for raw in raws] == [4, 3, 4]  # pyright: ignore
+    assert [episode.index for episode in broken.episodes] == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "reason"), [("reward", INF, "reward is inf"), ("observation", NAN, "observation[0] is nan")]
+)
+def test_a_failed_seed_stays_at_its_last_good_values(where, value, reason):
+    arguments = {"where": where, "value": value, "at": 3, "seeds": [training_seed(0, 0)]}
+    environments = SeedEnvironments(probes.NonFinite, arguments, [0, 1])
+    environments.reset()
+    *_, broken, after = steps_of(environments, 4)
+    assert broken.failures == [(0, reason, "")]
+    for outcome in (broken, after):
+        np.testing.assert_array_equal(outcome.observation, np.zeros((2, 1)))
+        np.testing.assert_array_equal(outcome.next_observation, np.zeros((2, 1)))
+        np.testing.assert_array_equal(outcome.reward, [1.0, 1.0])
+        assert not (outcome.terminated | outcome.truncated).any()
+
+
+def test_a_seed_that_fails_in_its_first_reset_is_reported_by_the_first_step():
+    environments = SeedEnvironments(probes.Failing, {"where": "reset"}, [0, 1])
+    environments.reset()
+    assert environments.alive.all()
+    first, second = steps_of(environments, 2)
+    assert [(failure.index, failure.reason) for failure in first.failures] == [
+        (0, "reset raised RuntimeError: the simulator broke"),
+        (1, "reset raised RuntimeError: the simulator broke"),
+    ]
+    assert second.failures == []
+    assert not environments.alive.any()
+
+
+def test_a_seed_that_fails_in_a_later_reset_has_finished_its_episode():
+    environments = SeedEnvironments(probes.Failing, {"where": "reset", "at": 2}, [0])
+    environments.reset()
+    *_, last = steps_of(environments, 3)
+    assert last.episodes == [(0, 3.0, 3)]
+    assert [failure.reason for failure in last.failures] == ["reset raised RuntimeError: the simulator broke"]
+    assert environments.alive.tolist() == [False]
+
+
+def test_a_stopped_seed_steps_no_more():
+    environments = SeedEnvironments(probes.Failing, {"at": 2}, [0, 1])
+    environments.reset()
+    environments.stop(0)
+    assert environments.alive.tolist() == [False, True]
+    _, second = steps_of(environments, 2)
+    assert [failure.index for failure in second.failures] == [1]
+
+
+# What is printed
+
+RUN = """
+import numpy as np
+from csac.training.environments import Environment, SeedEnvironments
+environments = SeedEnvironments("HalfCheetah-v4", None, [0, 1])
+environments.reset()
+environments.step(np.zeros((2, 6), np.float32))
+environments.environments[0].raw.unwrapped.data.qvel[:] = 1e30
+environments.step(np.zeros((2, 6), np.float32))
+Environment("Pendulum-v1", render_mode="rgb_array").close()
+environments.close()
+"""
+
+
+def run_python(code: str, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *options, "-c", code], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize("options", [(), ("-W", "always")])
+def test_nothing_is_printed_and_no_file_is_left(tmp_path, options):
+    ended = run_python(RUN, tmp_path, *options)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_mujoco_is_told_with_what_to_install(tmp_path):
+    code = """
+import sys
+sys.modules["mujoco"] = None
+from csac.training.environments import Environment
+from csac.types import InputError
+Environment("Pendulum-v1")
+try:
+    Environment("HalfCheetah-v4")
+except InputError as error:
+    print(error)
+"""
+    ended = run_python(code, tmp_path)
+    assert ended.stdout.startswith("HalfCheetah-v4 needs a package that is not installed: MuJoCo")
+    assert 'pip install "gymnasium[mujoco]"' in ended.stdout
+    assert ended.stderr == ""
+
+
+def test_warnings_of_the_users_own_environment_are_shown():
+    def task() -> gymnasium.Env:
+        gymnasium.logger.warn("hidden")
+        import warnings
+
+        warnings.warn("the user's own", stacklevel=1)
+        return probes.Endless()
+
+    with pytest.warns(UserWarning, match="the user's own") as shown:
+        Environment(task)
+    assert len(shown) == 1

@@ -1,0 +1,256 @@
+"""Evaluation: known returns, numbers that depend on nothing but the policy and the episode, failures in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import probes
+import pytest
+from gymnasium import spaces
+
+from csac.deploy.policy import Contract, Policy
+from csac.training.environments import EVALUATION_SEED, FRESH_EVALUATION_SEED, Environment, Task
+from csac.training.evaluation import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, evaluate
+from csac.types import InputError, Layer, PolicyNetwork
+
+
+def policy_for(task: Task, weight: float = 0.0, bias: float = 0.0, log_std: float = 0.0) -> Policy:
+    """A policy of one layer: tanh(weight * sum of the observation + bias), the same in every action dimension."""
+    environment = Environment(task)
+    observation_size, action_size = environment.spec
+    mean = np.full((observation_size, action_size), weight)
+    biases = np.concatenate([np.full(action_size, bias), np.full(action_size, log_std)])
+    network = PolicyNetwork((Layer(np.concatenate([mean, np.zeros_like(mean)], axis=1), biases),))
+    return Policy(network, Contract("Task-v0", "csac", "relu", "tanh_gaussian", *environment.contract_parts))
+
+
+class Lottery(gymnasium.Env):
+    """Length and observations are drawn from the reset seed; the reward is the action."""
+
+    observation_space = spaces.Box(-9.0, 9.0, (3,), np.float32)
+    action_space = spaces.Box(-1.0, 3.0, (2,), np.float32)
+
+    def __init__(self) -> None:
+        self.left = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        super().reset(seed=seed)
+        self.left = int(self.np_random.integers(1, 30))
+        return self.observe(), {}
+
+    def step(self, action):
+        self.left -= 1
+        return self.observe(), float(action.sum()), self.left == 0, False, {}
+
+    def observe(self) -> np.ndarray:
+        return self.np_random.normal(size=3).astype(np.float32)
+
+
+class Goal(gymnasium.Env):
+    """A dict observation; two steps; succeeds where the action reaches 1.5."""
+
+    observation_space = spaces.Dict(
+        goal=spaces.Box(-9.0, 9.0, (2,), np.float32), at=spaces.Box(-9.0, 9.0, (), np.float64)
+    )
+    action_space = spaces.Box(0.0, 2.0, (2, 1), np.float32)
+
+    def __init__(self, success_key: str = "is_success") -> None:
+        self.success_key, self.steps = success_key, 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        self.steps, self.seed = 0, seed
+        return self.observe(), {}
+
+    def step(self, action):
+        self.steps += 1
+        succeeded = np.array(bool((action >= 1.5).all()))
+        return self.observe(), 1.0, False, self.steps == 2, {self.success_key: succeeded}
+
+    def observe(self) -> dict[str, Any]:
+        return {"goal": np.ones(2, np.float32), "at": float(self.steps)}
+
+
+def test_returns_and_lengths_are_known():
+    episodes = Evaluator(probes.Endless, {"length": 4, "constant_reward": 0.5}, episodes=12).run(
+        policy_for(probes.Endless)
+    )
+    assert episodes == [EvaluationEpisode(number, 2.0, 4, None) for number in range(12)]
+
+
+def test_deterministic_actions_earn_what_they_should():
+    # tanh(bias) = 0.25: each episode earns -(0.25 - 0.5)² = -0.0625.
+    policy = policy_for(probes.ActionReward, bias=float(np.arctanh(0.25)))
+    returns = [episode.episode_return for episode in Evaluator(probes.ActionReward).run(policy)]
+    np.testing.assert_allclose(returns, np.full(10, -0.0625), rtol=1e-5)
+
+
+def test_the_policy_sees_the_observation_of_its_own_episode():
+    # tanh(large * x) = x: each episode earns -(x - x/2)² = -0.25; the observation of another would earn -2.25 at times.
+    policy = policy_for(probes.ObservationActionReward, weight=100.0)
+    returns = evaluate(policy, probes.ObservationActionReward, episodes=25)
+    np.testing.assert_allclose(returns, np.full(25, -0.25), rtol=1e-5)
+
+
+def test_episode_j_is_reset_with_the_first_seed_plus_j():
+    def expected(seed: int) -> int:
+        environment = Environment(Lottery)
+        environment.reset(seed)
+        return environment.raw.unwrapped.left  # pyright: ignore
+
+    policy = policy_for(Lottery)
+    lengths = [episode.length for episode in Evaluator(Lottery, episodes=23).run(policy)]
+    assert lengths == [expected(EVALUATION_SEED + number) for number in range(23)]
+    lengths = [episode.length for episode in Evaluator(Lottery, episodes=3, first_seed=77).run(policy)]
+    assert lengths == [expected(77 + number) for number in range(3)]
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_an_episode_depends_on_no_other(deterministic):
+    policy = policy_for(Lottery, weight=0.7)
+    few = Evaluator(Lottery, episodes=3).run(policy, deterministic)
+    many = Evaluator(Lottery, episodes=2 * ROWS + 3).run(policy, deterministic)
+    again = Evaluator(Lottery, episodes=3, first_seed=EVALUATION_SEED + ROWS).run(policy, deterministic)
+    assert few == many[:3]
+    assert [episode[1:] for episode in again] == [episode[1:] for episode in many[ROWS : ROWS + 3]]
+    assert len({episode.episode_return for episode in many}) == len(many)
+
+
+@pytest.mark.parametrize("task", [Lottery, "Hopper-v4"])
+def test_an_evaluation_can_be_repeated(task):
+    policy = policy_for(task, weight=0.1)
+    evaluator = Evaluator(task)
+    first = evaluator.run(policy)
+    evaluator.run(policy_for(task, weight=-0.3))
+    assert evaluator.run(policy) == first
+    assert Evaluator(task).run(policy) == first
+    evaluator.close()
+    assert evaluator.run(policy) == first
+
+
+def test_stochastic_actions_are_those_of_the_episode():
+    policy = policy_for(Lottery, log_std=-1.0)
+    (episode,) = Evaluator(Lottery, episodes=1).run(policy, deterministic=False)
+    generator = np.random.default_rng(EVALUATION_SEED)
+    noise = [generator.standard_normal(2, dtype=np.float32) for _ in range(episode.length)]
+    # Actions 1 + 2 tanh(noise / e) in each of two dimensions.
+    expected = sum(float(np.sum(1 + 2 * np.tanh(np.exp(-1.0) * part))) for part in noise)
+    assert episode.episode_return == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_environments_are_made_once_and_only_as_many_as_needed():
+    made = []
+
+    def task() -> gymnasium.Env:
+        made.append(1)
+        return probes.ConstantReward()
+
+    evaluator = Evaluator(task, episodes=3)
+    assert made == []
+    policy = policy_for(probes.ConstantReward)
+    evaluator.run(policy)
+    evaluator.run(policy)
+    assert len(made) == 3
+    evaluator = Evaluator(task, episodes=35)
+    evaluator.run(policy)
+    assert len(made) == 3 + ROWS
+
+
+@pytest.mark.parametrize("key", ["is_success", "success"])
+def test_success_is_what_the_last_step_says(key):
+    for bias, success in ((9.0, 1.0), (0.0, 0.0)):
+        episodes = Evaluator(Goal, {"success_key": key}, episodes=2).run(policy_for(Goal, bias=bias))
+        assert [episode.success for episode in episodes] == [success, success]
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "message"),
+    [
+        (probes.Failing, {"at": 2}, "at step 1: step raised RuntimeError: the simulator broke"),
+        (probes.Failing, {"where": "reset"}, "at step 0: reset raised RuntimeError: the simulator broke"),
+        (probes.NonFinite, {"at": 3}, "at step 2: reward is nan"),
+        (probes.NonFinite, {"where": "observation"}, r"at step 0: observation\[0\] is nan"),
+    ],
+)
+def test_an_environment_that_fails_is_named(task, arguments, message):
+    seed = EVALUATION_SEED + 4
+    evaluator = Evaluator(task, {**arguments, "seeds": [seed]})
+    with pytest.raises(EvaluationFailure, match=f"evaluation episode 4, reset with seed {seed}, {message}"):
+        evaluator.run(policy_for(probes.Endless))
+
+
+def test_a_policy_that_is_not_a_number_fails():
+    with pytest.raises(EvaluationFailure, match=r"action\[0\] is nan"):
+        evaluate(policy_for(probes.Endless, bias=float("nan")), probes.Endless, episodes=1)
+
+
+def test_a_policy_of_another_task_is_refused():
+    with pytest.raises(
+        InputError, match=r"trained on observations \(1,\) and actions \(1,\); Lottery has \(3,\) and \(2,\)"
+    ):
+        evaluate(policy_for(probes.Endless), Lottery)
+    with pytest.raises(InputError, match=r"Goal has at \(\), goal \(2,\) and \(2, 1\)"):
+        evaluate(policy_for(Lottery), Goal)
+
+
+@pytest.mark.parametrize("episodes", [0, -1])
+def test_at_least_one_episode_is_asked_for(episodes):
+    policy = policy_for(Lottery)
+    with pytest.raises(InputError, match="run at least one"):
+        Evaluator(Lottery, episodes=episodes)
+    for evaluated in (policy, Foreign(policy)):
+        with pytest.raises(InputError, match="run at least one"):
+            evaluate(evaluated, Lottery, episodes=episodes)
+
+
+class Foreign:
+    """Somebody else's policy, with nothing but `predict`; it counts its steps in its state."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self.calls: list[tuple] = []
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        self.calls.append((observation, state, episode_start, deterministic))
+        action, _ = self.policy.predict(observation)
+        return action, (state or 0) + 1
+
+
+def test_any_object_that_predicts_is_evaluated_alike():
+    policy = policy_for(Lottery, weight=0.7)
+    ours = evaluate(policy, Lottery, episodes=13)
+    assert ours.shape == (13,)
+    assert ours.dtype == np.float64
+    np.testing.assert_allclose(evaluate(Foreign(policy), Lottery, episodes=13), ours, rtol=1e-5)
+
+
+def test_a_foreign_policy_sees_raw_observations_its_state_and_the_starts():
+    foreign = Foreign(policy_for(Goal))
+    assert evaluate(foreign, Goal, episodes=2, deterministic=False).tolist() == [2.0, 2.0]
+    observations, states, starts, flags = zip(*foreign.calls, strict=True)
+    assert [observation["at"] for observation in observations] == [0.0, 1.0, 0.0, 1.0]
+    assert states == (None, 1, None, 1)
+    assert [start.tolist() for start in starts] == [[True], [False], [True], [False]]
+    assert set(flags) == {False}
+
+
+def test_a_foreign_action_of_the_wrong_shape_is_named():
+    class Batched:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.zeros((1, 2)), state
+
+    with pytest.raises(EvaluationFailure, match=r"action has shape \(1, 2\) where its space has \(2,\)"):
+        evaluate(Batched(), Lottery)
+
+
+def test_what_cannot_predict_is_refused():
+    with pytest.raises(InputError, match="a dict has no predict"):
+        evaluate({}, Lottery)
+
+
+def test_reports_use_other_episodes_than_training():
+    policy = policy_for(Lottery)
+    training = [episode.episode_return for episode in Evaluator(Lottery, first_seed=FRESH_EVALUATION_SEED).run(policy)]
+    np.testing.assert_array_equal(evaluate(policy, Lottery, episodes=10), training)
+    assert FRESH_EVALUATION_SEED - EVALUATION_SEED >= 1_000_000

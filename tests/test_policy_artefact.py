@@ -1,0 +1,349 @@
+"""The policy that leaves: known answers, Stable-Baselines3's shapes, files that are refused when damaged."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from csac.deploy.policy import Activation, Contract, Policy, load
+from csac.types import InputError, Layer, PolicyNetwork, Spec
+
+DICT_PARTS = (("achieved", (2,)), ("position", (1, 2)), ("speed", ()))
+
+
+def contract(parts=((None, (2,)),), action_shape=(1,), low=-1.0, high=1.0, activation: Activation = "relu") -> Contract:
+    size = math.prod(action_shape)
+    bounds = [np.full(size, bound, np.float32) for bound in (low, high)]
+    return Contract("Task-v0", "csac", activation, "tanh_gaussian", parts, action_shape, *bounds)
+
+
+def random_network(spec: Spec, width: int = 8, seed: int = 0) -> PolicyNetwork:
+    generator = np.random.default_rng(seed)
+    sizes = (spec.observation_size, width, width, 2 * spec.action_size)
+    layers = [
+        Layer(generator.normal(size=(inputs, outputs)), generator.normal(size=outputs))
+        for inputs, outputs in pairwise(sizes)
+    ]
+    return PolicyNetwork(tuple(layers))
+
+
+def random_policy(contract: Contract, seed: int = 0) -> Policy:
+    return Policy(random_network(contract.spec, seed=seed), contract)
+
+
+def hand_made(activation: Activation = "relu", log_std_bias=0.0, **settings) -> Policy:
+    """Hidden: [x0 - x1, x1 + 1]. Mean: hidden0 + 2 hidden1 - 3. Log std: hidden0 + bias."""
+    layers = (
+        Layer(np.array([[1.0, 0.0], [-1.0, 1.0]]), np.array([0.0, 1.0])),
+        Layer(np.array([[1.0, 1.0], [2.0, 0.0]]), np.array([-3.0, log_std_bias])),
+    )
+    return Policy(PolicyNetwork(layers, activation), contract(activation=activation, **settings))
+
+
+def test_the_deterministic_action_is_the_tanh_of_the_mean():
+    # [1, 3]: hidden = relu([-2, 4]) = [0, 4], mean = 0 + 8 - 3 = 5. [2, -1]: hidden = [3, 0], mean = 0.
+    actions = hand_made().act(np.array([[1.0, 3.0], [2.0, -1.0]], np.float32))
+    np.testing.assert_allclose(actions, [[math.tanh(5.0)], [0.0]], atol=1e-7)
+    assert actions.dtype == np.float32
+
+
+def test_tanh_layers_are_tanh_layers():
+    # [0.5, 0]: hidden = tanh([0.5, 1]), mean = tanh(0.5) + 2 tanh(1) - 3.
+    mean = math.tanh(0.5) + 2 * math.tanh(1.0) - 3.0
+    action = hand_made("tanh").act(np.array([[0.5, 0.0]], np.float32))
+    np.testing.assert_allclose(action, [[math.tanh(mean)]], rtol=1e-6)
+
+
+def test_a_stochastic_action_moves_by_the_clipped_standard_deviation():
+    # [2, -1]: hidden = [3, 0], mean = 0, log std = 3 + bias: 1 as it is, 2 after clipping 13, -20 after clipping -47.
+    observation, noise = np.array([[2.0, -1.0]], np.float32), np.array([[0.1]], np.float32)
+    for bias, log_std in ((-2.0, 1.0), (10.0, 2.0), (-50.0, -20.0)):
+        action = hand_made(log_std_bias=bias).act(observation, deterministic=False, noise=noise)
+        np.testing.assert_allclose(action, [[math.tanh(0.1 * math.exp(log_std))]], rtol=1e-6)
+
+
+def test_without_noise_the_stochastic_action_is_the_deterministic_one():
+    policy = random_policy(contract())
+    observations = np.random.default_rng(1).normal(size=(5, 2)).astype(np.float32)
+    still = policy.act(observations, deterministic=False, noise=np.zeros((5, 1), np.float32))
+    np.testing.assert_array_equal(still, policy.act(observations))
+
+
+def test_stochastic_actions_follow_the_seed():
+    network, agreement = random_network(Spec(2, 1)), contract()
+    observation = np.zeros(2)
+    draws = [Policy(network, agreement, seed).predict(observation, deterministic=False)[0] for seed in (3, 3, 4)]
+    assert draws[0] == draws[1] != draws[2]
+
+
+def test_actions_leave_on_the_scale_of_the_environment():
+    # The mean is 0 at [2, -1], the middle of the bounds; at [1, 3] it is 5, almost the upper bound.
+    policy = hand_made(low=2.0, high=6.0)
+    assert policy.predict(np.array([2.0, -1.0]))[0] == pytest.approx([4.0])
+    assert policy.predict(np.array([1.0, 3.0]))[0] == pytest.approx([4.0 + 2.0 * math.tanh(5.0)])
+
+
+BOUND = st.floats(-(2.0**100), 2.0**100, width=32)
+
+
+@given(st.tuples(BOUND, BOUND).map(sorted), hnp.arrays(np.float32, (3, 1), elements=st.floats(-1, 1, width=32)))
+def test_scaled_actions_never_leave_the_bounds(bounds, actions):
+    low, high = bounds
+    scaled = contract(low=low, high=high).to_environment(actions)
+    assert (scaled >= low).all()
+    assert (scaled <= high).all()
+
+
+def test_the_ends_of_the_action_range_are_the_bounds():
+    agreement = contract(action_shape=(2, 2), low=-0.1, high=0.7)
+    scaled = agreement.to_environment(np.array([-1.0, 1.0, 0.0, -2.0], np.float32))
+    np.testing.assert_allclose(scaled, [[-0.1, 0.7], [0.3, -0.1]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("action_shape", [(), (1,), (3,), (2, 3)])
+@pytest.mark.parametrize("observation_shape", [(), (1,), (4,), (2, 3)])
+def test_predict_has_the_shapes_of_stable_baselines3(observation_shape, action_shape):
+    policy = random_policy(contract(((None, observation_shape),), action_shape))
+    batch = np.random.default_rng(0).normal(size=(5, *observation_shape))
+    single, state = policy.predict(batch[2], state="kept", episode_start=np.ones(1, bool), deterministic=True)
+    together, _ = policy.predict(batch)
+    assert single.shape == action_shape
+    assert together.shape == (5, *action_shape)
+    assert single.dtype == together.dtype == np.float32
+    assert state == "kept"
+    np.testing.assert_allclose(single, together[2], rtol=1e-5, atol=1e-6)
+
+
+def test_a_dict_is_flattened_in_the_order_of_its_names():
+    agreement = contract(DICT_PARTS)
+    observation = {"speed": 5.0, "position": [[3, 4]], "achieved": np.array([1.0, 2.0])}
+    flat = agreement.flatten(observation)
+    np.testing.assert_array_equal(flat, np.array([1, 2, 3, 4, 5], np.float32))
+    assert flat.dtype == np.float32
+    batch = {key: np.stack([value, np.multiply(value, 10)]) for key, value in observation.items()}
+    np.testing.assert_array_equal(agreement.flatten(batch), [[1, 2, 3, 4, 5], [10, 20, 30, 40, 50]])
+
+
+def test_predict_takes_dicts_dicts_of_batches_and_flat_observations():
+    policy = random_policy(contract(DICT_PARTS, (2,)))
+    observation = {"speed": 0.5, "position": [[0.3, 0.4]], "achieved": [0.1, 0.2]}
+    action, _ = policy.predict(observation)
+    assert action.shape == (2,)
+    batched, _ = policy.predict({key: np.array([value]) for key, value in observation.items()})
+    assert batched.shape == (1, 2)
+    np.testing.assert_array_equal(batched[0], action)
+    np.testing.assert_array_equal(policy.predict(np.array([0.1, 0.2, 0.3, 0.4, 0.5]))[0], action)
+
+
+@pytest.mark.parametrize(
+    ("parts", "observation", "message"),
+    [
+        (((None, (3,)),), np.zeros(4), r"shape \(4,\); the policy takes \(3,\)"),
+        (((None, (3,)),), np.zeros((2, 2, 3)), r"shape \(2, 2, 3\)"),
+        (((None, (3,)),), ["a", "b", "c"], "not an array of numbers"),
+        (((None, (3,)),), {"speed": 1.0}, r"the keys \['speed'\]; the policy takes one array"),
+        (DICT_PARTS, {"speed": 1.0}, r"the keys \['speed'\]; the policy takes \['achieved', 'position', 'speed'\]"),
+        (
+            DICT_PARTS,
+            {"speed": 1.0, "position": [[1, 2]], "achieved": [1]},
+            r"observation\['achieved'\] has shape \(1,\)",
+        ),
+        (DICT_PARTS, {"speed": [1, 2], "position": [[1, 2]], "achieved": [1, 2]}, "differ in batch size"),
+        (DICT_PARTS, np.zeros(4), "takes a dict of"),
+    ],
+)
+def test_an_observation_of_another_task_is_refused(parts, observation, message):
+    with pytest.raises(InputError, match=message):
+        random_policy(contract(parts)).predict(observation)
+
+
+def test_the_policy_keeps_its_own_copy_of_the_layers():
+    network, agreement = random_network(Spec(2, 1)), contract()
+    policy = Policy(network, agreement)
+    before, _ = policy.predict(np.ones(2))
+    for layer in network.actor:
+        layer.weight[:] = 0.0
+        layer.bias[:] = 0.0
+    np.testing.assert_array_equal(policy.predict(np.ones(2))[0], before)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda network: network._replace(actor=network.actor[:-1]), "gives 8 outputs"),
+        (lambda network: network._replace(actor=network.actor[1:]), "after 2 inputs"),
+        (lambda network: network._replace(actor=()), "no layers"),
+        (lambda network: network._replace(activation="tanh"), "not as the contract says"),
+        (lambda network: network._replace(activation="gelu"), "'gelu'"),
+    ],
+)
+def test_layers_that_do_not_fit_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        Policy(change(random_network(Spec(2, 1))), contract())
+
+
+def test_a_policy_is_the_same_after_saving_and_loading(tmp_path):
+    policy = random_policy(contract(DICT_PARTS, (2, 3), low=-2.0, high=0.5))
+    policy.save(tmp_path / "policy.safetensors")
+    policy.contract.save(tmp_path / "contract.json")
+    again = Policy.load(tmp_path / "policy.safetensors", Contract.load(tmp_path / "contract.json"))
+    observations = np.random.default_rng(2).normal(size=(7, 5))
+    np.testing.assert_array_equal(again.predict(observations)[0], policy.predict(observations)[0])
+    assert again.contract.observation_parts == DICT_PARTS
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["contract.json", "policy.safetensors"]
+
+
+def test_equal_policies_are_equal_files(tmp_path):
+    for name in ("a", "b"):
+        random_policy(contract()).save(tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def save_run(directory: Path, evaluations: str = "", seeds=(0, 1, 2)) -> dict[int, Policy]:
+    folder = directory / "policy"
+    folder.mkdir(parents=True)
+    agreement = contract()
+    agreement.save(folder / "contract.json")
+    policies = {seed: random_policy(agreement, seed) for seed in seeds}
+    for seed, policy in policies.items():
+        policy.save(folder / f"seed_{seed}.safetensors")
+        random_policy(agreement, seed + 100).save(folder / f"seed_{seed}.best.safetensors")
+    if evaluations:
+        (directory / "evaluations.csv").write_text("seed,step,episode,return,length,success\n" + evaluations)
+    return policies
+
+
+def same(one: Policy, other: Policy) -> bool:
+    return bool(one.predict(np.ones(2))[0] == other.predict(np.ones(2))[0])
+
+
+def test_a_seed_is_loaded_by_its_label(tmp_path):
+    policies = save_run(tmp_path / "run")
+    assert same(load(tmp_path / "run", seed=2), policies[2])
+    assert not same(load(tmp_path / "run", seed=2, which="best"), policies[2])
+    assert same(load(tmp_path / "run", seed=2, which="best"), random_policy(contract(), 102))
+
+
+def test_the_best_seed_is_best_over_its_last_three_evaluation_points(tmp_path):
+    # Means of the last three points: seed 0: (1 + 1 + 30) / 3; seed 1: (12 + 12 + 12) / 3, its 99 being older;
+    # seed 2: (90, its own mean of 60 and 120, then 3 and 0) / 3 = 31.
+    returns = {0: [[0], [1], [1], [30]], 1: [[99], [12], [12], [12]], 2: [[0], [60, 120], [3], [0]]}
+    lines = [
+        f"{seed},{step},{episode},{value},10,"
+        for step in range(4)
+        for seed, points in returns.items()
+        for episode, value in enumerate(points[step])
+    ]
+    policies = save_run(tmp_path / "run", "\n".join(lines) + "\n")
+    assert same(load(tmp_path / "run"), policies[2])
+
+
+def test_a_line_that_is_still_being_written_does_not_count(tmp_path):
+    policies = save_run(tmp_path / "run", "0,1,0,5.0,10,\n1,1,0,6.0,10,\n2,1,0,99")
+    assert same(load(tmp_path / "run"), policies[1])
+
+
+def test_the_first_of_equal_seeds_and_the_only_seed_are_chosen(tmp_path):
+    policies = save_run(tmp_path / "tie", "2,1,0,5,10,\n1,1,0,5,10,\n")
+    assert same(load(tmp_path / "tie"), policies[1])
+    policies = save_run(tmp_path / "one", seeds=[4])
+    assert same(load(tmp_path / "one"), policies[4])
+
+
+def test_load_says_what_is_missing(tmp_path):
+    save_run(tmp_path / "run")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="not a directory"):
+        load(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="holds no policies"):
+        load(tmp_path / "empty")
+    with pytest.raises(InputError, match="no policy of seed 7; it has those of 0, 1, 2"):
+        load(tmp_path / "run", seed=7)
+    with pytest.raises(InputError, match="no evaluations to choose by: give a seed, one of 0, 1, 2"):
+        load(tmp_path / "run")
+    with pytest.raises(InputError, match="choose 'last' or 'best'"):
+        load(tmp_path / "run", which="first")  # pyright: ignore[reportArgumentType]
+    (tmp_path / "run" / "evaluations.csv").write_text("seed,step\n0,x\n")
+    with pytest.raises(InputError, match="damaged"):
+        load(tmp_path / "run")
+
+
+@pytest.mark.parametrize("damage", [lambda whole: whole[:-4], lambda whole: whole[:5], lambda whole: b"x" * 100])
+def test_a_damaged_policy_is_refused(tmp_path, damage):
+    save_run(tmp_path)
+    path = tmp_path / "policy" / "seed_0.safetensors"
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(InputError, match=r"seed_0\.safetensors is damaged"):
+        load(tmp_path, seed=0)
+
+
+def test_a_policy_that_is_not_a_number_is_refused(tmp_path):
+    network, agreement = random_network(Spec(2, 1)), contract()
+    network.actor[1].bias[3] = np.nan
+    Policy(network, agreement).save(tmp_path / "policy")
+    with pytest.raises(InputError, match="not finite float32"):
+        Policy.load(tmp_path / "policy", agreement)
+
+
+def test_a_policy_of_another_task_is_refused(tmp_path):
+    random_policy(contract()).save(tmp_path / "policy")
+    with pytest.raises(InputError, match="after 3 inputs"):
+        Policy.load(tmp_path / "policy", contract(((None, (3,)),)))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"schema_version": 2},
+        {"task": 3},
+        {"activation": "gelu"},
+        {"head": None},
+        {"observation_parts": []},
+        {"observation_parts": [{"key": None, "shape": [2.5]}]},
+        {"observation_parts": [{"key": "b", "shape": [1]}, {"key": "a", "shape": [1]}]},
+        {"observation_parts": [{"key": "a", "shape": [1]}, {"key": None, "shape": [1]}]},
+        {"observation_parts": [{"shape": [2]}]},
+        {"action_shape": [2]},
+        {"action_shape": "1"},
+        {"action_low": [float("nan")]},
+        {"action_low": [2.0]},
+        {"action_high": [[1.0]]},
+        {"action_high": ["far"]},
+    ],
+)
+def test_a_contract_that_is_not_of_the_schema_is_refused(tmp_path, change):
+    path = tmp_path / "contract.json"
+    contract().save(path)
+    fields = json.loads(path.read_text())
+    path.write_text(json.dumps(fields | change))
+    with pytest.raises(InputError, match="not a policy contract"):
+        Contract.load(path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "{}", "\xff"])
+def test_what_is_no_contract_at_all_is_refused(tmp_path, text):
+    path = tmp_path / "contract.json"
+    path.write_bytes(text.encode("latin1"))
+    with pytest.raises(InputError, match=r"contract\.json is not"):
+        Contract.load(path)
+
+
+def test_a_contract_without_a_named_task_is_kept(tmp_path):
+    replace(contract(), task=None).save(tmp_path / "contract.json")
+    assert Contract.load(tmp_path / "contract.json").task is None
+
+
+def test_a_policy_needs_neither_jax_nor_gymnasium():
+    code = "import csac.deploy.policy, sys; print({'jax', 'gymnasium', 'equinox'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
