@@ -1,0 +1,67 @@
+"""What Algorithm 1's relative entropy leaves over when it is read with mini-batches.
+
+The reference is then the actor itself at the moment both gradients are taken. This prints, for policies that get
+sharper and sharper, the mean and the standard deviation over the action noise of the actor loss's gradient with respect
+to the mean of the Gaussian: with `sampled`, with `closed_form`, and for SAC (weight 0). Expectations are exact up to
+rounding (Gauss-Hermite quadrature).
+
+    python examples/minibatch_reading.py
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac.algorithms.csac import CSAC
+from csac.algorithms.networks import MLP
+from csac.types import Layer
+
+BATCH = 256
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(64)
+
+
+def constant_policy(mean: float, std: float) -> MLP:
+    """Return an actor that gives the same one-dimensional Gaussian everywhere."""
+    return MLP((Layer(jnp.zeros((1, 2)), jnp.array([mean, np.log(std)])),))
+
+
+def flat_critics() -> tuple[MLP, MLP]:
+    """Return critics that say nothing, so that only the regularisers are left."""
+    critic = MLP((Layer(jnp.zeros((2, 1)), jnp.zeros(1)),))
+    return critic, critic
+
+
+def gradients(algorithm: CSAC, std: float) -> np.ndarray:
+    """Return dJ/dmean at every quadrature node of the action noise [64], with the actor as its own reference."""
+    actor = constant_policy(0.3, std)
+
+    def gradient(noise: jax.Array) -> jax.Array:
+        loss = jax.grad(lambda actor_: algorithm.actor_loss(actor_, actor, flat_critics(), jnp.zeros(1), noise)[0])
+        return loss(actor).layers[0].bias[0]
+
+    return np.asarray(jax.vmap(gradient)(jnp.asarray(NODES, jnp.float32)[:, None]), np.float64)
+
+
+def moments(values: np.ndarray) -> tuple[float, float]:
+    """Return mean and standard deviation of values at the quadrature nodes."""
+    mean = np.average(values, weights=WEIGHTS)
+    return float(mean), float(np.sqrt(np.average((values - mean) ** 2, weights=WEIGHTS)))
+
+
+def main() -> None:
+    """Print the table."""
+    sac = CSAC(relative_entropy_weight=0.0)
+    exact = CSAC(relative_entropy_estimator="closed_form", reference_policy="algorithm1")
+    sampled = CSAC(relative_entropy_estimator="sampled", reference_policy="algorithm1")
+    print("Gradient of the actor loss with respect to the mean; sigma = 0.2, tau = 0.5, flat critics")
+    print("       |    SAC (tau = 0)     |     closed_form      |       sampled        | sampled - closed_form,")
+    print("std    |      mean        std |      mean        std |      mean        std | mean of 256: std (tau/16std)")
+    for std in (1.0, 0.3, 0.1, 0.03, 0.01):
+        columns = [gradients(algorithm, std) for algorithm in (sac, exact, sampled)]
+        cells = " | ".join("{:+9.4f}  {:9.4f}".format(*moments(column)) for column in columns)
+        left_over = moments(columns[2] - columns[1])[1] / BATCH**0.5
+        print(f"{std:<6} | {cells} | {left_over:.4f} ({0.5 / BATCH**0.5 / std:.4f})")
+
+
+if __name__ == "__main__":
+    main()
