@@ -6,14 +6,15 @@ import multiprocessing
 import os
 import signal
 import traceback
+from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from csac.training.loop import Ended, Progress, Settings, train_group
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterator, Sequence
 
     from csac.training.loop import Event
 
@@ -54,7 +55,7 @@ def choose_groups(seeds: int, device: str) -> int:
 
 def run_groups(
     settings: Settings, groups: Sequence[Sequence[int]], should_stop: Callable[[], bool]
-) -> Iterator[tuple[int, Event | GroupCrashed]]:
+) -> Generator[tuple[int, Event | GroupCrashed], None, None]:
     """Train every group and yield (group, event) as they come. A single group is trained in this process."""
     if len(groups) == 1:
         for event in train_group(settings, groups[0], should_stop):
@@ -77,7 +78,7 @@ class _Worker:
         self.process = context.Process(target=_work, args=(theirs, settings, list(seeds)), daemon=True)
         self.step, self.over = 0, False
         self.cores: list[int] | None = None
-        with _single_threaded_products():
+        with _worker_surroundings():
             self.process.start()
         theirs.close()
 
@@ -103,7 +104,7 @@ class _Scheduler:
         self.waiting = list(workers)
         self.stopping = False
 
-    def run(self) -> Iterator[tuple[int, Event | GroupCrashed]]:
+    def run(self) -> Generator[tuple[int, Event | GroupCrashed], None, None]:
         self._hand_out()
         while running := [worker for worker in self.workers if not worker.over]:
             if not self.stopping and self.should_stop():
@@ -153,9 +154,7 @@ def _tell(worker: _Worker, cores: list[int] | None) -> None:
 
 
 def _work(connection: Connection, settings: Settings, seeds: list[int]) -> None:
-    """Train one group in a process of its own, one turn at a time. Signals are the parent's business."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
+    """Train one group in a process of its own, one turn at a time."""
     turns = _Turns(connection)
     try:
         turns.take()
@@ -192,21 +191,22 @@ class _Turns:
         return self.stopped
 
 
-class _single_threaded_products:  # noqa: N801
-    """A worker's NumPy starts with one thread: it evaluates small policies beside a learner that has the core."""
+@contextmanager
+def _worker_surroundings() -> Iterator[None]:
+    """What a worker inherits: products on one thread, since NumPy there only evaluates, and no signals.
 
-    NAMES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-
-    def __enter__(self) -> None:
-        self.before: dict[str, Any] = {name: os.environ.get(name) for name in self.NAMES}
-        os.environ.update(dict.fromkeys(self.NAMES, "1"))
-
-    def __exit__(self, *_: object) -> None:
-        for name, value in self.before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+    A Ctrl-C reaches every process of the terminal; the parent alone decides what it means.
+    """
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def _cause_of_death(exit_code: int | None) -> str:

@@ -9,7 +9,7 @@ import platform
 import signal
 import subprocess
 import threading
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     StopWhen = Callable[[int, dict[int, float]], bool]
 
 # Measured resident size of a worker process with JAX, MuJoCo and the compiled programs, before its replay.
-BYTES_PER_PROCESS = 450 * 2**20
+BYTES_PER_PROCESS = 550 * 2**20
 
 
 class Interrupted(Exception):  # noqa: N818
@@ -134,8 +134,8 @@ def train(
     log = TensorBoardLog(path / "tensorboard", labels) if tensorboard else None
     recorder = Recorder(run, parts, reporter, log)
     try:
-        with _signals() as (stop, received):
-            for group, event in run_groups(settings, parts, stop.is_set):
+        with _signals() as (stop, received), closing(run_groups(settings, parts, stop.is_set)) as events:
+            for group, event in events:
                 recorder.handle(group, event)
                 if _tell_caller(recorder, on_evaluation, stop_when):
                     stop.set()
