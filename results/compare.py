@@ -1,0 +1,60 @@
+"""Draw several runs in one picture and print their table: the figure and the numbers of a results folder.
+
+    python results/compare.py --title HalfCheetah-v4 --out results/halfcheetah-100k/curve.png \
+        "SAC=results/halfcheetah-100k/sac.csv" "SB3 SAC=results/halfcheetah-100k/sb3.csv"
+
+Each argument is a label and a file in the format of evaluations.csv. The others are compared with the first.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from csac.record.plots import learning_curve
+from csac.record.run import read_rows
+from csac.record.statistics import last_evaluations, maximum_average_return, mean_and_interval
+
+
+def up_to(rows: np.ndarray, step: int | None) -> np.ndarray:
+    """Return the rows of the evaluations until `step`, or all."""
+    return rows if step is None else rows[rows["step"] <= step]
+
+
+def table(runs: list[tuple[str, np.ndarray]]) -> str:
+    """Return a Markdown table: each run's last three evaluations and maximum average return."""
+    lines = [
+        "| run | seeds | steps | last three evaluations, mean ± std over seeds | 95 % t-interval | to the first "
+        "| maximum average return |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    first = None
+    for label, rows in runs:
+        last = np.array(list(last_evaluations(rows).values()))
+        mean, low, high = mean_and_interval(last)
+        first = mean if first is None else first
+        best, step = maximum_average_return(rows)
+        spread = last.std(ddof=1) if len(last) > 1 else float("nan")
+        lines.append(
+            f"| {label} | {len(last)} | {rows['step'].max():,} | {mean:.0f} ± {spread:.0f} | {low:.0f} to {high:.0f} "
+            f"| {mean / first:.2f} | {best:.0f} at {step:,} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Write the picture, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", metavar="LABEL=CSV")
+    parser.add_argument("--title", default="")
+    parser.add_argument("--until", type=int, help="leave out evaluations after this step")
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    pairs = [argument.partition("=")[::2] for argument in arguments.runs]
+    runs = [(label, up_to(read_rows(path), arguments.until)) for label, path in pairs]
+    learning_curve(runs, arguments.out, title=arguments.title)
+    print(table(runs))
+
+
+if __name__ == "__main__":
+    main()
