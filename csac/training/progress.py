@@ -6,23 +6,22 @@ import math
 import shlex
 import time
 from collections import deque
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich import box
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from csac.record.statistics import evaluation_matrix, last_evaluations, mean_and_interval
+from csac.training.console import duration, make_console, number, results_table, short
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from rich.console import RenderableType
+    from rich.console import Console, RenderableType
 
     from csac.record.run import RunDirectory
 
@@ -212,68 +211,6 @@ class Speed:
         return (last - first) / (end - begin) if end > begin and last > first else None
 
 
-def results_table(run: RunDirectory) -> Table:
-    """Return the results of a run, one row per seed: last evaluation, mean of the last three, best, episodes trained.
-
-    Below them the mean, standard deviation and 95 % t-interval over the seeds that did not fail. Their best is the best
-    evaluation of all seeds together (the paper's maximum average return), not the mean of each seed's own.
-    """
-    rows, failures = run.evaluations, run.manifest["failures"]
-    steps, seeds, returns = evaluation_matrix(rows)
-    trained, last_three = run.rows("episodes")["seed"], last_evaluations(rows, points=3)
-    largest = float(np.nanmax(np.abs(returns), initial=0.0))
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    for heading in ("seed", "last return", "last three", "best", "at step", "episodes"):
-        table.add_column(heading, justify="right")
-    for seed, line in zip(seeds.tolist(), returns, strict=True):
-        best = int(np.nanargmax(line))
-        values = (line[~np.isnan(line)][-1], last_three[seed], line[best])
-        cells = [*(number(value, largest) for value in values), f"{steps[best]:,}"]
-        style = "red" if str(seed) in failures else None
-        table.add_row(str(seed), *cells, f"{np.count_nonzero(trained == seed):,}", style=style)
-    sound = np.array([str(seed) not in failures for seed in seeds])
-    together = ~np.isnan(returns[sound]).any(axis=0)
-    if sound.sum() > 1 and together.any():
-        steps, returns = steps[together], returns[sound][:, together]
-        best = int(returns.mean(axis=0).argmax())
-        three = np.array([last_three[seed] for seed in seeds[sound].tolist()])
-        table.add_section()
-        for label, cells in _over_seeds(np.stack([returns[:, -1], three, returns[:, best]], axis=1), largest):
-            table.add_row(label, *cells, f"{steps[best]:,}" if label == "mean" else "", "")
-    return table
-
-
-def _over_seeds(values: np.ndarray, largest: float) -> Iterable[tuple[str, list[str]]]:
-    """Yield the summary rows for `values` [seed, column]."""
-    mean, _, high = mean_and_interval(values)
-    for label, row in (("mean", mean), ("± std", values.std(axis=0, ddof=1)), ("± 95 %", high - mean)):
-        yield label, [number(value, largest) for value in row]
-
-
-def number(value: float, largest: float | None = None) -> str:
-    """Return a return as people read it; `largest` sets the decimals for a whole column."""
-    size = abs(value) if largest is None else largest
-    return f"{value:,.{1 if size >= 100 else 2}f}"
-
-
-def short(steps: int) -> str:
-    """Return a number of steps in little room: 500, 12.5k, 1M."""
-    for size, suffix in ((1_000_000, "M"), (1_000, "k")):
-        if steps >= size:
-            return f"{steps / size:.4g}{suffix}"
-    return str(steps)
-
-
-def duration(seconds: float) -> str:
-    """Return a length of time with the two units that matter: 45 s, 3 min 20 s, 1 h 42 min, 2 d 3 h."""
-    whole = round(seconds)
-    for size, unit, smaller_size, smaller in ((86400, "d", 3600, "h"), (3600, "h", 60, "min"), (60, "min", 1, "s")):
-        if whole >= size:
-            count, rest = divmod(whole, size)
-            return f"{count} {unit}" + (f" {rest // smaller_size} {smaller}" if rest // smaller_size else "")
-    return f"{whole} s"
-
-
 def sparkline(values: Sequence[float], low: float, high: float, width: int) -> str:
     """Draw values between `low` and `high` in at most `width` characters, each the mean of its share; NaN is blank."""
     array = np.asarray(values, dtype=np.float64)
@@ -284,35 +221,6 @@ def sparkline(values: Sequence[float], low: float, high: float, width: int) -> s
         level = (part.mean() - low) / span if span > 0 else 0.5
         drawn += BLOCKS[min(max(int(level * len(BLOCKS)), 0), len(BLOCKS) - 1)] if math.isfinite(level) else " "
     return drawn
-
-
-def make_console() -> Console:
-    """Return a console on standard output that takes text as it is, and that goes quiet when nobody reads any more."""
-    console = Console(markup=False, emoji=False, highlight=False)
-    console.file = _Outliving(console.file)  # pyright: ignore[reportAttributeAccessIssue]
-    return console
-
-
-class _Outliving:
-    """A text file that swallows what can no longer be written: a run goes on after its terminal or pipe is gone."""
-
-    def __init__(self, file: IO[str]) -> None:
-        self._file = file
-
-    def write(self, text: str) -> int:
-        try:
-            return self._file.write(text)
-        except OSError:
-            return len(text)
-
-    def flush(self) -> None:
-        try:
-            self._file.flush()
-        except OSError:
-            return
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
 
 
 def _outcome(manifest: Mapping[str, Any], time_taken: str) -> str:

@@ -1,0 +1,175 @@
+"""From command lines to dataclasses: tyro, with every complaint in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import io
+import json
+import os
+import re
+from contextlib import contextmanager, redirect_stderr
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import tyro
+from tyro.conf import DisallowNone
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+Command = TypeVar("Command")
+
+# What tyro says, and how we say it; what is not here is passed on in tyro's own words.
+_COMPLAINTS = (
+    (r"Missing from .*?: (\S+).*", r"\1 is missing"),
+    (r"Missing value for argument '(.*?)'.*", r"\1 needs a value"),
+    (r"invalid choice '(.*?)' for argument '(.*?)'. Expected one of \((.*?),?\) ?\.?", r"\2: '\1' is not one of \3"),
+    (r"Error parsing (--\S+): .*Got errors: .*: (.*)", r"\1: \2"),
+    (r"Error parsing (--\S+): Could not find valid parse for arguments: (.*)", r"\1 does not take \2"),
+    (r"Error parsing (--\S+): (.*)", r"\1: \2"),
+    (r"Error parsing \S+: (.*)", r"\1"),
+)
+
+
+def parse(
+    command: type[Command],
+    arguments: list[str],
+    program: str,
+    elsewhere: Mapping[str, type[Any]] = MappingProxyType({}),
+) -> Command:
+    """Return the parsed arguments; print the help and raise SystemExit where it is asked for.
+
+    `elsewhere` are the dataclasses that other values of --algorithm would have, so that their options are known.
+
+    Raises:
+        InputError: tyro's complaint as one line, or an option that there is not.
+    """
+
+    def run(**options: Any) -> Any:
+        return tyro.cli(command, prog=program, args=arguments, registry=_numbers(), config=(DisallowNone,), **options)
+
+    if {"-h", "--help"} & set(arguments):
+        run()
+    complaint = io.StringIO()
+    try:
+        with _wide_terminal(), redirect_stderr(complaint):
+            parsed, unknown = run(return_unknown_args=True)
+    except SystemExit:
+        raise InputError(f"{_one_line(complaint.getvalue())} ({program} --help)") from None
+    if unknown:
+        raise InputError(f"{_unknown(unknown[0], command, elsewhere)} ({program} --help)")
+    return parsed
+
+
+def peek(arguments: list[str], option: str, default: Any) -> Any:
+    """Return the value of an option that decides which other options there are."""
+    value = default
+    for index, word in enumerate(arguments):
+        if word == option and index + 1 < len(arguments):
+            value = arguments[index + 1]
+        elif word.startswith(option + "="):
+            value = word.partition("=")[2]
+    return value
+
+
+def json_object(option: str, text: str) -> dict[str, Any]:
+    """Return the JSON object that an option was given. Raises InputError where it is none."""
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise InputError(f"{option} is not JSON ({error}): write it as '{{\"name\": 1.5}}'") from None
+    if not isinstance(value, dict):
+        raise InputError(f"{option} takes a JSON object such as '{{\"name\": 1.5}}', not {text}")
+    return value
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return "; did you mean ...?" with what resembles `word` most, or nothing."""
+    matches = difflib.get_close_matches(word, list(known), n=2)
+    return f"; did you mean {' or '.join(matches)}?" if matches else ""
+
+
+def _numbers() -> ConstructorRegistry:
+    """Return how numbers are read: 1_000_000 and 1e6 are whole numbers too."""
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        if info.type not in (int, float):
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="N" if info.type is int else "X",
+            instance_from_str=lambda words: _whole_number(words[0]) if info.type is int else _number(words[0]),
+            is_instance=lambda value: isinstance(value, int | info.type),
+            str_from_instance=lambda value: [f"{value:_}" if info.type is int else str(value)],
+        )
+
+    return registry
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a number") from None
+
+
+def _whole_number(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        value = _number(text)
+    if not value.is_integer():
+        raise ValueError(f"{text!r} is not a whole number")
+    return int(value)
+
+
+def _one_line(box: str) -> str:
+    """Return what tyro's box of text says in one line: what stands above its first rule."""
+    rows = [row.strip("│ ") for row in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines() if row.startswith("│")]
+    rule = next((index for index, row in enumerate(rows) if row and set(row) == {"─"}), len(rows))
+    text = " ".join(rows[:rule]) or box
+    for pattern, template in _COMPLAINTS:
+        if match := re.fullmatch(pattern, text):
+            return match.expand(template)
+    return " ".join(text.split())
+
+
+def _unknown(argument: str, command: type[Any], elsewhere: Mapping[str, type[Any]]) -> str:
+    if not argument.startswith("-"):
+        return f"there is no place for {argument!r}"
+    option = argument.partition("=")[0].replace("_", "-")
+    for name, kind in elsewhere.items():
+        if option in _options(kind):
+            return f"{option} is an option of {name}, which --algorithm {name} chooses"
+    return f"there is no option {option}{nearest(option, _options(command))}"
+
+
+def _options(kind: type[Any]) -> list[str]:
+    """Return the options that tyro makes of a dataclass; those of a dataclass within have no prefix."""
+    names: list[str] = []
+    for item in dataclasses.fields(kind):
+        if dataclasses.is_dataclass(item.default):
+            names += _options(type(item.default))
+        else:
+            names.append("--" + item.name.replace("_", "-"))
+    return names
+
+
+@contextmanager
+def _wide_terminal() -> Iterator[None]:
+    """Keep tyro from breaking its lines, which would break what they quote."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "10000"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = before

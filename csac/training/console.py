@@ -1,0 +1,185 @@
+"""Text for people: the console, numbers and lengths of time, and the tables that commands print."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+import psutil
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from csac.record.statistics import evaluation_matrix, last_evaluations, mean_and_interval
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from csac.record.run import RunDirectory
+    from csac.training.evaluation import EvaluationEpisode
+
+STATE_STYLES = {"running": "cyan", "finished": "green", "failed": "red", "interrupted": "yellow", "killed": "red"}
+WIDTH_ELSEWHERE = 200  # characters where there is no terminal: lines stay whole for grep
+
+
+def make_console() -> Console:
+    """Return a console on standard output that takes text as it is, and that goes quiet when nobody reads any more."""
+    width = None if sys.stdout.isatty() else WIDTH_ELSEWHERE
+    console = Console(markup=False, emoji=False, highlight=False, width=width)
+    console.file = _Outliving(console.file)  # pyright: ignore[reportAttributeAccessIssue]
+    return console
+
+
+def number(value: float, largest: float | None = None) -> str:
+    """Return a return as people read it; `largest` sets the decimals for a whole column."""
+    size = abs(value) if largest is None else largest
+    return f"{value:,.{1 if size >= 100 else 2}f}"
+
+
+def short(steps: int) -> str:
+    """Return a number of steps in little room: 500, 12.5k, 1M."""
+    for size, suffix in ((1_000_000, "M"), (1_000, "k")):
+        if steps >= size:
+            return f"{steps / size:.4g}{suffix}"
+    return str(steps)
+
+
+def duration(seconds: float) -> str:
+    """Return a length of time with the two units that matter: 45 s, 3 min 20 s, 1 h 42 min, 2 d 3 h."""
+    whole = round(seconds)
+    for size, unit, smaller_size, smaller in ((86400, "d", 3600, "h"), (3600, "h", 60, "min"), (60, "min", 1, "s")):
+        if whole >= size:
+            count, rest = divmod(whole, size)
+            return f"{count} {unit}" + (f" {rest // smaller_size} {smaller}" if rest // smaller_size else "")
+    return f"{whole} s"
+
+
+def results_table(run: RunDirectory) -> Table:
+    """Return the results of a run, one row per seed: last evaluation, mean of the last three, best, episodes trained.
+
+    Below them the mean, standard deviation and 95 % t-interval over the seeds that did not fail. Their best is the best
+    evaluation of all seeds together (the paper's maximum average return), not the mean of each seed's own.
+    """
+    rows, failures = run.evaluations, run.manifest["failures"]
+    steps, seeds, returns = evaluation_matrix(rows)
+    trained, last_three = run.rows("episodes")["seed"], last_evaluations(rows, points=3)
+    largest = float(np.nanmax(np.abs(returns), initial=0.0))
+    table = _table("seed", "last return", "last three", "best", "at step", "episodes")
+    for seed, line in zip(seeds.tolist(), returns, strict=True):
+        best = int(np.nanargmax(line))
+        values = (line[~np.isnan(line)][-1], last_three[seed], line[best])
+        cells = [*(number(value, largest) for value in values), f"{steps[best]:,}"]
+        style = "red" if str(seed) in failures else None
+        table.add_row(str(seed), *cells, f"{np.count_nonzero(trained == seed):,}", style=style)
+    sound = np.array([str(seed) not in failures for seed in seeds])
+    together = ~np.isnan(returns[sound]).any(axis=0)
+    if sound.sum() > 1 and together.any():
+        steps, returns = steps[together], returns[sound][:, together]
+        best = int(returns.mean(axis=0).argmax())
+        three = np.array([last_three[seed] for seed in seeds[sound].tolist()])
+        table.add_section()
+        for label, cells in _over_seeds(np.stack([returns[:, -1], three, returns[:, best]], axis=1), largest):
+            table.add_row(label, *cells, f"{steps[best]:,}" if label == "mean" else "", "")
+    return table
+
+
+def evaluation_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Table:
+    """Return one row per seed: mean, standard deviation and range of its episodes' returns, their mean length.
+
+    Where there are several seeds, the last row is the mean of their means with its 95 % t-interval.
+    """
+    returns = {seed: np.array([episode.episode_return for episode in result]) for seed, result in results.items()}
+    largest = max((float(np.abs(values).max()) for values in returns.values()), default=0.0)
+    has_success = any(episode.success is not None for result in results.values() for episode in result)
+    table = _table("seed", "mean return", "± std", "min", "max", "length", *["success"] * has_success)
+    for seed, values in returns.items():
+        std = values.std(ddof=1) if len(values) > 1 else 0.0
+        cells = [number(value, largest) for value in (values.mean(), std, values.min(), values.max())]
+        cells.append(f"{np.mean([episode.length for episode in results[seed]]):,.1f}")
+        if has_success:
+            cells.append(f"{np.mean([episode.success or 0.0 for episode in results[seed]]):.0%}")
+        table.add_row(str(seed), *cells)
+    if len(returns) > 1:
+        mean, _, high = mean_and_interval(np.array([values.mean() for values in returns.values()]))
+        table.add_section()
+        table.add_row("mean", number(float(mean), largest))
+        table.add_row("± 95 %", number(float(high - mean), largest))
+    return table
+
+
+def runs_table(runs: Sequence[RunDirectory]) -> Table:
+    """Return one row per run: what was trained, how far it is, its last return (mean over its seeds), where it is."""
+    table = _table("task", "algorithm", "seeds", "steps", "state", "last return", "directory")
+    for column in (0, 1, 4, 6):
+        table.columns[column].justify = "left"
+    table.columns[6].overflow = "fold"
+    for run in runs:
+        manifest, state = run.manifest, _state(run)
+        steps = f"{short(manifest['steps_done'])} / {short(manifest['steps'])}"
+        table.add_row(
+            Text(manifest["task"]),
+            manifest["algorithm"],
+            str(len(manifest["seeds"])),
+            steps,
+            Text(state, STATE_STYLES.get(state, "")),
+            _last_return(run),
+            Text(str(run.path)),
+        )
+    return table
+
+
+def _over_seeds(values: np.ndarray, largest: float) -> Iterable[tuple[str, list[str]]]:
+    """Yield the summary rows for `values` [seed, column]."""
+    mean, _, high = mean_and_interval(values)
+    for label, row in (("mean", mean), ("± std", values.std(axis=0, ddof=1)), ("± 95 %", high - mean)):
+        yield label, [number(value, largest) for value in row]
+
+
+def _state(run: RunDirectory) -> str:
+    """Return the state of the manifest, but see through a run whose process, on this machine, is no more."""
+    state, process = run.manifest["state"], run.manifest.get("process")
+    host = run.manifest.get("machine", {}).get("host", platform.node())
+    if state == "running" and process and host == platform.node() and not psutil.pid_exists(process):
+        return "killed"
+    return state
+
+
+def _last_return(run: RunDirectory) -> str:
+    try:
+        returns = last_evaluations(run.evaluations, points=1)
+    except InputError:
+        return "damaged"
+    return number(float(np.mean(list(returns.values())))) if returns else ""
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=box.SIMPLE, pad_edge=False)
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    return table
+
+
+class _Outliving:
+    """A text file that swallows what can no longer be written: a run goes on after its terminal or pipe is gone."""
+
+    def __init__(self, file: IO[str]) -> None:
+        self._file = file
+
+    def write(self, text: str) -> int:
+        try:
+            return self._file.write(text)
+        except OSError:
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            self._file.flush()
+        except OSError:
+            return
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)

@@ -1,0 +1,162 @@
+"""The policies of a finished run again, on fresh episodes: played for the eye, evaluated for the numbers."""
+
+from __future__ import annotations
+
+import os
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from csac.deploy.policy import load
+from csac.record.run import RunDirectory
+from csac.training.environments import FRESH_EVALUATION_SEED, Environment
+from csac.training.evaluation import EvaluationEpisode, Evaluator
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator
+
+DEFAULT_FRAMES_PER_SECOND = 30
+
+
+def evaluate_run(
+    directory: str | Path, seed: int | None = None, episodes: int = 10, deterministic: bool = True
+) -> Iterator[tuple[int, list[EvaluationEpisode]]]:
+    """Yield (seed, episodes) for the last policy of each seed of a run, or of the one asked for.
+
+    The episodes are the same for every seed, and none that training or its evaluations have seen.
+
+    Raises:
+        InputError: no run there, no such seed, a damaged file, or a task that can no longer be made.
+        EvaluationFailure: an environment raised, or gave what is not finite.
+    """
+    run = RunDirectory.open(directory)
+    evaluator = Evaluator(
+        run.manifest["task"], run.manifest.get("environment_arguments"), episodes, FRESH_EVALUATION_SEED
+    )
+    try:
+        for label in _seeds_with_policies(run) if seed is None else [seed]:
+            yield label, evaluator.run(load(directory, label), deterministic)
+    finally:
+        evaluator.close()
+
+
+def play(
+    directory: str | Path, seed: int | None = None, episodes: int = 1, video: str | Path | None = None
+) -> Iterator[EvaluationEpisode]:
+    """Yield the episodes that a run's policy plays, in a window or, with `video`, into an .mp4 file.
+
+    Without `seed` it is the seed with the best last evaluations. The video is there once the last episode was yielded.
+
+    Raises:
+        InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
+        EnvironmentFailure: the environment raised, or gave what is not finite.
+    """
+    run = RunDirectory.open(directory)
+    if episodes < 1:
+        raise InputError(f"{episodes} episodes: play at least one")
+    policy = load(directory, seed)
+    if video is None:
+        _require_display()
+    else:
+        _check_video(Path(video))
+        _draw_off_screen()
+    environment = Environment(
+        run.manifest["task"], run.manifest.get("environment_arguments"), "human" if video is None else "rgb_array"
+    )
+    try:
+        with _recording(environment, video) as record:
+            for number in range(episodes):
+                observation = environment.reset(FRESH_EVALUATION_SEED + number)
+                episode_return, length, ended = 0.0, 0, False
+                record()
+                while not ended:
+                    action = policy.act(observation[None])[0]
+                    observation, reward, terminated, truncated, _ = environment.step(action)
+                    episode_return, length, ended = episode_return + reward, length + 1, terminated or truncated
+                    record()
+                yield EvaluationEpisode(number, episode_return, length, None)
+    finally:
+        environment.close()
+
+
+def _seeds_with_policies(run: RunDirectory) -> list[int]:
+    seeds = [seed for seed in run.manifest["seeds"] if (run.path / "policy" / f"seed_{seed}.safetensors").exists()]
+    if not seeds:
+        raise InputError(f"{run.path} holds no policy yet: its first evaluation writes one")
+    return seeds
+
+
+def _require_display() -> None:
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError("there is no display to play on: write a video instead, with --video out.mp4")
+
+
+def _draw_off_screen() -> None:
+    """Have MuJoCo draw without a display. It reads this variable when it is first imported."""
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+
+
+def _check_video(path: Path) -> None:
+    if path.suffix.lower() != ".mp4":
+        raise InputError(f"the video is an .mp4 file: name it {path.with_suffix('.mp4')}")
+    if path.is_dir():
+        raise InputError(f"{path} is a directory: give the name of a file for the video")
+
+
+@contextmanager
+def _recording(environment: Environment, video: str | Path | None) -> Iterator[Callable[[], None]]:
+    """Yield a function that adds the present picture to the video, which gets its name once it is whole."""
+    if video is None:
+        yield lambda: None
+        return
+    path = Path(video)
+    aside = path.with_name(f".{os.getpid()}.{path.name}")
+    writer: list[Generator[None, Any, None]] = []
+
+    def record() -> None:
+        frame = _frame(environment)
+        if not writer:
+            writer.append(_open_video(aside, frame.shape, environment))
+        writer[0].send(frame)
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield record
+        for open_writer in writer:
+            open_writer.close()
+        aside.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}; choose another place") from error
+    finally:
+        for open_writer in writer:
+            open_writer.close()
+        aside.unlink(missing_ok=True)
+
+
+def _frame(environment: Environment) -> np.ndarray:
+    """Return the present picture, uint8 [height, width, 3]."""
+    try:
+        frame = environment.raw.render()
+    except Exception as error:
+        hint = "without a display MuJoCo needs the system's EGL library (Debian and Ubuntu: apt install libegl1)"
+        raise InputError(f"{environment.task_name} cannot be drawn: {' '.join(str(error).split())}; {hint}") from error
+    picture = np.asarray(frame)
+    if picture.ndim != 3 or picture.shape[2] < 3:
+        raise InputError(f"{environment.task_name} draws no pictures, so there is no video of it")
+    return np.ascontiguousarray(picture[:, :, :3], dtype=np.uint8)
+
+
+def _open_video(path: Path, shape: tuple[int, ...], environment: Environment) -> Generator[None, Any, None]:
+    import imageio_ffmpeg
+
+    frames_per_second = environment.raw.metadata.get("render_fps") or DEFAULT_FRAMES_PER_SECOND
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (shape[1], shape[0]), fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
+    )
+    writer.send(None)
+    return writer

@@ -1,0 +1,8 @@
+"""Before anything imports JAX: small processes, and a broadcast that raises the rank is an error."""
+
+import os
+
+os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
+os.environ["JAX_PLATFORMS"] = "cpu"
+for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[threads] = "1"
