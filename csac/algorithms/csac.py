@@ -149,9 +149,7 @@ class CSAC:
 
     def update(self, state: State, batch: Transition, key: jax.Array, step: jax.Array) -> tuple[State, Metrics]:
         """Take one gradient step on the critics, then one on the actor, then move the target critics."""
-        target_key, actor_key = jax.random.split(key)
-        target_noise = jax.random.normal(target_key, batch.action.shape)
-        actor_noise = jax.random.normal(actor_key, batch.action.shape)
+        target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         reference = self.reference_before(state, step)
 
         targets = jax.vmap(self.critic_target, in_axes=(None, None, None, 0, 0))(

@@ -136,9 +136,7 @@ class SAC:
 
     def update(self, state: State, batch: Transition, key: jax.Array, step: jax.Array) -> tuple[State, Metrics]:
         """Take one gradient step on the critics, the actor and the temperature, then move the target critics."""
-        target_key, actor_key = jax.random.split(key)
-        target_noise = jax.random.normal(target_key, batch.action.shape)
-        actor_noise = jax.random.normal(actor_key, batch.action.shape)
+        target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.log_temperature)
 
         targets = jax.vmap(self.critic_target, in_axes=(None, None, None, 0, 0))(

@@ -11,7 +11,7 @@ import numpy as np
 from csac.deploy.policy import Contract, Policy
 from csac.training.environments import SeedEnvironments
 from csac.training.evaluation import EvaluationFailure, Evaluator
-from csac.types import Layer, PolicyNetwork
+from csac.types import PolicyNetwork
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -132,39 +132,29 @@ class Learner:
     """The compiled programs of one group. Seeds are the leading axis of everything that enters and leaves.
 
     What is learnt is kept as a flat list of buffers, donated at every call: flattening nested modules in Python at
-    each environment step would cost more than the environment.
+    each environment step would cost more than the environment. A seed that is alone has no seed axis in there: for an
+    axis of size one XLA transposes the weight gradients, which costs 4-8 % of an update.
     """
 
     def __init__(self, algorithm: Algorithm, spec: Spec, seeds: Sequence[int], steps: int) -> None:
         self.algorithm, self.spec = algorithm, spec
+        self._is_alone = len(seeds) == 1
         self._metrics: list[str] = []
-        keys = np.stack([np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds])
-        carry = jax.jit(jax.vmap(lambda key: self._begin(key, steps)))(keys)
-        self.network = algorithm.policy(jax.tree.map(lambda leaf: leaf[0], carry[0]))  # for all but its layers
-        self._buffers, structure = jax.tree.flatten(carry)
         self._updates_summed = 0
-
-        def compiled(program: Callable) -> Callable:
-            def flat(buffers: list[jax.Array], rows: jax.Array, observations: jax.Array, step: jax.Array):
-                carry = jax.tree.unflatten(structure, buffers)
-                actions, carry = jax.vmap(program, in_axes=(0, 0, 0, None))(carry, rows, observations, step)
-                return actions, jax.tree.leaves(carry)
-
-            return jax.jit(flat, donate_argnums=0)
-
-        self._explore, self._learn = compiled(self._remember_and_explore), compiled(self._remember_and_learn)
-        self._structure = structure
-
-        def actor_layers(buffers: list[jax.Array]) -> tuple[Layer, ...]:
-            return jax.vmap(lambda state: algorithm.policy(state).actor)(jax.tree.unflatten(structure, buffers)[0])
-
-        self._actor_layers = jax.jit(actor_layers)
+        keys = np.stack([np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds])
+        begin = jax.jit(lambda key: self._begin(key, steps))
+        carry = begin(keys[0]) if self._is_alone else jax.vmap(begin)(keys)
+        self._buffers, self._structure = jax.tree.flatten(carry)
+        self._explore = self._compiled(self._remember_and_explore)
+        self._learn = self._compiled(self._remember_and_learn)
+        self.network = algorithm.policy(jax.eval_shape(lambda: carry[0]))  # for all but its layers
 
     def first_actions(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions [seed, action] for the first observations [seed, observation]."""
-        carry = jax.tree.unflatten(self._structure, self._buffers)
         act = self._uniform if self.algorithm.warmup_steps else self._act
-        return np.asarray(jax.jit(jax.vmap(act, in_axes=(0, 0, None)))(carry, observations, 0))
+        if self._is_alone:
+            return np.asarray(jax.jit(act)(self._carry, observations[0], 0))[None]
+        return np.asarray(jax.jit(jax.vmap(act, in_axes=(0, 0, None)))(self._carry, observations, 0))
 
     def step(self, observations: np.ndarray, actions: np.ndarray, outcome: Steps, step: int) -> np.ndarray:
         """Remember environment step number `step`, learn if the warm-up is over, and return the next actions.
@@ -192,21 +182,42 @@ class Learner:
 
     def networks(self) -> list[PolicyNetwork]:
         """Return each seed's policy as NumPy layers."""
-        layers = jax.tree.map(np.asarray, self._actor_layers(self._buffers))
-        return [
-            self.network._replace(actor=tuple(Layer(w[i].copy(), b[i].copy()) for w, b in layers))
-            for i in range(layers[0].bias.shape[0])
-        ]
+        layers = jax.tree.map(np.array, self.algorithm.policy(self._carry[0]).actor)
+        return [self.network._replace(actor=actor) for actor in self._by_seed(layers)]
 
     def take_metrics(self) -> list[dict[str, float]]:
         """Return each seed's metrics, averaged over the updates since the last call; none if there were no updates."""
         if not self._updates_summed:
             return []
-        carry = jax.tree.unflatten(self._structure, self._buffers)
-        means = np.asarray(carry[2]) / self._updates_summed
-        self._buffers = jax.tree.leaves((*carry[:2], jnp.zeros_like(carry[2]), *carry[3:]))
+        state, memory, sums, key_data = self._carry
+        means = np.asarray(sums) / self._updates_summed
+        self._buffers = jax.tree.leaves((state, memory, jnp.zeros_like(sums), key_data))
         self._updates_summed = 0
-        return [dict(zip(self._metrics, (float(value) for value in seed), strict=True)) for seed in means]
+        return [dict(zip(self._metrics, seed.tolist(), strict=True)) for seed in self._by_seed(means)]
+
+    @property
+    def _carry(self) -> tuple:
+        return jax.tree.unflatten(self._structure, self._buffers)
+
+    def _by_seed(self, tree: Any) -> list[Any]:
+        """Return one tree of NumPy arrays per seed."""
+        if self._is_alone:
+            return [tree]
+        seeds = len(jax.tree.leaves(tree)[0])
+        return [jax.tree.map(lambda leaf: leaf[i], tree) for i in range(seeds)]  # noqa: B023
+
+    def _compiled(self, program: Callable) -> Callable:
+        """Return a program of one seed as one dispatch for all: (buffers, rows, observations, step)."""
+
+        def flat(buffers: list[jax.Array], rows: jax.Array, observations: jax.Array, step: jax.Array):
+            carry = jax.tree.unflatten(self._structure, buffers)
+            if self._is_alone:
+                action, carry = program(carry, rows[0], observations[0], step)
+                return action[None], jax.tree.leaves(carry)
+            actions, carry = jax.vmap(program, in_axes=(0, 0, 0, None))(carry, rows, observations, step)
+            return actions, jax.tree.leaves(carry)
+
+        return jax.jit(flat, donate_argnums=0)
 
     # What follows speaks of one seed; a carry is (state, memory, sums of metrics, key data).
 
