@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     Row = Mapping[str, Any]
 
+FLUSH_SECONDS = 30
 EPISODES_AVERAGED = 100  # as Stable-Baselines3's rollout/ep_rew_mean
 
 
@@ -27,7 +28,7 @@ class TensorBoardLog:
     """
 
     def __init__(self, path: Path, seeds: Sequence[int], clock: Callable[[], float] = time.monotonic) -> None:
-        self._writers = {seed: SummaryWriter(str(path / f"seed_{seed}")) for seed in seeds}
+        self._writers = {seed: SummaryWriter(str(path / f"seed_{seed}"), flush_secs=FLUSH_SECONDS) for seed in seeds}
         self._recent: dict[int, deque[tuple[float, int]]] = {seed: deque(maxlen=EPISODES_AVERAGED) for seed in seeds}
         self._clock, self._began = clock, clock()
 
@@ -49,7 +50,7 @@ class TensorBoardLog:
             self._write(row["seed"], row["step"], values)
 
     def evaluations(self, rows: Sequence[Row]) -> None:
-        """Write the means over each evaluation's episodes, rows of evaluations.csv, and flush."""
+        """Write the means over each evaluation's episodes, rows of evaluations.csv."""
         for (seed, step), episodes in _grouped(rows).items():
             values = {
                 "eval/mean_reward": np.mean([row["return"] for row in episodes]),
@@ -59,7 +60,6 @@ class TensorBoardLog:
             if successes:
                 values["eval/success_rate"] = np.mean(successes)
             self._write(seed, step, values)
-            self._writers[seed].flush()
 
     def close(self) -> None:
         """Write what still waits and close the files. May be called again."""

@@ -54,7 +54,7 @@ class Reporter:
         self._began = self._spoke = clock()
 
     def start(
-        self, task: str, algorithm: str, seeds: list[int], steps: int, directory: Path, notes: Sequence[str] = ()
+        self, task: str, algorithm: str, seeds: list[int], steps: int, directory: str | Path, notes: Sequence[str] = ()
     ) -> None:
         """Say what is trained and where it goes; `steps` are environment steps per seed."""
         self._steps, self._directory = steps, str(directory)
@@ -211,7 +211,7 @@ class Speed:
         return (last - first) / (end - begin) if end > begin and last > first else None
 
 
-def sparkline(values: Sequence[float], low: float, high: float, width: int) -> str:
+def sparkline(values: Sequence[float] | np.ndarray, low: float, high: float, width: int) -> str:
     """Draw values between `low` and `high` in at most `width` characters, each the mean of its share; NaN is blank."""
     array = np.asarray(values, dtype=np.float64)
     parts = np.array_split(array, min(width, len(array))) if len(array) else []

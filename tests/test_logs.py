@@ -1,0 +1,78 @@
+import struct
+from collections import defaultdict
+
+import pytest
+from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+
+from csac.training.logs import TensorBoardLog
+
+
+def scalars(directory):
+    """Return {tag: [(step, value), ...]} of the event files in a directory."""
+    found = defaultdict(list)
+    for path in directory.glob("events.out.tfevents.*"):
+        data, position = path.read_bytes(), 0
+        while position < len(data):
+            (length,) = struct.unpack_from("<Q", data, position)
+            event = Event.FromString(data[position + 12 : position + 12 + length])
+            position += 12 + length + 4
+            for value in event.summary.value:
+                found[value.tag].append((event.step, value.simple_value))
+    return dict(found)
+
+
+@pytest.fixture
+def log(tmp_path):
+    times = iter([10.0, 12.0])
+    log = TensorBoardLog(tmp_path, [0, 7], clock=lambda: next(times))
+    yield log
+    log.close()
+
+
+def test_each_seed_has_a_directory_and_metrics_their_own_tags(log, tmp_path):
+    log.metrics([{"seed": 0, "step": 1000, "critic_loss": 0.5}, {"seed": 7, "step": 1000, "critic_loss": 0.25}])
+    log.close()
+
+    # 1000 steps from 10 s to 12 s.
+    assert scalars(tmp_path / "seed_0") == {"train/critic_loss": [(1000, 0.5)], "time/fps": [(1000, 500.0)]}
+    assert scalars(tmp_path / "seed_7") == {"train/critic_loss": [(1000, 0.25)], "time/fps": [(1000, 500.0)]}
+
+
+def test_training_episodes_are_averaged_over_the_last_hundred(log, tmp_path):
+    log.episodes([{"seed": 0, "step": step, "return": 1.0, "length": 10} for step in range(1, 101)])
+    log.episodes([{"seed": 0, "step": step, "return": 5.0, "length": 30} for step in range(101, 151)])
+    log.close()
+
+    # One point per call: a hundred ones, then fifty ones and fifty fives.
+    assert scalars(tmp_path / "seed_0") == {
+        "rollout/ep_rew_mean": [(100, 1.0), (150, 3.0)],
+        "rollout/ep_len_mean": [(100, 10.0), (150, 20.0)],
+    }
+    assert scalars(tmp_path / "seed_7") == {}
+
+
+def test_evaluations_are_averaged_per_seed_and_step(log, tmp_path):
+    log.evaluations(
+        [
+            {"seed": seed, "step": step, "episode": episode, "return": value, "length": 4, "success": success}
+            for seed, step, episode, value, success in [
+                (0, 10, 0, 1.0, 1.0),
+                (0, 10, 1, 2.0, 0.0),
+                (0, 20, 0, 5.0, None),
+                (7, 10, 0, 8.0, None),
+            ]
+        ]
+    )
+    log.close()
+
+    assert scalars(tmp_path / "seed_0") == {
+        "eval/mean_reward": [(10, 1.5), (20, 5.0)],
+        "eval/mean_ep_length": [(10, 4.0), (20, 4.0)],
+        "eval/success_rate": [(10, 0.5)],
+    }
+    assert scalars(tmp_path / "seed_7") == {"eval/mean_reward": [(10, 8.0)], "eval/mean_ep_length": [(10, 4.0)]}
+
+
+def test_closing_twice_is_harmless(log):
+    log.close()
+    log.close()
