@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import subprocess
 import sys
+from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from csac.training.environments import (
 from csac.types import InputError, Spec
 
 UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)
+DISORDERED = spaces.Dict(OrderedDict(z=UNIT, a=spaces.Box(-9, 9, (1, 2)), m=spaces.Box(-9, 9, ())))
 
 
 class Scripted(gymnasium.Env):
@@ -174,7 +176,7 @@ def test_the_paper_tasks_have_the_paper_sizes(task, spec):
         (spaces.Box(0, 255, (2,), np.uint8), np.array([255, 255], np.uint8), [255, 255]),
         (spaces.Box(-9, 9, (2,), np.int64), np.array([3, -4]), [3, -4]),
         (spaces.Box(-np.inf, np.inf, (2,), np.float64), np.array([1e30, -1e30]), [1e30, -1e30]),
-        (spaces.Dict(z=UNIT, a=spaces.Box(-9, 9, (1, 2))), {"z": [1.0], "a": [[2.0, 3.0]]}, [2, 3, 1]),
+        (DISORDERED, {"m": 4.0, "z": [1.0], "a": [[2.0, 3.0]]}, [2, 3, 4, 1]),
     ],
 )
 def test_observations_become_flat_float32(space, observation, flat):
