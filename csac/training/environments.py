@@ -37,7 +37,7 @@ def training_seed(seed: int, episode: int) -> int:
     return _FIRST_TRAINING_SEED + word % _FIRST_TRAINING_SEED
 
 
-class EnvironmentFailure(RuntimeError):  # noqa: N818
+class EnvironmentFailure(RuntimeError):
     """An environment raised, or gave what is not a finite number of the right shape. The message is one line."""
 
 

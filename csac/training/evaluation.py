@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 ROWS = 10  # of every batch that the policy sees: rounding depends on its shape
 
 
-class EvaluationFailure(RuntimeError):  # noqa: N818
+class EvaluationFailure(RuntimeError):
     """An evaluation environment raised, or gave what is not finite. The message names the episode and is one line."""
 
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 BYTES_PER_PROCESS = 550 * 2**20
 
 
-class Interrupted(Exception):  # noqa: N818
+class Interrupted(Exception):
     """Training was stopped by a signal; what was learnt is saved in `run`."""
 
     def __init__(self, run: RunDirectory, signal_number: int) -> None:
