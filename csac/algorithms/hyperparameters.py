@@ -17,7 +17,10 @@ POSITIVE: Limit = (lambda value: value > 0, "more than 0")
 NOT_NEGATIVE: Limit = (lambda value: value >= 0, "0 or more")
 COUNT: Limit = (lambda value: value >= 1, "at least 1")
 RATE: Limit = (lambda value: 0 < value <= 1, "more than 0 and at most 1")
-WIDTHS: Limit = (lambda value: all(isinstance(width, int) and width >= 1 for width in value), "widths of at least 1")
+WIDTHS: Limit = (
+    lambda value: isinstance(value, tuple | list) and all(_is_whole(width) and width >= 1 for width in value),
+    "a tuple of whole numbers of at least 1",
+)
 
 LIMITS: dict[str, Limit] = {
     "entropy_weight": NOT_NEGATIVE,
@@ -47,16 +50,21 @@ def check_hyperparameters(algorithm: Any) -> None:
     """
     hints = get_type_hints(type(algorithm))
     for field in dataclasses.fields(algorithm):
-        value = getattr(algorithm, field.name)
-        if get_origin(hints[field.name]) is Literal and value not in get_args(hints[field.name]):
-            raise InputError(f"{field.name} must be one of {', '.join(get_args(hints[field.name]))}, not {value!r}")
-        if hints[field.name] is int and (isinstance(value, bool) or not isinstance(value, int)):
+        value, hint = getattr(algorithm, field.name), hints[field.name]
+        if get_origin(hint) is Literal and value not in get_args(hint):
+            raise InputError(f"{field.name} must be one of {', '.join(get_args(hint))}, not {value!r}")
+        if hint is int and not _is_whole(value):
             raise InputError(f"{field.name} must be a whole number, not {value!r}")
-        if hints[field.name] in (float, float | None) and value is not None and not _is_finite(value):
+        optional = hint == float | None and value is None
+        if hint in (float, float | None) and not optional and not _is_finite(value):
             raise InputError(f"{field.name} must be a finite number, not {value!r}")
         accepts, words = LIMITS.get(field.name, (lambda _: True, ""))
         if not accepts(value):
             raise InputError(f"{field.name} must be {words}, not {value!r}")
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _is_finite(value: Any) -> bool:
