@@ -1,0 +1,109 @@
+"""From measurements to a table in Markdown: medians, ranges, and ratios of what was measured in the same repetition."""
+
+from __future__ import annotations
+
+import csv
+import statistics
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+
+
+class Measurement(NamedTuple):
+    """What one process, or the processes that run side by side, did in one window."""
+
+    repetition: int
+    setting: str
+    contender: str
+    steps_per_second: float  # environment steps, each with its update, of all seeds together
+    steps: int
+    seconds: float
+    start_seconds: float  # from launching the process to its first update: imports, compilation, warm-up
+    peak_mib: float  # resident memory, all processes together
+    other_load: float  # processors that other programs kept busy meanwhile, the hypervisor's share included
+
+
+class Reach(NamedTuple):
+    """A ratio that is to be reached between two contenders of one setting."""
+
+    setting: str
+    contender: str
+    peer: str
+    ratio: float
+
+
+def ratios(measurements: Sequence[Measurement], setting: str, contender: str, peer: str) -> list[float]:
+    """Return the ratio of steps per second, one for each repetition that has both."""
+    ours, theirs = (
+        {m.repetition: m.steps_per_second for m in measurements if (m.setting, m.contender) == (setting, name)}
+        for name in (contender, peer)
+    )
+    return [ours[repetition] / theirs[repetition] for repetition in sorted(ours.keys() & theirs.keys())]
+
+
+def markdown(measurements: Sequence[Measurement], reaches: Sequence[Reach], machine: Sequence[str]) -> str:
+    """Return the whole report: what was to be reached, everything measured, and on what."""
+    parts = [_reached(measurements, reaches), _measured(measurements), "\n".join(f"- {line}" for line in machine)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def write_csv(path: Path, measurements: Sequence[Measurement]) -> None:
+    """Write one row for each measurement, in the order in which they were made."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(Measurement._fields)
+        for measurement in measurements:
+            writer.writerow([f"{value:.4g}" if isinstance(value, float) else value for value in measurement])
+
+
+def write_between_markers(path: Path, text: str) -> None:
+    """Replace what stands between the markers of the Markdown file `path`, which is made if there is none."""
+    before = path.read_text() if path.exists() else f"{BEGIN}\n{END}\n"
+    head, begin, rest = before.partition(BEGIN)
+    _, end, tail = rest.partition(END)
+    if not (begin and end):
+        raise SystemExit(f"{path} lacks the lines {BEGIN} and {END}, between which the table goes")
+    path.write_text(f"{head}{BEGIN}\n{text}{END}{tail}")
+
+
+def _reached(measurements: Sequence[Measurement], reaches: Sequence[Reach]) -> str:
+    rows = []
+    for setting, contender, peer, wanted in reaches:
+        if found := ratios(measurements, setting, contender, peer):
+            ratio = statistics.median(found)
+            verdict = "yes" if ratio >= wanted else "**no**"
+            rows.append([setting, f"{contender} / {peer}", f">= {wanted}", _with_range(found, ".2f"), verdict])
+    return _table(["setting", "ratio of steps/s", "to reach", "measured", "reached"], rows) if rows else ""
+
+
+def _measured(measurements: Sequence[Measurement]) -> str:
+    rows = []
+    for setting, contender in dict.fromkeys((m.setting, m.contender) for m in measurements):
+        mine = [m for m in measurements if (m.setting, m.contender) == (setting, contender)]
+        speeds = [m.steps_per_second for m in mine]
+        against = ratios(measurements, setting, "csac SAC", contender)
+        rows.append(
+            [
+                setting,
+                contender,
+                _with_range(speeds, ".0f"),
+                _with_range(against, ".2f") if against and contender != "csac SAC" else "",
+                f"{statistics.median(m.start_seconds for m in mine):.1f}",
+                f"{max(m.peak_mib for m in mine):.0f}",
+            ]
+        )
+    return _table(["setting", "", "steps/s", "csac SAC / this", "start, s", "peak memory, MiB"], rows)
+
+
+def _with_range(values: Sequence[float], form: str) -> str:
+    median = f"{statistics.median(values):{form}}"
+    return f"{median} ({min(values):{form}} to {max(values):{form}})" if len(values) > 1 else median
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
