@@ -12,12 +12,13 @@ SEEDS ?= 2
 ARGS ?=
 
 SETUP := .venv/.installed
+PEERS := .venv-peers/.installed
 
 define require_python
 @test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
 endef
 
-.PHONY: help setup train test check lock clean
+.PHONY: help setup train test check lock clean peers bench
 
 help:  ## List the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
@@ -37,6 +38,11 @@ check: $(SETUP)  ## Check format, lint, types and the direction of imports
 	.venv/bin/pyright
 	.venv/bin/lint-imports
 
+peers: $(PEERS)  ## Install stable-baselines3 and SBX into .venv-peers, to measure against
+
+bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS))  ## Measure speed beside the peers, 12 minutes: make bench ARGS=--quick
+	.venv/bin/python benchmarks/speed.py --out benchmarks $(ARGS)
+
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml
 	$(UV) pip compile pyproject.toml --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
 		--no-emit-index-url --no-annotate --no-header --quiet --output-file requirements.lock
@@ -50,6 +56,13 @@ $(SETUP): requirements.lock pyproject.toml | $(UV)
 	@test -x .venv/bin/python || $(UV) venv --quiet --python "$$(command -v $(PYTHON))" .venv
 	@$(UV) pip sync --quiet --python .venv/bin/python --require-hashes requirements.lock
 	@$(UV) pip install --quiet --python .venv/bin/python --no-deps --editable .
+	@touch $@
+
+$(PEERS): benchmarks/requirements-peers.txt
+	$(require_python)
+	@echo "Installing the peers into .venv-peers"
+	@test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
+	@.venv-peers/bin/python -m pip install --quiet --requirement $<
 	@touch $@
 
 .tools/bin/uv:
