@@ -1,0 +1,257 @@
+"""What CSAC is in theory: its exact improvement step, tabular CVI, DPP and SAC, and what Algorithm 1 leaves of it."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.special import logsumexp, softmax
+
+from csac.algorithms import CSAC, SAC
+from csac.algorithms.csac import regularised_value
+from csac.types import Spec, Transition
+
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(80)
+WEIGHTS = WEIGHTS / WEIGHTS.sum()  # the mean over ξ ~ N(0, 1) of f(ξ) is WEIGHTS @ f(NODES)
+ONE_OBSERVATION = jnp.zeros(1)
+REFERENCE_POLICIES = ["algorithm1", "previous", "periodic", "average"]
+ESTIMATORS = ["sampled", "closed_form"]
+
+
+def q_value(action):
+    """A value with a bend, no symmetry, and its best action away from 0."""
+    return 1.5 * action - 2.0 * action**2 + 0.4 * np.sin(5.0 * action)
+
+
+def critic(inputs: jax.Array) -> jax.Array:
+    action = inputs[1:]
+    return 1.5 * action - 2.0 * action**2 + 0.4 * jnp.sin(5.0 * action)
+
+
+def actor_losses(algorithm, parameters, reference, noises):
+    """The actor loss at each noise, of the policy with these [mean, log_std] at the only observation."""
+
+    def loss(noise):
+        actor, previous = (lambda _: parameters), (lambda _: reference)
+        return algorithm.actor_loss(actor, previous, (critic, critic), ONE_OBSERVATION, noise[None])[0]
+
+    return jax.vmap(loss)(noises)
+
+
+def test_algorithm1_has_no_expected_gradient_of_the_relative_entropy():
+    # With π̃ = π at u = mean + std ξ, log π(u) does not move with the mean, and -log π̃(u) has the slope ξ / std there;
+    # in log_std the slopes are -1 and ξ². So the gradient of τ (log π - log π̃) is τ [ξ / std, ξ² - 1]: its mean over
+    # ξ ~ N(0, 1) is 0, but at one noise it is not.
+    tau, parameters = 0.5, jnp.array([0.3, -0.7])
+
+    def gradients(relative_entropy_weight):
+        algorithm = CSAC(relative_entropy_weight=relative_entropy_weight, relative_entropy_estimator="sampled")
+        return jax.jacobian(lambda p: actor_losses(algorithm, p, parameters, jnp.float32(NODES)))(parameters)
+
+    part = np.asarray(gradients(tau) - gradients(0.0))
+    expected = tau * np.stack([NODES / np.exp(-0.7), NODES**2 - 1.0], axis=1)
+    likely = np.abs(NODES) < 4
+    np.testing.assert_allclose(part[likely], expected[likely], atol=1e-3)
+    np.testing.assert_allclose(WEIGHTS @ part, [0.0, 0.0], atol=1e-5)
+    assert np.abs(part[likely]).max() > 1.0
+
+
+SPEC = Spec(3, 2)
+SMALL = {
+    "discount": 0.9,
+    "target_rate": 0.05,
+    "actor_learning_rate": 3e-3,
+    "critic_learning_rate": 3e-3,
+    "actor_hidden_sizes": (16, 16),
+    "critic_hidden_sizes": (16, 16),
+    "entropy_weight": 0.2,
+}
+
+
+def after_updates(algorithm, updates=50):
+    """The state after some updates on random batches, the same for every algorithm."""
+
+    def one(state, step):
+        key = jax.random.fold_in(jax.random.key(0), step)
+        vectors = jax.random.normal(key, (32, 2 * SPEC.observation_size))
+        action = jax.random.uniform(key, (32, SPEC.action_size), minval=-1.0)
+        reward, terminated = action.sum(axis=1), (vectors[:, 0] > 1).astype(jnp.float32)
+        batch = Transition(vectors[:, :3], action, reward, vectors[:, 3:], terminated, jnp.zeros(32))
+        return algorithm.update(state, batch, key, step)[0], None
+
+    state = algorithm.init(jax.random.key(1), SPEC)
+    return jax.jit(lambda state: jax.lax.scan(one, state, jnp.arange(updates))[0])(state)
+
+
+@pytest.fixture(scope="module")
+def sac_state():
+    return after_updates(SAC(temperature="fixed", **SMALL))
+
+
+def assert_equals_sac(state, sac_state):
+    for name in ("actor", "critics", "target_critics", "actor_optimiser", "critic_optimiser"):
+        ours, theirs = jax.tree.leaves(getattr(state, name)), jax.tree.leaves(getattr(sac_state, name))
+        for our, their in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(our, their, rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("reference_policy", REFERENCE_POLICIES)
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_without_relative_entropy_csac_is_sac(reference_policy, estimator, sac_state):
+    algorithm = CSAC(
+        relative_entropy_weight=0.0,
+        reference_policy=reference_policy,
+        reference_period=7,
+        relative_entropy_estimator=estimator,
+        **SMALL,
+    )
+    assert_equals_sac(after_updates(algorithm), sac_state)
+
+
+def test_algorithm1_with_the_closed_form_is_sac(sac_state):
+    algorithm = CSAC(
+        relative_entropy_weight=0.5, reference_policy="algorithm1", relative_entropy_estimator="closed_form", **SMALL
+    )
+    assert_equals_sac(after_updates(algorithm), sac_state)
+
+
+@pytest.mark.parametrize("reference_policy", ["previous", "periodic", "average"])
+def test_every_other_reference_policy_changes_what_is_learnt(reference_policy, sac_state):
+    algorithm = CSAC(relative_entropy_weight=0.5, reference_policy=reference_policy, **SMALL)
+    with pytest.raises(AssertionError, match="actor"):
+        assert_equals_sac(after_updates(algorithm), sac_state)
+
+
+def best_tanh_gaussian(sigma, tau, mean, log_std):
+    """Minimise KL(π ‖ π̃^α exp(βQ) / Z) over tanh-Gaussians π by integrating over actions: ([mean, log_std], J)."""
+    alpha, beta = tau / (tau + sigma), 1.0 / (tau + sigma)
+    u = np.linspace(-12.0, 12.0, 8001)
+    log_width = np.log(u[1] - u[0]) + np.log(4.0) - 2.0 * np.logaddexp(u, -u)  # da = 4 du / (eᵘ + e⁻ᵘ)²
+
+    def log_density(mean, log_std):
+        log_gaussian = -0.5 * ((u - mean) / np.exp(log_std)) ** 2 - log_std - 0.5 * np.log(2 * np.pi)
+        return log_gaussian - (log_width - np.log(u[1] - u[0]))
+
+    log_target = alpha * log_density(mean, log_std) + beta * q_value(np.tanh(u))
+    log_z = logsumexp(log_target + log_width)
+
+    def divergence(parameters):
+        log_pi = log_density(*parameters)
+        return np.exp(log_pi + log_width) @ (log_pi - log_target + log_z)
+
+    best = minimize(divergence, [mean, log_std], method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-12})
+    return best.x, (best.fun - log_z) / beta  # J is the divergence over β, without the normaliser
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize(("sigma", "tau"), [(0.2, 0.5), (0.05, 1.0), (0.3, 0.0)])
+def test_descending_the_actor_loss_reaches_the_exact_improvement(estimator, sigma, tau):
+    algorithm = CSAC(entropy_weight=sigma, relative_entropy_weight=tau, relative_entropy_estimator=estimator)
+    mean, log_std = -0.4, -0.6
+    expected, expected_loss = best_tanh_gaussian(sigma, tau, mean, log_std)
+    with jax.enable_x64(True):
+        reference, weights, nodes = jnp.array([mean, log_std]), jnp.array(WEIGHTS), jnp.array(NODES)
+
+        def loss(parameters):
+            return weights @ actor_losses(algorithm, parameters, reference, nodes)
+
+        descend = jax.jit(lambda start: jax.lax.fori_loop(0, 3000, lambda _, p: p - 0.1 * jax.grad(loss)(p), start))
+        reached = descend(reference)
+        np.testing.assert_allclose(reached, expected, atol=1e-4)
+        assert float(loss(reached)) == pytest.approx(expected_loss, abs=1e-6)
+
+
+STATES, ACTIONS, DISCOUNT = 4, 7, 0.9
+GENERATOR = np.random.default_rng(0)
+REWARD = GENERATOR.normal(size=(STATES, ACTIONS))
+DYNAMICS = GENERATOR.dirichlet(np.full(STATES, 0.3), size=(STATES, ACTIONS))  # [state, action, next state]
+FIRST_Q = GENERATOR.normal(size=(STATES, ACTIONS))
+FIRST_POLICY = np.log(GENERATOR.dirichlet(np.ones(ACTIONS), size=STATES))  # log π_(-1)
+
+
+def expected_value(q, log_policy, log_reference, sigma, tau):
+    """The policy's mean of the code's bracket [state]: as an actor's objective, and as what a critic looks ahead to."""
+    bracket = regularised_value(q, log_policy, log_policy - log_reference, sigma, tau)
+    return jnp.sum(jnp.exp(log_policy) * bracket, axis=1)
+
+
+def improve(q, log_reference, sigma, tau):
+    """Maximise the code's bracket over all policies: log π.
+
+    The objective is (linear in π) - (τ + σ) Σ π log π, so one mirror step of size β = 1 / (τ + σ) from any policy, here
+    the uniform one, ends in the maximum.
+    """
+    log_policy = jnp.full_like(q, -jnp.log(q.shape[1]))
+    slope = jax.grad(lambda policy: expected_value(q, jnp.log(policy), log_reference, sigma, tau).sum())(
+        jnp.exp(log_policy)
+    )
+    return jax.nn.log_softmax(log_policy + slope / (tau + sigma), axis=1)
+
+
+def iterate(sigma, tau, iterations):
+    """The equations, exactly: yields (Q_k, log π_k, V_k). The critic's reference is π_(k-1), the actor's is π_k."""
+
+    @jax.jit
+    def step(q, log_before):
+        log_policy = improve(q, log_before, sigma, tau)
+        value = expected_value(q, log_policy, log_before, sigma, tau)
+        return log_policy, value, REWARD + DISCOUNT * DYNAMICS @ value
+
+    with jax.enable_x64(True):
+        q, log_policy = jnp.array(FIRST_Q), jnp.array(FIRST_POLICY)
+        for _ in range(iterations):
+            before = q
+            log_policy, value, q = step(q, log_policy)
+            yield np.asarray(before), np.asarray(log_policy), np.asarray(value)
+
+
+def soft_value_iteration(sigma):
+    """The fixed point of SAC, by iterating V = σ log Σ exp(Q / σ)."""
+    q = np.zeros((STATES, ACTIONS))
+    for _ in range(500):
+        q = REWARD + DISCOUNT * DYNAMICS @ (sigma * logsumexp(q / sigma, axis=1))
+    return q
+
+
+@pytest.mark.parametrize(("sigma", "tau"), [(0.2, 0.5), (0.5, 0.05), (0.2, 5.0), (0.0, 0.5), (0.2, 0.0)])
+def test_the_equations_are_conservative_value_iteration(sigma, tau):
+    # CVI (Kozuno et al. 2019) knows only preferences P, with m P = (1/β) log Σ exp(βP):
+    #   P_(k+1) = r + γ E[m P_k] + α (P_k - m P_k), from P_0 = τ log π_(-1) + Q_0,
+    # its policy is π_k ∝ exp(βP_k) and its value m P_k. With σ = 0, α = 1: that is DPP. With τ = 0, α = 0: SAC.
+    alpha, beta = tau / (tau + sigma), 1.0 / (tau + sigma)
+    preference = tau * FIRST_POLICY + FIRST_Q
+    for _, log_policy, value in iterate(sigma, tau, 40):
+        soft_maximum = logsumexp(beta * preference, axis=1) / beta
+        np.testing.assert_allclose(np.exp(log_policy), softmax(beta * preference, axis=1), atol=1e-9)
+        np.testing.assert_allclose(value, soft_maximum, atol=1e-9)
+        preference = REWARD + DISCOUNT * DYNAMICS @ soft_maximum + alpha * (preference - soft_maximum[:, None])
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.05, 0.5, 5.0])
+def test_the_fixed_point_is_that_of_sac_whatever_the_relative_entropy_weighs(tau):
+    # At a fixed point π^(1-α) ∝ exp(βQ), and β / (1 - α) = 1/σ; the log-ratio is zero. α is 0.96 for τ = 5.
+    sigma = 0.2
+    *_, (q, log_policy, _) = iterate(sigma, tau, 1000)
+    expected = soft_value_iteration(sigma)
+    np.testing.assert_allclose(q, expected, atol=1e-8)
+    np.testing.assert_allclose(np.exp(log_policy), softmax(expected / sigma, axis=1), atol=1e-8)
+
+
+def test_relative_entropy_slows_the_policy_down():
+    """With a larger weight the policy has moved less from its start after a few iterations."""
+
+    def moved(tau):
+        *_, (_, log_policy, _) = iterate(0.2, tau, 2)
+        return np.abs(np.exp(log_policy) - np.exp(FIRST_POLICY)).sum()
+
+    assert moved(50.0) < moved(5.0) < moved(0.5)
+
+
+def test_dynamic_policy_programming_finds_the_optimal_policy():
+    q = np.zeros((STATES, ACTIONS))
+    for _ in range(500):
+        q = REWARD + DISCOUNT * DYNAMICS @ q.max(axis=1)
+    *_, (_, log_policy, _) = iterate(0.0, 0.5, 500)
+    assert np.exp(log_policy)[np.arange(STATES), q.argmax(axis=1)].min() > 0.999

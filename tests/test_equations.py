@@ -1,0 +1,284 @@
+"""Every equation against numbers worked by hand, and the order of the steps within one update."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac.algorithms import CSAC, SAC
+from csac.algorithms import csac as csac_file
+from csac.algorithms import sac as sac_file
+from csac.algorithms.distributions import kl, policy_at
+from csac.algorithms.networks import MLP, descend, make_optimiser, polyak
+from csac.types import Layer, Spec, Transition
+
+ONE = Spec(1, 1)
+
+
+def linear(weight: list[list[float]], bias: list[float]) -> MLP:
+    return MLP((Layer(jnp.array(weight), jnp.array(bias)),))
+
+
+def gaussian(mean: float, std: float) -> MLP:
+    """A policy that is tanh(N(mean, std²)) everywhere."""
+    return linear([[0.0, 0.0]], [mean, math.log(std)])
+
+
+def transition(observation=1.0, action=0.5, reward=2.0, next_observation=1.0, terminated=0.0, truncated=0.0):
+    observation, action, next_observation = (np.array([x], np.float32) for x in (observation, action, next_observation))
+    reward, terminated, truncated = (np.array(x, np.float32) for x in (reward, terminated, truncated))
+    return Transition(observation, action, reward, next_observation, terminated, truncated)
+
+
+def batch_of(*transitions: Transition) -> Transition:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *transitions)
+
+
+@partial(jax.jit, static_argnums=0)
+def update(algorithm, state, batch: Transition, step: int = 0):
+    return algorithm.update(state, batch, jax.random.key(step), step)
+
+
+# Policy tanh(N(0, 1)), reference tanh(N(1, 2²)), noise 0.5, so u = 0.5, a = tanh 0.5 = 0.4621172, 1 - a² = 0.7864477.
+# log N(u; 0, 1) = -0.125 - 0.9189385              = -1.0439385
+# log N(u; 1, 2²) = -0.03125 - 0.6931472 - 0.9189385 = -1.6433357
+# log π = -1.0439385 - log 0.7864477 = -1.0439385 + 0.2402290 = -0.8037095;  log π̃ = -1.6433357 + 0.2402290 = -1.4031067
+# sampled: log π - log π̃ = 0.5993972;  closed form: KL = log 2 + (1² + 1²) / (2·2²) - 1/2 = 0.4431472
+# Q₁ = s + 2a = 1.9242343, Q₂ = 3 - a = 2.5378828 at s = 1, so min Q = 1.9242343
+POLICY, REFERENCE, NOISE = gaussian(0.0, 1.0), gaussian(1.0, 2.0), jnp.array([0.5])
+CRITICS = (linear([[1.0], [2.0]], [0.0]), linear([[0.0], [-1.0]], [3.0]))
+
+
+def csac(**settings) -> CSAC:
+    return CSAC(**{"entropy_weight": 0.2, "relative_entropy_weight": 0.5, "discount": 0.9, **settings})
+
+
+@pytest.mark.parametrize(
+    ("estimator", "terminated", "truncated", "expected"),
+    [
+        # 2 + 0.9 (1.9242343 + 0.2·0.8037095 - 0.5·0.5993972) = 2 + 0.9·1.7852776
+        ("sampled", 0.0, 0.0, 3.6067499),
+        # 2 + 0.9 (1.9242343 + 0.2·0.8037095 - 0.5·0.4431472) = 2 + 0.9·1.8634026
+        ("closed_form", 0.0, 0.0, 3.6770624),
+        ("sampled", 1.0, 0.0, 2.0),  # nothing follows
+        ("sampled", 1.0, 1.0, 2.0),
+        ("sampled", 0.0, 1.0, 3.6067499),  # the environment was only stopped: the target looks ahead
+    ],
+)
+def test_csac_critic_target(estimator, terminated, truncated, expected):
+    step = transition(terminated=terminated, truncated=truncated)
+    target = csac(relative_entropy_estimator=estimator).critic_target(POLICY, REFERENCE, CRITICS, step, NOISE)
+    assert float(target) == pytest.approx(expected, abs=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "expected"),
+    [
+        # 0.7 log π - 0.5 log π̃ - min Q = -0.5625967 + 0.7015534 - 1.9242343
+        ("sampled", -1.7852776),
+        # 0.2 log π + 0.5 KL - min Q = -0.1607419 + 0.2215736 - 1.9242343
+        ("closed_form", -1.8634026),
+    ],
+)
+def test_csac_actor_loss(estimator, expected):
+    algorithm = csac(relative_entropy_estimator=estimator)
+    loss, metrics = algorithm.actor_loss(POLICY, REFERENCE, CRITICS, jnp.array([1.0]), NOISE)
+    assert float(loss) == pytest.approx(expected, abs=2e-6)
+    assert float(metrics["q_mean"]) == pytest.approx(1.9242343, abs=1e-6)
+    assert float(metrics["entropy"]) == pytest.approx(0.8037095, abs=1e-6)
+
+
+@pytest.mark.parametrize(("terminated", "truncated", "expected"), [(0, 0, 3.8764787), (1, 0, 2.0), (0, 1, 3.8764787)])
+def test_sac_critic_target(terminated, truncated, expected):
+    # 2 + 0.9 (1.9242343 + 0.2·0.8037095) = 2 + 0.9·2.0849762
+    step = transition(terminated=terminated, truncated=truncated)
+    target = SAC(discount=0.9).critic_target(POLICY, CRITICS, jnp.float32(0.2), step, NOISE)
+    assert float(target) == pytest.approx(expected, abs=2e-6)
+
+
+def test_sac_actor_loss():
+    loss, _ = SAC().actor_loss(POLICY, CRITICS, jnp.float32(0.2), jnp.array([1.0]), NOISE)
+    assert float(loss) == pytest.approx(-2.0849762, abs=2e-6)
+
+
+@pytest.mark.parametrize("file", [csac_file, sac_file])
+def test_critic_loss_sums_both_critics(file):
+    # Q₁(1, 0.5) = 2 and Q₂(1, 0.5) = 2.5 with target 3: 1² + 0.5²
+    assert float(file.critic_loss(CRITICS, transition(), jnp.float32(3.0))) == pytest.approx(1.25)
+
+
+def test_temperature_rises_where_the_entropy_is_below_its_target():
+    # d/d(log α) [log α (entropy - target)] = entropy - target = -2 - (-1) = -1, and descent goes against it.
+    assert float(jax.grad(SAC().temperature_loss)(0.3, -2.0, -1.0)) == -1.0
+
+
+def test_polyak():
+    # 1 + 0.25 (5 - 1) = 2 and 2 + 0.25 (-2 - 2) = 1
+    assert polyak({"a": 1.0, "b": 2.0}, {"a": 5.0, "b": -2.0}, 0.25) == {"a": 2.0, "b": 1.0}
+
+
+def test_gradient_is_clipped_by_its_global_norm():
+    # Adam's first moment after one step is 0.1 g, so it shows g: (30, 40) has norm 50 and becomes (3, 4).
+    optimiser = make_optimiser(0.1, max_gradient_norm=5.0)
+    parameters = jnp.zeros(2)
+    _, state, _ = descend(
+        optimiser, lambda p: (p @ jnp.array([30.0, 40.0]), None), parameters, optimiser.init(parameters)
+    )
+    first_moment = next(leaf for leaf in jax.tree.leaves(state) if leaf.shape == (2,))
+    np.testing.assert_allclose(first_moment, [0.3, 0.4], rtol=1e-6)
+
+
+LINEAR = {
+    "actor_hidden_sizes": (),
+    "critic_hidden_sizes": (),
+    "discount": 0.5,
+    "target_rate": 0.5,
+    "actor_learning_rate": 0.1,
+    "critic_learning_rate": 0.1,
+}
+NO_ENTROPY = [
+    CSAC(entropy_weight=0.0, relative_entropy_weight=0.0, **LINEAR),
+    SAC(temperature="fixed", entropy_weight=0.0, **LINEAR),
+]
+
+
+@pytest.mark.parametrize("algorithm", NO_ENTROPY, ids=lambda algorithm: algorithm.name)
+def test_the_actor_descends_against_the_new_critics_and_targets_move_last(algorithm):
+    # Target critics say -20 everywhere, so y = 0 + 0.5·(-20) = -10. Both critics are Q = 0.01 a = 0.01: the loss is
+    # 2·10.01² and each of their parameters, having a positive gradient, goes down by the learning rate in Adam's first
+    # step. The slope of Q in the action turns from 0.01 to -0.09: the actor goes down if it sees the new critics, and
+    # up if it sees the old ones. Targets: halfway from (0, 0, -20) to the new (-0.1, -0.09, -0.1).
+    critic, target_critic = linear([[0.0], [0.01]], [0.0]), linear([[0.0], [0.0]], [-20.0])
+    state = algorithm.init(jax.random.key(0), ONE)._replace(
+        actor=gaussian(0.0, 1.0), critics=(critic, critic), target_critics=(target_critic, target_critic)
+    )
+    state, metrics = update(algorithm, state, batch_of(transition(action=1.0, reward=0.0)))
+    assert float(metrics["critic_loss"]) == pytest.approx(200.4002, rel=1e-6)
+    for new, target in zip(state.critics, state.target_critics, strict=True):
+        np.testing.assert_allclose(new.layers[0].weight, [[-0.1], [-0.09]], atol=1e-6)
+        np.testing.assert_allclose(target.layers[0].weight, [[-0.05], [-0.045]], atol=1e-6)
+        np.testing.assert_allclose(target.layers[0].bias, [-10.05], atol=1e-5)
+    assert float(state.actor.layers[0].bias[0]) == pytest.approx(-0.1, abs=1e-5)
+
+
+@pytest.mark.parametrize(("target_entropy", "expected"), [(-100.0, -0.1), (100.0, 0.1)])
+def test_the_automatic_temperature_moves_after_it_was_used(target_entropy, expected):
+    algorithm = SAC(target_entropy=target_entropy, temperature_learning_rate=0.1, **LINEAR)
+    state = algorithm.init(jax.random.key(0), ONE)
+    state, metrics = update(algorithm, state, batch_of(transition()))
+    assert float(state.log_temperature) == pytest.approx(expected, abs=1e-5)
+    assert float(metrics["temperature"]) == 1.0
+
+
+def test_a_fixed_temperature_stays():
+    algorithm = SAC(temperature="fixed", entropy_weight=0.2, **LINEAR)
+    state, _ = update(algorithm, algorithm.init(jax.random.key(0), ONE), batch_of(transition()))
+    assert float(state.log_temperature) == pytest.approx(math.log(0.2))
+
+
+@pytest.mark.parametrize(("log_std", "expected"), [(-2.6, 0.1), (-2.2, -0.1)])
+def test_the_target_entropy_is_minus_the_number_of_action_dimensions(log_std, expected):
+    # Near u = 0 the tanh changes little: the entropy of three dimensions is about 3 (1.4189385 + log_std), which is
+    # -3.5 at -2.6 and -2.3 at -2.2. The target is -3: the temperature rises below it and falls above.
+    algorithm = SAC(temperature_learning_rate=0.1, **LINEAR)
+    state = algorithm.init(jax.random.key(0), Spec(1, 3))._replace(actor=linear([[0.0] * 6], [0.0] * 3 + [log_std] * 3))
+    batch = batch_of(*[transition()._replace(action=np.zeros(3, np.float32))] * 1000)
+    state, _ = update(algorithm, state, batch)
+    assert float(state.log_temperature) == pytest.approx(expected, abs=1e-4)
+
+
+@jax.jit
+def mean_kl(actor: MLP, reference: MLP, observations: jax.Array) -> jax.Array:
+    return jnp.mean(jax.vmap(lambda x: kl(policy_at(actor, x), policy_at(reference, x)))(observations))
+
+
+@pytest.mark.parametrize("choice", ["algorithm1", "previous", "periodic", "average"])
+def test_reference_policy_over_time(choice):
+    """The KL that an update reports tells which reference it used. A_k is the actor before update k."""
+    period, rate = 3, 0.25
+    algorithm = csac(
+        reference_policy=choice,
+        reference_period=period,
+        reference_rate=rate,
+        actor_learning_rate=0.05,
+        actor_hidden_sizes=(),
+        critic_hidden_sizes=(),
+    )
+    batch = batch_of(*(transition(observation=x, action=x / 3) for x in (-2.0, 0.5, 1.0)))
+    state, actors, reported = algorithm.init(jax.random.key(0), ONE), [], []
+    for k in range(7):
+        actors.append(state.actor)
+        state, metrics = update(algorithm, state, batch, k)
+        reported.append(float(metrics["relative_entropy"]))
+
+    averages = [actors[0]]
+    for actor in actors[:-1]:  # R_0 = A_0, R_(k+1) = R_k + rate (A_k - R_k)
+        averages.append(jax.tree.map(lambda average, a: (1 - rate) * average + rate * a, averages[-1], actor))
+    references = {
+        "algorithm1": actors,  # A_k
+        "previous": [actors[0], *actors[:-1]],  # A_(k-1)
+        "periodic": [actors[k - k % period] for k in range(7)],
+        "average": averages,
+    }[choice]
+    expected = [
+        mean_kl(actor, reference, batch.observation) for actor, reference in zip(actors, references, strict=True)
+    ]
+    np.testing.assert_allclose(reported, np.array(expected), atol=2e-6)
+    assert max(reported) == 0 if choice == "algorithm1" else max(reported) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("choice", "step", "relative_entropy"),
+    [
+        ("algorithm1", 5, 0.0),
+        ("previous", 5, 0.4431472),
+        ("average", 5, 0.4431472),
+        ("periodic", 5, 0.4431472),
+        ("periodic", 8, 0.0),
+    ],
+)
+def test_the_critic_target_of_an_update_uses_the_reference_policy(choice, step, relative_entropy):
+    # No entropy weight, critics 0 and target critics 3 everywhere: y = 2 + 0.5 (3 - 0.5 KL), and the loss is 2 y².
+    algorithm = CSAC(
+        entropy_weight=0.0, relative_entropy_weight=0.5, reference_policy=choice, reference_period=4, **LINEAR
+    )
+    nothing, three = linear([[0.0], [0.0]], [0.0]), linear([[0.0], [0.0]], [3.0])
+    state = algorithm.init(jax.random.key(0), ONE)._replace(
+        actor=POLICY, reference=REFERENCE, critics=(nothing, nothing), target_critics=(three, three)
+    )
+    _, metrics = update(algorithm, state, batch_of(transition()), step)
+    assert float(metrics["critic_loss"]) == pytest.approx(2 * (3.5 - 0.25 * relative_entropy) ** 2, rel=1e-6)
+
+
+@pytest.mark.parametrize("algorithm", [CSAC(**LINEAR), SAC(**LINEAR)], ids=lambda algorithm: algorithm.name)
+def test_actions_are_the_tanh_of_the_mean_or_of_a_sample(algorithm):
+    state = algorithm.init(jax.random.key(0), ONE)._replace(actor=gaussian(0.5, 0.1))
+    act = jax.vmap(algorithm.act, in_axes=(None, None, 0, None))
+    keys = jax.random.split(jax.random.key(1), 4000)
+    np.testing.assert_allclose(act(state, jnp.ones(1), keys, False), math.tanh(0.5), rtol=1e-6)
+    before_tanh = np.arctanh(act(state, jnp.ones(1), keys, True))
+    assert before_tanh.mean() == pytest.approx(0.5, abs=0.01)  # standard error 0.0016
+    assert before_tanh.std() == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("algorithm", [CSAC(), SAC()], ids=lambda algorithm: algorithm.name)
+def test_no_two_parts_of_the_first_state_share_a_buffer(algorithm):
+    state = replace(algorithm, actor_hidden_sizes=(4,), critic_hidden_sizes=(4,)).init(jax.random.key(0), ONE)
+    pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state)]
+    assert len(set(pointers)) == len(pointers)
+
+
+@pytest.mark.parametrize("algorithm", [CSAC(), SAC()], ids=lambda algorithm: algorithm.name)
+def test_targets_and_reference_begin_as_copies_and_critics_differ(algorithm):
+    state = replace(algorithm, actor_hidden_sizes=(4,), critic_hidden_sizes=(4,)).init(jax.random.key(0), ONE)
+    jax.tree.map(np.testing.assert_array_equal, state.critics, state.target_critics)
+    if algorithm.name == "csac":
+        jax.tree.map(np.testing.assert_array_equal, state.actor, state.reference)
+    first, second = (critic.layers[0].weight for critic in state.critics)
+    assert not np.allclose(first, second)
