@@ -8,7 +8,7 @@ import io
 import json
 import os
 import re
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -56,7 +56,8 @@ def parse(
         run()
     complaint = io.StringIO()
     try:
-        with _wide_terminal(), redirect_stderr(complaint):
+        # With standard output elsewhere too, tyro takes it for one that cannot show boxes.
+        with _wide_terminal(), redirect_stderr(complaint), redirect_stdout(io.StringIO()):
             parsed, unknown = run(return_unknown_args=True)
     except SystemExit:
         raise InputError(f"{_one_line(complaint.getvalue())} ({program} --help)") from None
@@ -129,15 +130,14 @@ def _whole_number(text: str) -> int:
     return int(value)
 
 
-def _one_line(box: str) -> str:
-    """Return what tyro's box of text says in one line: what stands above its first rule."""
-    rows = [row.strip("│ ") for row in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines() if row.startswith("│")]
-    rule = next((index for index, row in enumerate(rows) if row and set(row) == {"─"}), len(rows))
-    text = " ".join(rows[:rule]) or box
+def _one_line(complaint: str) -> str:
+    """Return what tyro complains of in one line. It writes a title, a rule, what is wrong, a rule, and more."""
+    sections = re.split(r"^ *-{5,} *$", complaint, flags=re.MULTILINE)
+    text = " ".join(sections[1 if len(sections) > 1 else 0].split())
     for pattern, template in _COMPLAINTS:
         if match := re.fullmatch(pattern, text):
             return match.expand(template)
-    return " ".join(text.split())
+    return text
 
 
 def _unknown(argument: str, command: type[Any], elsewhere: Mapping[str, type[Any]]) -> str:

@@ -7,7 +7,7 @@ import io
 import os
 import shlex
 import sys
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,6 +20,8 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from rich.console import Console
 
 HELP = """\
 usage: csac COMMAND ...
@@ -123,6 +125,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(error, 2)
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:
+        return 0
     finally:
         _settle_output()
 
@@ -192,7 +196,7 @@ def _evaluate(arguments: list[str]) -> int:
     console = make_console()
     results = {}
     try:
-        with console.status("evaluating") if console.is_interactive else nullcontext():
+        with _waiting(console, "evaluating"):
             results.update(evaluate_run(options.run, options.seed, options.episodes, not options.stochastic))
     except EvaluationFailure as error:
         return _complain(error, 1)
@@ -202,16 +206,20 @@ def _evaluate(arguments: list[str]) -> int:
 
 def _play(arguments: list[str]) -> int:
     options = parse(Play, arguments, "csac play")
+    from csac.training.console import make_console
     from csac.training.environments import EnvironmentFailure
     from csac.training.play import play
 
+    console = make_console()
     try:
-        for episode in play(options.run, options.seed, options.episodes, options.video):
-            print(f"episode {episode.episode}: return {episode.episode_return:,.2f} in {episode.length:,} steps")
+        with _waiting(console, "playing"):
+            for episode in play(options.run, options.seed, options.episodes, options.video):
+                text = f"return {episode.episode_return:,.2f} in {episode.length:,} steps"
+                console.print(f"episode {episode.episode}: {text}")
     except EnvironmentFailure as error:
         return _complain(error, 1)
     if options.video:
-        print(options.video)
+        console.print(str(options.video), soft_wrap=True)
     return 0
 
 
@@ -232,15 +240,21 @@ def _runs(arguments: list[str]) -> int:
 def _with_algorithm(algorithms: dict[str, Any], name: str, preset: str | None, task: str) -> type[Any]:
     """Return `Train` with the options of one algorithm beside its own; a preset sets what they are by default."""
     algorithm = algorithms[name](**(hyperparameters(preset, name, task) if preset else {}))
-    presets = Annotated[Literal[PRESETS], arg(help_behavior_hint="(default: none)")]
+    presets: Any = Literal[PRESETS]
+    hint = arg(help_behavior_hint=f"(default: {preset or 'none'})")
     fields = [
         ("algorithm", Literal[tuple(algorithms)], field(default=name)),
-        ("preset", presets if preset is None else Literal[PRESETS], field(default=preset)),
+        ("preset", Annotated[presets | None, hint], field(default=preset)),
         (name, OmitArgPrefixes[type(algorithm)], field(default=algorithm)),
     ]
     return dataclasses.make_dataclass(
         "Train", fields, bases=(Train,), frozen=True, namespace={"__doc__": Train.__doc__}
     )
+
+
+def _waiting(console: Console, doing: str) -> AbstractContextManager[Any]:
+    """Say on a terminal what takes its time."""
+    return console.status(doing) if console.is_interactive else nullcontext()
 
 
 def _complain(message: object, code: int) -> int:

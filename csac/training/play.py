@@ -64,9 +64,7 @@ def play(
     else:
         _check_video(Path(video))
         _draw_off_screen()
-    environment = Environment(
-        run.manifest["task"], run.manifest.get("environment_arguments"), "human" if video is None else "rgb_array"
-    )
+    environment = _drawn_environment(run, "human" if video is None else "rgb_array")
     try:
         with _recording(environment, video) as record:
             for number in range(episodes):
@@ -108,6 +106,22 @@ def _check_video(path: Path) -> None:
         raise InputError(f"{path} is a directory: give the name of a file for the video")
 
 
+def _drawn_environment(run: RunDirectory, render_mode: str) -> Environment:
+    task, arguments = run.manifest["task"], run.manifest.get("environment_arguments")
+    try:
+        return Environment(task, arguments, render_mode)
+    except InputError as error:
+        raise _cannot_be_drawn(task, error) from error
+
+
+def _cannot_be_drawn(task: str, error: Exception) -> InputError:
+    reason = " ".join(str(error).split())
+    hint = ""
+    if os.environ.get("MUJOCO_GL") == "egl" and "egl" in reason.lower():
+        hint = "; to draw without a display, MuJoCo needs the system's EGL library (on Debian: apt install libegl1)"
+    return InputError(f"{task} cannot be drawn: {reason}{hint}")
+
+
 @contextmanager
 def _recording(environment: Environment, video: str | Path | None) -> Iterator[Callable[[], None]]:
     """Yield a function that adds the present picture to the video, which gets its name once it is whole."""
@@ -143,8 +157,7 @@ def _frame(environment: Environment) -> np.ndarray:
     try:
         frame = environment.raw.render()
     except Exception as error:
-        hint = "without a display MuJoCo needs the system's EGL library (Debian and Ubuntu: apt install libegl1)"
-        raise InputError(f"{environment.task_name} cannot be drawn: {' '.join(str(error).split())}; {hint}") from error
+        raise _cannot_be_drawn(environment.task_name, error) from error
     picture = np.asarray(frame)
     if picture.ndim != 3 or picture.shape[2] < 3:
         raise InputError(f"{environment.task_name} draws no pictures, so there is no video of it")

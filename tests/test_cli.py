@@ -1,0 +1,494 @@
+import dataclasses
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+import csac.training.train as training
+from csac.algorithms import ALGORITHMS, SAC
+from csac.arguments import peek
+from csac.cli import main
+from csac.deploy.policy import Contract, Policy
+from csac.record.run import RunDirectory
+from csac.types import Layer, PolicyNetwork
+
+TESTS = Path(__file__).parent
+TINY = "--batch-size 8 --actor-hidden-sizes 8 --critic-hidden-sizes 8"
+
+
+def csac(line):
+    """Type `csac line` and return the exit code."""
+    return main(shlex.split(line))
+
+
+class Pictures(gymnasium.Env):
+    """Five steps of reward 1, and a picture of each."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    observation_space = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+    action_space = gymnasium.spaces.Box(-2, 2, (1,), np.float32)
+
+    def __init__(self, render_mode=None):
+        self.render_mode, self.steps = render_mode, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(3, np.float32), 1.0, self.steps == 5, False, {}
+
+    def render(self):
+        return np.full((34, 48, 3), 40 * self.steps, np.uint8)
+
+
+if "Pictures-v0" not in gymnasium.registry:
+    gymnasium.register("Pictures-v0", entry_point=f"{__name__}:Pictures")
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(TESTS)
+
+
+@pytest.fixture
+def train_call(monkeypatch):
+    """What `csac train` calls `train` with, instead of training."""
+    calls = []
+
+    def train(algorithm, task, **options):
+        calls.append({"algorithm": algorithm, "task": task, **options})
+        return RunDirectory(Path("run"), {"state": "finished"})
+
+    monkeypatch.setattr(training, "train", train)
+
+    def call(line):
+        assert csac(f"train {line}") == 0
+        return calls[-1]
+
+    return call
+
+
+def make_run(path, task, observation_size, low, high, seeds=(0, 1)):
+    """A finished run with a random linear policy for each seed."""
+    path = Path(path)
+    run = RunDirectory.create(
+        path, {"task": task, "algorithm": "csac", "seeds": list(seeds), "steps": 100, "steps_done": 100}
+    )
+    contract = Contract(
+        task=task,
+        algorithm="csac",
+        activation="relu",
+        head="tanh_gaussian",
+        observation_parts=((None, (observation_size,)),),
+        action_shape=(len(low),),
+        action_low=np.array(low, np.float32),
+        action_high=np.array(high, np.float32),
+    )
+    (path / "policy").mkdir()
+    contract.save(path / "policy" / "contract.json")
+    generator = np.random.default_rng(0)
+    for seed in seeds:
+        weight = generator.normal(size=(observation_size, 2 * len(low))).astype(np.float32)
+        network = PolicyNetwork((Layer(weight, np.zeros(2 * len(low), np.float32)),))
+        Policy(network, contract).save(path / "policy" / f"seed_{seed}.safetensors")
+        rows = {"seed": seed, "step": 100, "episode": 0, "return": float(seed), "length": 5, "success": None}
+        run.append("evaluations", [rows])
+    run.update_manifest(state="finished")
+    return run
+
+
+def words(text):
+    return [" ".join(line.split()) for line in text.splitlines() if line.strip(" ─")]
+
+
+# What is wrong with the arguments is told in one line, and nothing is written.
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("trian X", "no command is called 'trian'; did you mean train? (csac --help)"),
+        ("train", "TASK is missing (csac train --help)"),
+        ("train X --steps", "--steps needs a value (csac train --help)"),
+        ("train X --steps abc", "--steps: 'abc' is not a number (csac train --help)"),
+        ("train X --steps 1.5", "--steps: '1.5' is not a whole number (csac train --help)"),
+        ("train X --seeds inf", "--seeds: 'inf' is not a whole number (csac train --help)"),
+        ("train X --groups x", "--groups: 'x' is not a number (csac train --help)"),
+        ("train X --discount x", "--discount: 'x' is not a number (csac train --help)"),
+        ("train X --sedes 3", "there is no option --sedes; did you mean --seeds or --steps? (csac train --help)"),
+        ("train X --no_such_thing=3", "there is no option --no-such-thing (csac train --help)"),
+        ("train X Y", "there is no place for 'Y' (csac train --help)"),
+        ("train X --device tpu", "--device: 'tpu' is not one of 'cpu', 'gpu' (csac train --help)"),
+        ("train X --algorithm dqn", "no algorithm is called 'dqn': choose csac or sac"),
+        ("train X --preset papr", "no preset is called 'papr': choose paper"),
+        (
+            "train X --temperature fixed",
+            "--temperature is an option of sac, which --algorithm sac chooses (csac train --help)",
+        ),
+        ("train X --actor-hidden-sizes 3 x", "--actor-hidden-sizes does not take ['3', 'x'] (csac train --help)"),
+        ("train X --env-kwargs [1]", "--env-kwargs takes a JSON object such as '{\"name\": 1.5}', not [1]"),
+        ("train X --discount 1.5", "discount must be at least 0 and less than 1, not 1.5 (csac train --help)"),
+        ("train Qxyz-v0", "no task is called Qxyz-v0: write module:Id for one that a module registers"),
+        ("train probes:Endless-v0 --seeds 0", "seeds must be a whole number of at least 1, not 0"),
+        ("evaluate", "DIR is missing (csac evaluate --help)"),
+        ("evaluate nowhere", "nowhere does not exist; give a run directory ('csac runs' lists them)"),
+        (
+            "evaluate nowhere --episode 3",
+            "there is no option --episode; did you mean --episodes? (csac evaluate --help)",
+        ),
+        ("play nowhere", "nowhere does not exist; give a run directory ('csac runs' lists them)"),
+        ("runs nowhere", "there is no directory nowhere; give one that holds runs"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_no_trace(capsys, tmp_path, line, complaint):
+    assert csac(line) == 2
+
+    output = capsys.readouterr()
+    assert output.err == f"csac: {complaint}\n"
+    assert output.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_that_is_none_is_told_where(capsys):
+    assert csac("train X --env-kwargs {a") == 2
+
+    complaint = capsys.readouterr().err
+    assert complaint.startswith("csac: --env-kwargs is not JSON (Expecting property name")
+    assert complaint.count("\n") == 1
+
+
+def test_a_long_word_in_a_complaint_stays_whole(capsys):
+    word = "x" * 300
+
+    csac(f"train X --steps {word}")
+
+    assert word in capsys.readouterr().err
+
+
+# What the options mean.
+
+
+def test_train_passes_its_options_on(train_call):
+    call = train_call(
+        "Hopper-v4 --steps 1e5 --seeds 3 --first-seed 7 --directory some/where --device gpu --groups 2 "
+        "--evaluation-interval 1_000 --evaluation-episodes 4 --warmup-steps 2e3 --actor-hidden-sizes 8 9 "
+        """--env-kwargs '{"ctrl_cost_weight": 0.5}'"""
+    )
+
+    assert call["task"] == "Hopper-v4"
+    assert call["algorithm"] == ALGORITHMS["csac"](warmup_steps=2000, actor_hidden_sizes=(8, 9))
+    assert call["directory"] == Path("some/where")
+    assert call["environment_arguments"] == {"ctrl_cost_weight": 0.5}
+    assert call["command"].startswith("csac train Hopper-v4 --steps 1e5")
+    assert call["command"].endswith("""--env-kwargs '{"ctrl_cost_weight": 0.5}'""")
+    numbers = {name: call[name] for name in call if isinstance(call[name], int)}
+    assert numbers == {
+        "steps": 100_000,
+        "seeds": 3,
+        "first_seed": 7,
+        "groups": 2,
+        "evaluation_interval": 1000,
+        "evaluation_episodes": 4,
+    }
+
+
+def test_train_without_options_uses_the_defaults(train_call):
+    call = train_call("Hopper-v4")
+
+    assert call["algorithm"] == ALGORITHMS["csac"]()
+    assert (call["steps"], call["seeds"], call["groups"], call["directory"]) == (1_000_000, 1, None, None)
+    assert call["preset"] is None
+
+
+@pytest.mark.parametrize("name", sorted(ALGORITHMS))
+def test_each_algorithm_brings_its_options(train_call, name):
+    assert train_call(f"Hopper-v4 --algorithm {name}")["algorithm"] == ALGORITHMS[name]()
+    assert train_call(f"Hopper-v4 --algorithm={name} --discount 0.5")["algorithm"].discount == 0.5
+
+
+def test_a_preset_depends_on_the_task_and_options_win_over_it(train_call):
+    quad = "PyFlyt/QuadX-Waypoints-v1"
+
+    assert train_call("Ant-v4 --preset paper")["algorithm"].relative_entropy_weight == 0.5
+    assert train_call(f"--preset paper {quad}")["algorithm"].relative_entropy_weight == 0.1
+    given = train_call(f"{quad} --preset=paper --relative-entropy-weight 5")
+    assert given["algorithm"].relative_entropy_weight == 5.0
+    assert given["algorithm"].reference_policy == "algorithm1"
+    assert given["preset"] == "paper"
+
+
+def test_a_preset_is_the_algorithms_own(train_call):
+    algorithm = train_call("Ant-v4 --algorithm sac --preset paper")["algorithm"]
+
+    assert algorithm == SAC(temperature="fixed", entropy_weight=0.2)
+
+
+def test_negative_numbers_are_values(train_call):
+    assert train_call("Ant-v4 --algorithm sac --target-entropy -3")["algorithm"].target_entropy == -3.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "value"), [([], "a"), (["--x", "b"], "b"), (["--x=b", "--x", "c"], "c"), (["--x"], "a"), (["x"], "a")]
+)
+def test_peeking_finds_the_last_value(arguments, value):
+    assert peek(arguments, "--x", "a") == value
+
+
+# Help.
+
+
+def test_help_lists_the_commands(capsys):
+    assert csac("") == 0
+    assert csac("--help") == 0
+
+    output = capsys.readouterr().out
+    for command in ("train", "evaluate", "play", "runs"):
+        assert output.count(f"csac {command} ") >= 2
+
+
+def test_version(capsys):
+    assert csac("--version") == 0
+    assert capsys.readouterr().out == "csac 0.1.0\n"
+
+
+@pytest.mark.parametrize("name", sorted(ALGORITHMS))
+def test_the_help_of_train_explains_every_hyperparameter(capsys, monkeypatch, name):
+    monkeypatch.setenv("COLUMNS", "200")
+
+    assert csac(f"train --help --algorithm {name}") == 0
+
+    box = capsys.readouterr().out.partition(f" {name} options")[2]
+    shown = " ".join(line.strip("│ ") for line in box.splitlines())
+    for item in dataclasses.fields(ALGORITHMS[name]):
+        option = "--" + item.name.replace("_", "-")
+        explanation = shown.partition(f"{option} ")[2].partition(" --")[0]
+        assert "(default: " in explanation
+        assert len(explanation.partition("(default")[0].split()) > 3
+
+
+def test_the_help_shows_what_a_preset_sets(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+
+    csac("train --preset paper --help")
+
+    output = " ".join(capsys.readouterr().out.split())
+    assert "(default: algorithm1)" in output
+    assert "(default: paper)" in output
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [("evaluate", ["--seed", "--episodes", "--stochastic"]), ("play", ["--seed", "--episodes", "--video"])],
+)
+def test_the_other_commands_have_help(capsys, command, options):
+    assert csac(f"{command} --help") == 0
+
+    output = capsys.readouterr().out
+    assert all(option in output for option in [*options, "DIR"])
+
+
+# The commands themselves.
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of two seeds, trained by the command line on a task of constant reward: (exit code, its directory)."""
+    directory = tmp_path_factory.mktemp("trained") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(TESTS)
+        code = csac(
+            f"train probes:Endless-v0 --directory {directory} --steps 40 --warmup-steps 20 --seeds 2 --groups 1 "
+            f"--evaluation-interval 20 {TINY}"
+        )
+    return code, directory
+
+
+def test_train_writes_a_run(trained):
+    code, directory = trained
+    run = RunDirectory.open(directory)
+
+    assert code == 0
+    assert run.manifest["state"] == "finished"
+    assert run.manifest["command"].startswith("csac train probes:Endless-v0 --directory ")
+    assert run.manifest["hyperparameters"]["batch_size"] == 8
+    assert len(run.evaluations) == 2 * 2 * 10
+    assert set(run.evaluations["return"]) == {10.0}
+    there = {path.name for path in directory.rglob("*")}
+    assert {"metrics.csv", "episodes.csv", "log.txt", "curve.png", "contract.json", "seed_1.best.safetensors"} <= there
+    assert {path.name for path in (directory / "tensorboard").iterdir()} == {"seed_0", "seed_1"}
+
+
+def test_evaluate_reads_what_train_wrote(trained, capsys):
+    assert csac(f"evaluate {trained[1]} --episodes 2") == 0
+
+    assert words(capsys.readouterr().out) == [
+        "seed mean return ± std min max length",
+        "0 10.00 0.00 10.00 10.00 10.0",
+        "1 10.00 0.00 10.00 10.00 10.0",
+        "mean 10.00",
+        "± 95 % 0.00",
+    ]
+
+
+def test_evaluate_takes_one_seed(trained, capsys):
+    assert csac(f"evaluate {trained[1]} --seed 1 --episodes 1 --stochastic") == 0
+
+    assert words(capsys.readouterr().out)[1:] == ["1 10.00 0.00 10.00 10.00 10.0"]
+
+
+def test_evaluate_names_the_seeds_there(trained, capsys):
+    assert csac(f"evaluate {trained[1]} --seed 5") == 2
+
+    assert capsys.readouterr().err.endswith("has no policy of seed 5; it has those of 0, 1\n")
+
+
+def test_train_leaves_a_run_that_is_there_alone(trained, capsys):
+    before = {path: path.read_bytes() for path in trained[1].rglob("*") if path.is_file()}
+
+    assert csac(f"train probes:Endless-v0 --directory {trained[1]}") == 2
+
+    assert "already holds a run" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in trained[1].rglob("*") if path.is_file()} == before
+
+
+def test_runs_lists_it(trained, capsys):
+    assert csac(f"runs {trained[1].parent}") == 0
+
+    assert words(capsys.readouterr().out)[1] == f"probes:Endless-v0 csac 2 40 / 40 finished 10.00 {trained[1]}"
+
+
+def test_runs_without_any_says_how_to_start_one(capsys):
+    assert csac("runs") == 0
+
+    assert capsys.readouterr().out == "no runs in runs yet; csac train HalfCheetah-v4 starts one\n"
+
+
+def test_a_failed_seed_is_exit_code_3(capsys):
+    code = csac(
+        """train probes:Failing-v0 --directory run --env-kwargs '{"where": "step", "at": 30}' --steps 50 """
+        f"--evaluation-interval 25 --evaluation-episodes 1 {TINY}"
+    )
+
+    assert code == 3
+    assert "seed 0 failed at step 30: " in capsys.readouterr().out
+    assert RunDirectory.open("run").manifest["state"] == "failed"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_says_what_to_type(monkeypatch, capsys, number, code):
+    def train(*_, **__):
+        raise training.Interrupted(RunDirectory(Path("my run"), {}), number)
+
+    monkeypatch.setattr(training, "train", train)
+
+    assert csac("train Hopper-v4") == code
+    assert capsys.readouterr().err.endswith("type: csac evaluate 'my run'\n")
+
+
+def test_sigterm_saves_what_was_learnt(tmp_path):
+    line = "train probes:Endless-v0 --directory run --steps 1e8 --warmup-steps 1e8 --replay-size 1e3 "
+    process = subprocess.Popen(
+        [sys.executable, "-m", "csac", *shlex.split(f"{line} --evaluation-interval 100 {TINY}")],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(TESTS)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith("step 100 of 100,000,000: mean return 10.00"):
+            process.send_signal(signal.SIGTERM)
+            break
+    output, errors = process.communicate()
+
+    assert process.returncode == 143
+    assert errors == "csac: stopped by SIGTERM; saved in run; to test what was learnt, type: csac evaluate run\n"
+    assert "stopped at step" in output
+    run = RunDirectory.open(tmp_path / "run")
+    assert run.manifest["state"] == "interrupted"
+    assert csac(f"evaluate {run.path} --episodes 1") == 0
+
+
+def test_nobody_reading_is_no_error():
+    command = [sys.executable, "-m", "csac", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+    assert process.returncode == 0
+
+
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # JAX is loaded here; where csac plays, it is not
+def test_play_writes_a_video(capsys):
+    make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+
+    assert csac("play run --episodes 2 --video new/film.mp4") == 0
+
+    assert capsys.readouterr().out == (
+        "episode 0: return 5.00 in 5 steps\nepisode 1: return 5.00 in 5 steps\nnew/film.mp4\n"
+    )
+    decode = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", "new/film.mp4", "-f", "rawvideo", "-pix_fmt", "gray", "-"]
+    decoded = subprocess.run(decode, capture_output=True, check=True)
+    assert b"48x34" in decoded.stderr
+    assert b"10 fps" in decoded.stderr
+    # Each episode: the first picture and one per step, getting lighter.
+    pictures = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 34 * 48)
+    assert np.rint(pictures.mean(axis=1) / 40).tolist() == [0, 1, 2, 3, 4, 5] * 2
+    assert [path.name for path in Path("new").iterdir()] == ["film.mp4"]
+
+
+def test_play_without_a_display_points_at_video(monkeypatch, capsys):
+    make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+
+    assert csac("play run") == 2
+    assert capsys.readouterr().err == (
+        "csac: there is no display to play on: write a video instead, with --video out.mp4\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("task", "video", "complaint"),
+    [
+        ("Pictures-v0", "film.gif", "the video is an .mp4 file: name it film.mp4"),
+        ("probes:Endless-v0", "film.mp4", "probes:Endless-v0 cannot be drawn: "),
+    ],
+)
+def test_a_video_that_cannot_be_made_is_one_line(capsys, task, video, complaint):
+    make_run("run", task, 3, [-2.0], [2.0])
+
+    assert csac(f"play run --video {video}") == 2
+
+    output = capsys.readouterr().err
+    assert output.startswith(f"csac: {complaint}")
+    assert output.count("\n") == 1
+    assert not Path(video).exists()
+
+
+def test_a_picture_that_fails_names_the_library_and_leaves_no_file(monkeypatch, capsys):
+    def render(self):
+        raise RuntimeError("Cannot initialize an EGL device display")
+
+    make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+    monkeypatch.setattr(Pictures, "render", render)
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+
+    assert csac("play run --video film.mp4") == 2
+    assert "apt install libegl1" in capsys.readouterr().err
+    assert [path.name for path in Path().iterdir()] == ["run"]
