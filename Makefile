@@ -33,7 +33,7 @@ test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
 	.venv/bin/pytest $(ARGS)
 
 check: $(SETUP)  ## Check format, lint, types and the direction of imports
-	.venv/bin/ruff format --check .
+	.venv/bin/ruff format --check --exclude '*.md' .
 	.venv/bin/ruff check .
 	.venv/bin/pyright
 	.venv/bin/lint-imports
