@@ -36,7 +36,7 @@ check: $(SETUP)  ## Check format, lint, types and the direction of imports
 	.venv/bin/ruff format --check --exclude '*.md' .
 	.venv/bin/ruff check .
 	.venv/bin/pyright
-	.venv/bin/lint-imports
+	.venv/bin/lint-imports --no-logo
 
 peers: $(PEERS)  ## Install stable-baselines3 and SBX into .venv-peers, to measure against
 
