@@ -8,7 +8,7 @@ import io
 import json
 import os
 import re
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -53,7 +53,9 @@ def parse(
         return tyro.cli(command, prog=program, args=arguments, registry=_numbers(), config=(DisallowNone,), **options)
 
     if {"-h", "--help"} & set(arguments):
-        run()
+        with suppress(BrokenPipeError):
+            run()
+        raise SystemExit(0)
     complaint = io.StringIO()
     try:
         # With standard output elsewhere too, tyro takes it for one that cannot show boxes.

@@ -7,7 +7,7 @@ import io
 import os
 import shlex
 import sys
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -125,20 +125,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(error, 2)
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:
-        return 0
     finally:
         _settle_output()
 
 
 def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(HELP, end="")
+        _say(HELP.rstrip())
         return 0
     if arguments[0] == "--version":
         from csac import __version__
 
-        print(f"csac {__version__}")
+        _say(f"csac {__version__}")
         return 0
     commands = {"train": _train, "evaluate": _evaluate, "play": _play, "runs": _runs}
     if arguments[0] not in commands:
@@ -161,6 +159,7 @@ def _train(arguments: list[str]) -> int:
     if preset:
         options = parse(_with_algorithm(ALGORITHMS, name, preset, options.task), arguments, "csac train", others)
 
+    from csac.training.console import program
     from csac.training.progress import Reporter
     from csac.training.train import Interrupted, train
 
@@ -182,7 +181,7 @@ def _train(arguments: list[str]) -> int:
             command=shlex.join(["csac", "train", *arguments]),
         )
     except Interrupted as interruption:
-        look = f"csac evaluate {shlex.quote(str(interruption.run.path))}"
+        look = f"{program()} evaluate {shlex.quote(str(interruption.run.path))}"
         return _complain(f"{interruption}; to test what was learnt, type: {look}", 128 + interruption.signal_number)
     return 3 if run.manifest["state"] == "failed" else 0
 
@@ -233,7 +232,7 @@ def _runs(arguments: list[str]) -> int:
     if runs:
         make_console().print(runs_table(runs))
     else:
-        print(f"no runs in {options.directory} yet; csac train HalfCheetah-v4 starts one")
+        _say(f"no runs in {options.directory} yet; csac train HalfCheetah-v4 starts one")
     return 0
 
 
@@ -255,6 +254,11 @@ def _with_algorithm(algorithms: dict[str, Any], name: str, preset: str | None, t
 def _waiting(console: Console, doing: str) -> AbstractContextManager[Any]:
     """Say on a terminal what takes its time."""
     return console.status(doing) if console.is_interactive else nullcontext()
+
+
+def _say(text: str) -> None:
+    with suppress(BrokenPipeError):
+        print(text)
 
 
 def _complain(message: object, code: int) -> int:

@@ -492,3 +492,18 @@ def test_a_picture_that_fails_names_the_library_and_leaves_no_file(monkeypatch, 
     assert csac("play run --video film.mp4") == 2
     assert "apt install libegl1" in capsys.readouterr().err
     assert [path.name for path in Path().iterdir()] == ["run"]
+
+
+def test_a_gpu_that_is_not_there_is_one_line(tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-m", "csac", "train", "Pendulum-v1", "--device", "gpu"],
+        cwd=tmp_path,
+        env={**os.environ, "CUDA_VISIBLE_DEVICES": ""},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert result.stderr == "csac: no GPU that JAX can use: install csac[cuda], or choose the cpu\n"
+    assert not any(tmp_path.iterdir())

@@ -57,8 +57,7 @@ class CSAC:
     relative_entropy_weight: float = 0.5
     """Weight of the relative entropy towards the reference policy (the paper's tau); 0 is SAC."""
     reference_policy: Literal["algorithm1", "previous", "periodic", "average"] = "periodic"
-    """Which earlier policy is the reference: the actor just before the gradients, the actor before the last update,
-    a copy made every `reference_period` updates, or a running average."""
+    """The reference: the actor before the gradients or before the last update, a periodic copy, or an average."""
     reference_period: int = 1000
     """Updates between two copies of the actor, with `periodic`."""
     reference_rate: float = 0.005

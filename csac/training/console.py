@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import platform
+import shlex
+import shutil
 import sys
+from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +35,13 @@ def make_console() -> Console:
     console = Console(markup=False, emoji=False, highlight=False, width=width)
     console.file = _Outliving(console.file)  # pyright: ignore[reportAttributeAccessIssue]
     return console
+
+
+def program() -> str:
+    """Return what to type for csac: its name, or the path it was started by where a shell would not find the name."""
+    started = sys.argv[0]
+    is_ours = Path(started).name == "csac" and shutil.which("csac") is None
+    return shlex.quote(started) if is_ours else "csac"
 
 
 def number(value: float, largest: float | None = None) -> str:

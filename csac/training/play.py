@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,6 +65,7 @@ def play(
         _check_video(Path(video))
         _draw_off_screen()
     environment = _drawn_environment(run, "human" if video is None else "rgb_array")
+    _follow(environment)
     try:
         with _recording(environment, video) as record:
             for number in range(episodes):
@@ -79,6 +80,15 @@ def play(
                 yield EvaluationEpisode(number, episode_return, length, None)
     finally:
         environment.close()
+
+
+def _follow(environment: Environment) -> None:
+    """Have the camera follow the body: Gymnasium's own would watch a HalfCheetah run out of the picture."""
+    renderer = getattr(environment.raw.unwrapped, "mujoco_renderer", None)
+    if renderer is None or renderer.camera_id != -1 or "trackbodyid" in (renderer.default_cam_config or {}):
+        return
+    with suppress(KeyError):  # no such camera
+        renderer.camera_id = renderer.model.camera("track").id
 
 
 def _seeds_with_policies(run: RunDirectory) -> list[int]:

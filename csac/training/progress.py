@@ -15,7 +15,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from csac.training.console import duration, make_console, number, results_table, short
+from csac.training.console import duration, make_console, number, program, results_table, short
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -113,12 +113,12 @@ class Reporter:
             self._live = None
 
     def _print_next(self, run: RunDirectory, has_curve: bool) -> None:
-        directory = shlex.quote(str(run.path))
+        directory, csac = shlex.quote(str(run.path)), program()
         lines = [("curve", str(run.path / "curve.png"))] if has_curve else []
         if (run.path / "policy").exists():
             lines += [
-                ("test it", f"csac evaluate {directory}"),
-                ("watch it", f"csac play {directory} --video {shlex.quote(str(run.path / 'play.mp4'))}"),
+                ("test it", f"{csac} evaluate {directory}"),
+                ("watch it", f"{csac} play {directory} --video {shlex.quote(str(run.path / 'play.mp4'))}"),
             ]
         for label, line in lines:
             self._print(Text.assemble((f"{label:<9}", "dim"), line))

@@ -222,14 +222,15 @@ def _check_picklable(settings: Settings) -> None:
 def _choose_device(device: str) -> None:
     if device not in ("cpu", "gpu"):
         raise InputError(f"device must be cpu or gpu, not {device!r}")
-    platform_name = "cpu" if device == "cpu" else "cuda"
-    os.environ["JAX_PLATFORMS"] = platform_name  # for the workers
+    before, platform_name = os.environ.get("JAX_PLATFORMS"), "cpu" if device == "cpu" else "cuda"
     jax.config.update("jax_platforms", platform_name)
     if device == "gpu":
         try:
             jax.devices()
-        except RuntimeError:
-            raise InputError("no GPU that JAX can use: install csac[cuda], or choose --device cpu") from None
+        except Exception as error:  # which one depends on what is missing, and on JAX's version
+            jax.config.update("jax_platforms", before)
+            raise InputError("no GPU that JAX can use: install csac[cuda], or choose the cpu") from error
+    os.environ["JAX_PLATFORMS"] = platform_name  # for the workers
 
 
 def _memory_note(algorithm: Algorithm, spec: Spec, steps: int, seeds: int, processes: int) -> str:
