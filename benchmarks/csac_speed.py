@@ -37,7 +37,7 @@ class Clock(Reporter):
     def __init__(self, arguments: argparse.Namespace) -> None:
         super().__init__(Console(file=open(os.devnull, "w")))  # noqa: SIM115
         self.arguments = arguments
-        self.start_seconds = 0.0
+        self.start_seconds = self.peak_mib = 0.0
         self.times: list[float] = []
         self.totals: list[int] = []  # environment steps of all seeds together
 
@@ -53,6 +53,7 @@ class Clock(Reporter):
         self.times.append(now)
         self.totals.append(sum(steps_by_seed.values()))
         if now - self.times[0] >= arguments.seconds and self.totals[-1] - self.totals[0] >= arguments.steps:
+            self.peak_mib = peak_mib()  # while the workers live
             raise Measured
 
     def steps_per_second(self) -> float:
@@ -119,7 +120,7 @@ def main() -> None:
             "steps": clock.totals[-1] - clock.totals[0],
             "seconds": clock.times[-1] - clock.times[0],
             "steps_per_second": clock.steps_per_second(),
-            "peak_mib": peak_mib(),
+            "peak_mib": clock.peak_mib,
         }
         print(json.dumps(result), flush=True)
     else:
