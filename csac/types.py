@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeAlias
 
 if TYPE_CHECKING:
     import jax
@@ -62,10 +62,8 @@ class Algorithm(Protocol):
     Every method is pure and speaks of one seed; `training` adds the seed axis.
     """
 
-    @property
-    def name(self) -> str:
-        """The name in `ALGORITHMS`, on the command line and in the manifest."""
-        ...
+    name: ClassVar[str]
+    """The name in `ALGORITHMS`, on the command line and in the manifest."""
 
     @property
     def warmup_steps(self) -> int:

@@ -396,26 +396,34 @@ def test_an_interrupted_run_says_what_to_type(monkeypatch, capsys, number, code)
     assert capsys.readouterr().err.endswith("type: csac evaluate 'my run'\n")
 
 
-def test_sigterm_saves_what_was_learnt(tmp_path):
+@pytest.mark.parametrize(
+    ("number", "groups"), [(signal.SIGTERM, 1), (signal.SIGINT, 2)], ids=["SIGTERM", "SIGINT to every process"]
+)
+def test_a_signal_saves_what_was_learnt(tmp_path, number, groups):
+    """A terminal sends Ctrl-C to all processes of a run; only the first may act on it."""
     line = "train probes:Endless-v0 --directory run --steps 1e8 --warmup-steps 1e8 --replay-size 1e3 "
+    line += f"--seeds {groups} --groups {groups} --evaluation-interval 250 {TINY}"
     process = subprocess.Popen(
-        [sys.executable, "-m", "csac", *shlex.split(f"{line} --evaluation-interval 100 {TINY}")],
+        [sys.executable, "-m", "csac", *shlex.split(line)],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(TESTS)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        start_new_session=True,
     )
     assert process.stdout is not None
     for line in process.stdout:
-        if line.startswith("step 100 of 100,000,000: mean return 10.00"):
-            process.send_signal(signal.SIGTERM)
+        if line.startswith("step 250 of 100,000,000: mean return 10.00"):
+            os.killpg(process.pid, number)
             break
     output, errors = process.communicate()
 
-    assert process.returncode == 143
-    assert errors == "csac: stopped by SIGTERM; saved in run; to test what was learnt, type: csac evaluate run\n"
+    assert process.returncode == 128 + number
+    told = f"csac: stopped by {number.name}; saved in run; to test what was learnt, type: csac evaluate run\n"
+    assert errors == told
     assert "stopped at step" in output
+    assert "failed" not in output
     run = RunDirectory.open(tmp_path / "run")
     assert run.manifest["state"] == "interrupted"
     assert csac(f"evaluate {run.path} --episodes 1") == 0

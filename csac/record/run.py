@@ -173,7 +173,7 @@ def _claim(path: Path, manifest: dict[str, Any]) -> None:
 
 def _refuse_occupied(path: Path) -> None:
     if (path / MANIFEST).exists():
-        raise InputError(f"{path} already holds a run; type 'csac resume {path}' or choose another directory")
+        raise InputError(f"{path} already holds a run; choose another directory")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path} is a file; choose another directory")
     if path.exists() and any(path.iterdir()):

@@ -7,6 +7,7 @@ import os
 import signal
 import traceback
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -199,6 +200,7 @@ def _worker_surroundings() -> Iterator[None]:
     """
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
+    resource_tracker.ensure_running()  # starts at the first spawn otherwise, and would let the signals through again
     os.environ.update(dict.fromkeys(names, "1"))
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
     try:

@@ -33,7 +33,7 @@ def evaluate_run(
         InputError: no run there, no such seed, a damaged file, or a task that can no longer be made.
         EvaluationFailure: an environment raised, or gave what is not finite.
     """
-    run = RunDirectory.open(directory)
+    run = _open(directory)
     evaluator = Evaluator(
         run.manifest["task"], run.manifest.get("environment_arguments"), episodes, FRESH_EVALUATION_SEED
     )
@@ -55,7 +55,7 @@ def play(
         InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
         EnvironmentFailure: the environment raised, or gave what is not finite.
     """
-    run = RunDirectory.open(directory)
+    run = _open(directory)
     if episodes < 1:
         raise InputError(f"{episodes} episodes: play at least one")
     policy = load(directory, seed)
@@ -80,6 +80,16 @@ def play(
                 yield EvaluationEpisode(number, episode_return, length, None)
     finally:
         environment.close()
+
+
+def _open(directory: str | Path) -> RunDirectory:
+    run = RunDirectory.open(directory)
+    if run.manifest.get("task_is_callable"):
+        raise InputError(
+            f"the task of {directory} was made by a Python function, {run.manifest['task']}: "
+            "evaluate it in Python, with csac.load and csac.evaluate"
+        )
+    return run
 
 
 def _follow(environment: Environment) -> None:

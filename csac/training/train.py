@@ -113,6 +113,7 @@ def train(
     path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
     manifest = {
         "task": task_name,
+        "task_is_callable": not isinstance(task, str),
         "environment_arguments": environment_arguments,
         "algorithm": algorithm.name,
         "hyperparameters": dataclasses.asdict(algorithm),  # pyright: ignore[reportArgumentType]
@@ -122,7 +123,7 @@ def train(
         "steps": steps,
         "evaluation": {"interval": evaluation_interval, "episodes": evaluation_episodes},
         "device": device,
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()},
+        "machine": {"processor": _processor(), "cores": os.cpu_count(), "host": platform.node()},
         "versions": _versions(),
         "commit": _commit(),
         "command": command,
@@ -266,6 +267,16 @@ def _versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return versions
+
+
+def _processor() -> str:
+    """Return the processor's model, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()
 
 
 def _commit() -> str | None:
