@@ -1,0 +1,47 @@
+"""Both algorithms learn to swing a pendulum up, and do not where the actor climbs its loss."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from trainer import run
+
+from csac.algorithms import CSAC, SAC
+from csac.training.loop import Evaluated
+
+SETTINGS: dict[str, Any] = {
+    "discount": 0.95,
+    "target_rate": 0.01,
+    "actor_learning_rate": 2e-3,
+    "critic_learning_rate": 2e-3,
+    "actor_hidden_sizes": (64, 64),
+    "critic_hidden_sizes": (64, 64),
+    "batch_size": 128,
+    "warmup_steps": 500,
+}
+# A random policy returns about -1200 and a good one about -150.
+THRESHOLD = -250.0
+
+
+class Climbing(CSAC):
+    def actor_loss(self, *arguments):
+        loss, metrics = super().actor_loss(*arguments)
+        return -loss, metrics
+
+
+def mean_return(algorithm, steps: int = 3000, seed: int = 0) -> float:
+    events = run(algorithm, "Pendulum-v1", steps, (seed,), episodes=10).events
+    rows = [row for event in events if isinstance(event, Evaluated) for row in event.rows]
+    assert len(rows) == 10
+    return float(np.mean([row["return"] for row in rows]))
+
+
+@pytest.mark.parametrize("algorithm", [CSAC(**SETTINGS), SAC(temperature_learning_rate=2e-3, **SETTINGS)])
+def test_the_pendulum_is_learnt(algorithm):
+    assert mean_return(algorithm) > THRESHOLD
+
+
+def test_the_pendulum_is_not_learnt_with_the_sign_of_the_actor_loss_turned():
+    assert mean_return(Climbing(**SETTINGS)) < 4 * THRESHOLD

@@ -1,0 +1,152 @@
+"""The replay: what goes in comes out, whole and aligned, uniformly, and from one's own seed alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from scipy.stats import chisquare
+from trainer import run
+
+from csac.algorithms import CSAC, SAC
+from csac.algorithms.memory import Replay, pack, row_width, unpack
+from csac.training.environments import training_seed
+from csac.types import Layer, PolicyNetwork, Spec, Transition
+
+SPEC = Spec(2, 1)
+
+
+def numbered(k) -> Transition:
+    """A transition whose every number says which it is and where it belongs."""
+    return Transition(
+        observation=jnp.stack([k + 0.125, k + 0.25]),
+        action=jnp.stack([k + 0.375]),
+        reward=k + 0.5,
+        next_observation=jnp.stack([k + 0.625, k + 0.75]),
+        terminated=k % 2,
+        truncated=k % 3,
+    )
+
+
+def filled(capacity: int, count: int) -> Replay:
+    def add(replay, k):
+        return replay.add(pack(numbered(k.astype(jnp.float32))), k), None
+
+    return jax.jit(lambda: jax.lax.scan(add, Replay.create(capacity, SPEC), jnp.arange(count))[0])()
+
+
+def test_a_row_holds_the_fields_in_their_order():
+    row = pack(numbered(jnp.float32(4.0)))
+    np.testing.assert_array_equal(row, [4.125, 4.25, 4.375, 4.5, 4.625, 4.75, 0.0, 1.0])
+    assert row_width(SPEC) == 8
+    jax.tree.map(np.testing.assert_array_equal, unpack(row, SPEC), numbered(jnp.float32(4.0)))
+
+
+@pytest.mark.parametrize(
+    ("count", "held"),
+    [(1, [0]), (3, [0, 1, 2]), (5, [0, 1, 2, 3, 4]), (6, [1, 2, 3, 4, 5]), (13, [8, 9, 10, 11, 12])],
+)
+def test_a_ring_of_five_holds_the_newest_five(count, held):
+    batch = filled(5, count).draw(jax.random.key(0), jnp.int32(count), 300, SPEC)
+    numbers = np.floor(batch.reward)
+    assert sorted(set(numbers.tolist())) == held
+    jax.tree.map(np.testing.assert_array_equal, batch, jax.vmap(numbered)(jnp.array(numbers)))
+
+
+def test_draws_are_uniform():
+    batch = filled(10, 17).draw(jax.random.key(1), jnp.int32(17), 20_000, SPEC)
+    drawn = np.bincount(np.floor(batch.reward).astype(int), minlength=17)[7:]
+    assert drawn.sum() == 20_000
+    assert chisquare(drawn).pvalue > 0.001
+
+
+@pytest.mark.parametrize(("steps", "capacity"), [(500, 300), (100, 100)])
+def test_a_short_run_gets_a_small_replay(steps, capacity):
+    for algorithm in (CSAC(replay_size=300), SAC(replay_size=300)):
+        assert algorithm.memory(SPEC, steps).rows.shape == (capacity, 8)
+
+
+# What follows goes through the training loop, on a task whose observations are [reset seed, episode, step, action].
+
+SEEDS = (3, 8)
+
+
+class Seen(NamedTuple):
+    drawn: jax.Array  # [update, batch, observation]
+    times: jax.Array  # [update] how often `update` was called with this number
+    layer: Layer
+
+
+@dataclass(frozen=True)
+class Watcher:
+    """An algorithm that learns nothing and keeps every batch."""
+
+    warmup_steps: int = 10
+    updates_per_step: int = 2
+    batch_size: int = 16
+    name: ClassVar[str] = "watcher"
+
+    def memory(self, spec, steps):
+        return Replay.create(steps, spec)
+
+    def init(self, key, spec):
+        drawn = jnp.zeros((100, self.batch_size, spec.observation_size))
+        layer = Layer(jnp.zeros((spec.observation_size, 2 * spec.action_size)), jnp.zeros(2 * spec.action_size))
+        return Seen(drawn, jnp.zeros(100), layer)
+
+    def act(self, state, observation, key, explore):
+        return jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)
+
+    def update(self, state, batch, key, step):
+        drawn, times = state.drawn.at[step].set(batch.observation), state.times.at[step].add(1)
+        return state._replace(drawn=drawn, times=times), {"step": step}
+
+    def policy(self, state):
+        return PolicyNetwork((state.layer,))
+
+
+@pytest.fixture(scope="module")
+def watched():
+    return run(Watcher(), probes.IdEncoded, 30, SEEDS)
+
+
+def test_the_loop_remembers_what_happened(watched):
+    for seed, rows in zip(SEEDS, watched.memories, strict=True):
+        step = jax.vmap(unpack, in_axes=(0, None))(rows, Spec(4, 1))
+        reset_seed, episode, number, last_action = step.observation.T
+        assert episode.max() > 5
+        np.testing.assert_array_equal(reset_seed, [training_seed(seed, int(e)) % 65536 for e in episode])
+        after = np.stack([reset_seed, episode, number + 1, step.action[:, 0]], axis=1)
+        np.testing.assert_allclose(step.next_observation, after, atol=1e-6)  # never the observation of a reset
+        np.testing.assert_array_equal(step.reward, number + 1)
+        is_last = number + 1 == 2 + episode % 3
+        np.testing.assert_array_equal(step.terminated, is_last & (episode % 3 != 1))
+        np.testing.assert_array_equal(step.truncated, is_last & (episode % 3 != 0))
+        # The next row starts where this one ended, or with a reset.
+        np.testing.assert_allclose(step.observation[1:][~is_last[:-1]], step.next_observation[:-1][~is_last[:-1]])
+        np.testing.assert_array_equal(number[1:][is_last[:-1]], 0)
+        np.testing.assert_array_equal(episode[1:] - episode[:-1], is_last[:-1])
+        np.testing.assert_array_equal(last_action[number == 0], 0)
+
+
+def test_updates_are_counted_from_the_end_of_the_warm_up(watched):
+    # Two updates after each of the steps 10, 11, ... 30, numbered from 0.
+    for state in watched.states:
+        np.testing.assert_array_equal(state.times, [1.0] * 42 + [0.0] * 58)
+
+
+def test_each_seed_draws_for_itself_from_what_it_has(watched):
+    for rows, state in zip(watched.memories, watched.states, strict=True):
+        known = [tuple(row) for row in rows[:, :4]]
+        indices = np.array([[known.index(tuple(row)) for row in batch] for batch in state.drawn[:42]])
+        so_far = 10 + np.arange(42) // 2  # the environment steps before each update
+        assert (indices < so_far[:, None]).all()
+        assert (indices == so_far[:, None] - 1).any()  # the newest transition may be drawn at once
+        assert len({tuple(batch) for batch in indices}) == 42
+    first, second = (state.drawn[:42, :, 1:3] for state in watched.states)  # episode and step, alike in every seed
+    assert (first != second).any(axis=(1, 2)).all()

@@ -1,0 +1,106 @@
+"""Each algorithm, in the real loop, learns the values of tasks whose values are known (after Jones, "Debugging RL")."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from trainer import run
+
+from csac.algorithms import CSAC, SAC
+from csac.algorithms.distributions import TanhGaussian, policy_at
+from csac.algorithms.networks import q_values
+
+DISCOUNT = 0.9
+SETTINGS: dict[str, Any] = {
+    "entropy_weight": 1e-3,
+    "discount": DISCOUNT,
+    "target_rate": 0.1,
+    "actor_learning_rate": 3e-3,
+    "critic_learning_rate": 3e-3,
+    "actor_hidden_sizes": (32, 32),
+    "critic_hidden_sizes": (32, 32),
+    "batch_size": 64,
+    "warmup_steps": 64,
+    "replay_size": 500,
+}
+
+
+@pytest.fixture(params=["csac", "sac", "csac-periodic"])
+def algorithm(request):
+    if request.param == "sac":
+        return SAC(temperature="fixed", **SETTINGS)
+    if request.param == "csac":
+        return CSAC(
+            relative_entropy_weight=0.01, reference_policy="average", relative_entropy_estimator="sampled", **SETTINGS
+        )
+    return CSAC(relative_entropy_weight=0.01, reference_period=100, **SETTINGS)
+
+
+def values(state, observation: float, actions=(-0.8, 0.0, 0.8)) -> np.ndarray:
+    """Both critics' values of a few actions, [critic, action]."""
+    pairs = jnp.array([observation]), jnp.array(actions)[:, None]
+    return np.stack(jax.vmap(q_values, in_axes=(None, None, 0))(state.critics, *pairs))
+
+
+def best_action(state, observation: float) -> float:
+    return float(policy_at(state.actor, jnp.array([observation])).mode()[0])
+
+
+def entropy(policy: TanhGaussian) -> float:
+    """The entropy of a policy of one action dimension, by Gauss-Hermite quadrature."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(60)
+    log_prob = jax.vmap(lambda noise: policy.log_prob(policy.pre_tanh(noise)))(jnp.array(nodes, jnp.float32)[:, None])
+    return -float(weights @ np.asarray(log_prob) / weights.sum())
+
+
+def test_constant_reward(algorithm):
+    state = run(algorithm, probes.ConstantReward, 700).states[0]
+    np.testing.assert_allclose(values(state, 0.0), 1.0, atol=0.05)
+
+
+def test_the_reward_is_the_observation(algorithm):
+    state = run(algorithm, probes.ObservationReward, 1000).states[0]
+    np.testing.assert_allclose(values(state, -1.0), -1.0, atol=0.1)
+    np.testing.assert_allclose(values(state, 1.0), 1.0, atol=0.1)
+
+
+def test_a_reward_one_step_later_is_discounted(algorithm):
+    state = run(algorithm, probes.DelayedReward, 1000).states[0]
+    np.testing.assert_allclose(values(state, 1.0), 1.0, atol=0.04)
+    np.testing.assert_allclose(values(state, 0.0), DISCOUNT, atol=0.04)
+
+
+def test_the_best_action_is_found(algorithm):
+    state = run(algorithm, probes.ActionReward, 1500).states[0]
+    assert best_action(state, 0.0) == pytest.approx(0.5, abs=0.1)
+    # -(a - 0.5)² = -0.25, -0.01, 0, -0.09
+    np.testing.assert_allclose(values(state, 0.0, (0.0, 0.4, 0.5, 0.8)), [[-0.25, -0.01, 0.0, -0.09]] * 2, atol=0.05)
+
+
+def test_the_best_action_depends_on_the_observation(algorithm):
+    state = run(algorithm, probes.ObservationActionReward, 2500).states[0]
+    for observation in (-1.0, 1.0):
+        assert best_action(state, observation) == pytest.approx(observation / 2, abs=0.15)
+        np.testing.assert_allclose(values(state, observation, (observation / 2,)), 0.0, atol=0.06)
+
+
+def test_a_truncated_episode_goes_on_in_its_value(algorithm):
+    # Q = r / (1 - γ) = 10. If a truncation, every 5 steps, ended the episode: Q = 1 + 0.8·0.9 Q, which is 3.57.
+    state = run(algorithm, probes.Endless, 2000, length=5).states[0]
+    np.testing.assert_allclose(values(state, 0.0), 10.0, atol=0.4)
+
+
+@pytest.mark.parametrize("algorithm", [CSAC, SAC], ids=lambda algorithm: algorithm.name)
+def test_entropy_has_its_weight_in_the_value(algorithm):
+    # Every action is as good as another, so the policy spreads out and Q = (r + γ σ H) / (1 - γ) with its entropy H,
+    # nearly log 2: with σ = 1 about 10 + 6.2. The relative entropy is zero once nothing moves.
+    fixed: dict[str, Any] = {"temperature": "fixed"} if algorithm is SAC else {"reference_policy": "average"}
+    state = run(algorithm(**{**SETTINGS, **fixed, "entropy_weight": 1.0}), probes.Endless, 2500).states[0]
+    policy_entropy = entropy(policy_at(state.actor, jnp.zeros(1)))
+    assert np.log(2) - 0.1 < policy_entropy < np.log(2)
+    np.testing.assert_allclose(values(state, 0.0), (1 + DISCOUNT * policy_entropy) / (1 - DISCOUNT), atol=0.6)

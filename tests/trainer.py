@@ -1,0 +1,47 @@
+"""The training loop itself, run in this process, with what the seeds learnt at hand."""
+
+from __future__ import annotations
+
+import tempfile
+from typing import TYPE_CHECKING, Any, NamedTuple
+from unittest.mock import patch
+
+import jax
+import numpy as np
+
+from csac.training import loop
+
+if TYPE_CHECKING:
+    from csac.types import Algorithm
+
+# XLA would take most of the time of these tests: compile each program once for all of them.
+_PROGRAMS = tempfile.TemporaryDirectory()
+jax.config.update("jax_compilation_cache_dir", _PROGRAMS.name)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+class Outcome(NamedTuple):
+    """`states` and `memories` hold one entry per seed; `events` is everything that the loop yielded."""
+
+    states: list[Any]
+    memories: list[np.ndarray]  # [steps, width] packed transitions, in the order of the steps
+    events: list[loop.Event]
+
+
+def run(
+    algorithm: Algorithm, task: Any, steps: int, seeds: tuple[int, ...] = (0,), episodes: int = 1, **arguments: Any
+) -> Outcome:
+    """Train `seeds` together, evaluating at the end alone, and return what there is to look at."""
+    learners: list[loop.Learner] = []
+
+    class Kept(loop.Learner):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            learners.append(self)
+
+    settings = loop.Settings(algorithm, task, arguments, steps, steps, episodes)
+    with patch.object(loop, "Learner", Kept):
+        events = list(loop.train_group(settings, seeds, lambda: False))
+    carries = learners[0]._by_seed(jax.tree.map(np.asarray, learners[0]._carry))
+    return Outcome([carry[0] for carry in carries], [carry[1].rows for carry in carries], events)
