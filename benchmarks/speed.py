@@ -83,7 +83,7 @@ class Protocol(NamedTuple):
     warmup: int = 250  # csac reports its progress every 250 steps, and its first update is at this one
     settled: int = 500
     seconds: float = 5.0
-    seconds_of_five: float = 12.0
+    seconds_of_five: float = 10.0
     evaluation_interval: int = 5_000
     evaluation_episodes: int = 10
 
