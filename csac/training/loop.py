@@ -11,7 +11,7 @@ import numpy as np
 from csac.deploy.policy import Contract, Policy
 from csac.training.environments import SeedEnvironments
 from csac.training.evaluation import EvaluationFailure, Evaluator
-from csac.types import PolicyNetwork
+from csac.types import Layer, PolicyNetwork
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -182,7 +182,12 @@ class Learner:
 
     def networks(self) -> list[PolicyNetwork]:
         """Return each seed's policy as NumPy layers."""
-        layers = jax.tree.map(np.array, self.algorithm.policy(self._carry[0]).actor)
+
+        def layers_of(state: Any) -> tuple[Layer, ...]:
+            return self.algorithm.policy(state).actor
+
+        states = self._carry[0]
+        layers = jax.tree.map(np.array, layers_of(states) if self._is_alone else jax.vmap(layers_of)(states))
         return [self.network._replace(actor=actor) for actor in self._by_seed(layers)]
 
     def take_metrics(self) -> list[dict[str, float]]:
