@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     StopWhen = Callable[[int, dict[int, float]], bool]
 
 # Measured resident size of a worker process with JAX, MuJoCo and the compiled programs, before its replay.
-BYTES_PER_PROCESS = 550 * 2**20
+BYTES_PER_PROCESS = 600 * 2**20
 
 
 class Interrupted(Exception):
