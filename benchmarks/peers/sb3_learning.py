@@ -101,8 +101,8 @@ class Evaluations(BaseCallback):
     """Evaluates at every multiple of the interval and writes the rows.
 
     SB3 calls it after a step of the environment and before the update that follows, where csac evaluates after it: the
-    policies of SAC and TD3 have had one update fewer here. PPO's changes at the end of a rollout only; what is evaluated
-    is the policy in force, its observations on the scale reached by then.
+    policies of SAC and TD3 have had one update fewer here. PPO's changes at the end of a rollout only; the one in force
+    is evaluated, its observations on the scale reached by then.
     """
 
     def __init__(self, arguments, file):
