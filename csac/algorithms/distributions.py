@@ -1,4 +1,4 @@
-"""The tanh-Gaussian policy distribution, for one example."""
+"""The distributions of policies, for one example."""
 
 from __future__ import annotations
 
@@ -12,9 +12,30 @@ if TYPE_CHECKING:
 
 LOG_TWO = 0.6931471805599453
 HALF_LOG_TWO_PI = 0.9189385332046727
+GAUSSIAN_ENTROPY = 1.4189385332046727  # of N(0, 1), log(2πe) / 2
 
 # The clipping bounds of PARL, which the paper builds on; SB3 and the authors of SAC use the same.
 MINIMUM_LOG_STD, MAXIMUM_LOG_STD = -20.0, 2.0
+
+
+class Gaussian(NamedTuple):
+    """The distribution N(mean, exp(log_std)²), its dimensions independent."""
+
+    mean: jax.Array  # [action]
+    log_std: jax.Array  # [action]
+
+    def sample(self, noise: jax.Array) -> jax.Array:
+        """Return mean + std ξ for noise ξ ~ N(0, I) [action]."""
+        return self.mean + jnp.exp(self.log_std) * noise
+
+    def log_prob(self, value: jax.Array) -> jax.Array:
+        """Return the log-density of a value [action]."""
+        noise = (value - self.mean) * jnp.exp(-self.log_std)
+        return jnp.sum(-0.5 * noise**2 - self.log_std - HALF_LOG_TWO_PI)
+
+    def entropy(self) -> jax.Array:
+        """Return the differential entropy in nats."""
+        return jnp.sum(self.log_std + GAUSSIAN_ENTROPY)
 
 
 class TanhGaussian(NamedTuple):
@@ -38,8 +59,7 @@ class TanhGaussian(NamedTuple):
 
     def gaussian_log_prob(self, pre_tanh: jax.Array) -> jax.Array:
         """Return log N(u; mean, std²), the density beneath the tanh."""
-        noise = (pre_tanh - self.mean) * jnp.exp(-self.log_std)
-        return jnp.sum(-0.5 * noise**2 - self.log_std - HALF_LOG_TWO_PI)
+        return Gaussian(self.mean, self.log_std).log_prob(pre_tanh)
 
     def log_prob(self, pre_tanh: jax.Array) -> jax.Array:
         """Return the log-density of the action tanh(u)."""
