@@ -85,18 +85,19 @@ def _measured(measurements: Sequence[Measurement]) -> str:
     for setting, contender in dict.fromkeys((m.setting, m.contender) for m in measurements):
         mine = [m for m in measurements if (m.setting, m.contender) == (setting, contender)]
         speeds = [m.steps_per_second for m in mine]
-        against = ratios(measurements, setting, "csac SAC", contender)
+        first = next(m.contender for m in measurements if m.setting == setting)
+        against = ratios(measurements, setting, first, contender)
         rows.append(
             [
                 setting,
                 contender,
                 _with_range(speeds, ".0f"),
-                _with_range(against, ".2f") if against and contender != "csac SAC" else "",
+                _with_range(against, ".2f") if against and contender != first else "",
                 f"{statistics.median(m.start_seconds for m in mine):.1f}",
                 f"{max(m.peak_mib for m in mine):.0f}",
             ]
         )
-    return _table(["setting", "", "steps/s", "csac SAC / this", "start, s", "peak memory, MiB"], rows)
+    return _table(["setting", "", "steps/s", "the setting's first / this", "start, s", "peak memory, MiB"], rows)
 
 
 def _with_range(values: Sequence[float], form: str) -> str:

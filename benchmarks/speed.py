@@ -33,15 +33,17 @@ TASK = "HalfCheetah-v4"
 SINGLE, SINGLE_ONE_CORE = "one seed, 2 cores", "one seed, 1 core"
 FIVE, FIVE_ONE_CORE = "five seeds, 2 cores", "five seeds, 1 core"
 EVALUATED = "one seed, 2 cores, evaluation on"
+TD3, PPO = "TD3, one seed, 2 cores", "PPO, one seed, 2 cores"
+ROLLOUT_STEPS = 2048  # of PPO: its first update is at this step
 
 
 class Case(NamedTuple):
-    """One contender in one setting."""
+    """One contender in one setting. The first of a setting is what the others are compared with."""
 
     setting: str
     contender: str
     library: str  # csac, sbx or sb3
-    algorithm: str = "sac"  # of csac; the peers have SAC alone
+    algorithm: str = "sac"
     seeds: int = 1
     cores: int = 2
     together: int = 1  # processes side by side, the cores divided among them
@@ -67,12 +69,21 @@ CASES = [
     Case(EVALUATED, "SBX SAC", "sbx", evaluated=True),
     Case(EVALUATED, "SB3 SAC", "sb3", evaluated=True),
     Case(EVALUATED, "csac CSAC", "csac", "csac", evaluated=True),
+    Case(TD3, "csac TD3", "csac", "td3", repeated=True),
+    Case(TD3, "SBX TD3", "sbx", "td3", repeated=True),
+    Case(TD3, "SB3 TD3", "sb3", "td3", repeated=True),
+    Case(TD3, "csac SD3", "csac", "sd3"),
+    Case(PPO, "csac PPO", "csac", "ppo", repeated=True),
+    Case(PPO, "SBX PPO", "sbx", "ppo", repeated=True),
+    Case(PPO, "SB3 PPO", "sb3", "ppo", repeated=True),
 ]
 
 REACHES = [
     Reach(SINGLE, "csac SAC", "SBX SAC", 1.4),
     Reach(SINGLE, "csac SAC", "SB3 SAC", 2.7),
     Reach(FIVE, "csac SAC", "SBX SAC, two at a time", 1.25),
+    Reach(TD3, "csac TD3", "SBX TD3", 1.3),
+    Reach(PPO, "csac PPO", "SB3 PPO", 3.0),
 ]
 
 
@@ -123,19 +134,19 @@ def _launch(case: Case, protocol: Protocol, cores: Sequence[int], folder: str, e
     ours = case.library == "csac"
     script = HERE / "csac_speed.py" if ours else HERE / "peers" / "speed.py"
     arguments = {
-        "algorithm": case.algorithm if ours else case.library,
+        "algorithm": case.algorithm,
         "task": TASK,
         "seeds": case.seeds,
         "cores": ",".join(map(str, cores)),
         "launched": time.monotonic(),
-        "warmup": protocol.warmup,
-        "settled": protocol.settled,
+        "warmup": ROLLOUT_STEPS if case.algorithm == "ppo" else protocol.warmup,
+        "settled": ROLLOUT_STEPS if case.algorithm == "ppo" else protocol.settled,
         "seconds": protocol.seconds_of_five if case.seeds > 1 else 0.0 if case.evaluated else protocol.seconds,
         "steps": protocol.evaluation_interval if case.evaluated else 1,
         "evaluation-interval": protocol.evaluation_interval if case.evaluated else 0,
         "evaluation-episodes": protocol.evaluation_episodes,
     }
-    command = [sys.executable if ours else PEERS_PYTHON, str(script)]
+    command = [sys.executable, str(script)] if ours else [PEERS_PYTHON, str(script), f"--library={case.library}"]
     command += [f"--{name}={value}" for name, value in arguments.items()]
     return subprocess.Popen(
         command + ["--together"] * (case.together > 1),

@@ -14,87 +14,14 @@ import warnings
 from pathlib import Path
 
 import gymnasium
-import numpy as np
 import torch
-from stable_baselines3 import PPO, SAC, TD3
+from models import make_model
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 warnings.filterwarnings("ignore", category=DeprecationWarning)
 
 # Episode j of every evaluation is reset with this seed + j: the same starts that csac's own evaluation uses.
 EVALUATION_SEED = 1_000_000
-
-OFF_POLICY = {
-    "learning_rate": 3e-4,
-    "buffer_size": 1_000_000,
-    "learning_starts": 10_000,
-    "batch_size": 256,
-    "tau": 0.005,
-    "gamma": 0.99,
-    "train_freq": 1,
-    "gradient_steps": 1,
-    "policy_kwargs": {"net_arch": [256, 256]},
-}
-
-
-def make_sac(arguments):
-    """Return SAC; an automatic temperature begins at 1."""
-    weight = arguments.entropy_weight
-    return SAC(
-        "MlpPolicy",
-        gymnasium.make(arguments.task),
-        ent_coef=weight if weight == "auto" else float(weight),
-        seed=arguments.seed,
-        device="cpu",
-        **OFF_POLICY,
-    )
-
-
-def make_td3(arguments):
-    """Return TD3. Its noise is also added to the random actions of the warm-up, which then are not quite uniform."""
-    environment = gymnasium.make(arguments.task)
-    shape = environment.action_space.shape
-    return TD3(
-        "MlpPolicy",
-        environment,
-        policy_delay=2,
-        target_policy_noise=0.2,
-        target_noise_clip=0.5,
-        action_noise=NormalActionNoise(np.zeros(shape), np.full(shape, 0.1)),
-        seed=arguments.seed,
-        device="cpu",
-        **OFF_POLICY,
-    )
-
-
-def make_ppo(arguments):
-    """Return PPO with PARL's settings, observations and rewards on running scales."""
-    environment = DummyVecEnv([lambda: Monitor(gymnasium.make(arguments.task))])
-    return PPO(
-        "MlpPolicy",
-        VecNormalize(environment, clip_obs=10.0, clip_reward=10.0, gamma=0.99),
-        # The last rollout ends after the last step, where the line would be below zero.
-        learning_rate=lambda progress_remaining: 3e-4 * max(progress_remaining, 0.0),
-        n_steps=2048,
-        batch_size=64,
-        n_epochs=10,
-        gamma=0.99,
-        gae_lambda=0.95,
-        clip_range=0.2,
-        clip_range_vf=0.2,
-        ent_coef=0.0,
-        vf_coef=0.5,
-        max_grad_norm=0.5,
-        policy_kwargs={"net_arch": {"pi": [64, 64], "vf": [64, 64]}},
-        seed=arguments.seed,
-        device="cpu",
-    )
-
-
-MAKERS = {"sac": make_sac, "td3": make_td3, "ppo": make_ppo}
 
 
 class Evaluations(BaseCallback):
@@ -137,7 +64,7 @@ class Evaluations(BaseCallback):
 def main():
     """Train one seed; the file appears complete or not at all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--algorithm", choices=MAKERS, default="sac")
+    parser.add_argument("--algorithm", choices=("sac", "td3", "ppo"), default="sac")
     parser.add_argument("--task", default="HalfCheetah-v4")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=100_000)
@@ -149,7 +76,9 @@ def main():
     arguments = parser.parse_args()
 
     torch.set_num_threads(arguments.threads)
-    model = MAKERS[arguments.algorithm](arguments)
+    model = make_model(
+        "sb3", arguments.algorithm, arguments.task, arguments.seed, 10_000, entropy_weight=arguments.entropy_weight
+    )
     partial = arguments.out.with_suffix(".partial")
     with partial.open("w", newline="") as file:
         # One call for the whole run, because the schedule of PPO's learning rate spans what one call is asked for.

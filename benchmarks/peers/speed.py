@@ -1,6 +1,7 @@
-"""One measurement of SB3's or SBX's SAC, in a process of its own; `benchmarks/speed.py` runs it with the peers' Python.
+"""One measurement of SB3 or SBX, in a process of its own; `benchmarks/speed.py` runs it with the peers' Python.
 
-It prints one line of JSON. The two scripts that measure take the same arguments, and this one `--together` as well.
+It prints one line of JSON. The two scripts that measure take the same arguments, and this one `--library` and
+`--together` as well.
 """
 
 import argparse
@@ -11,23 +12,16 @@ import sys
 import time
 import warnings
 
+from models import make_model
+
 TASK_SEED = 0
-PAPER = {
-    "learning_rate": 3e-4,
-    "buffer_size": 1_000_000,
-    "batch_size": 256,
-    "tau": 0.005,
-    "gamma": 0.99,
-    "train_freq": 1,
-    "gradient_steps": 1,
-    "ent_coef": 0.2,
-}
 
 
 def parse():
     """Return the arguments that the driver gives."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--algorithm", choices=("sb3", "sbx"), required=True)
+    parser.add_argument("--library", choices=("sb3", "sbx"), required=True)
+    parser.add_argument("--algorithm", choices=("sac", "td3", "ppo"), required=True)
     parser.add_argument("--task", required=True)
     parser.add_argument("--seeds", type=int, choices=(1,), required=True)
     parser.add_argument("--cores", required=True)
@@ -40,25 +34,6 @@ def parse():
     parser.add_argument("--evaluation-episodes", type=int, required=True)
     parser.add_argument("--together", action="store_true", help="say `ready` and wait for a line before the window")
     return parser.parse_args()
-
-
-def make_model(arguments, environment):
-    """Return the peer's SAC with the paper's settings."""
-    if arguments.algorithm == "sb3":
-        from stable_baselines3 import SAC
-    else:
-        from sbx import SAC
-    model = SAC(
-        "MlpPolicy",
-        environment,
-        learning_starts=arguments.warmup - 1,
-        policy_kwargs={"net_arch": [256, 256]},
-        seed=TASK_SEED,
-        device="cpu",
-        **PAPER,
-    )
-    fill(model.replay_buffer)
-    return model
 
 
 def fill(replay):
@@ -74,20 +49,27 @@ def make_clock(arguments):
     class Clock(BaseCallback):
         start_seconds = begin = end = 0.0
         steps = 0
+        is_over = False
+
+        def _on_rollout_start(self):
+            # A rollout is one step, of PPO 2048; the update that belongs to the rollout before is over by now.
+            if not self.start_seconds and self.num_timesteps >= arguments.warmup:
+                self.start_seconds = time.monotonic() - arguments.launched
+            if self.num_timesteps < arguments.settled:
+                return
+            if not self.begin:
+                self._begin()
+            self.end, self.steps = time.monotonic(), self.num_timesteps - self.first
+            self.is_over = self.end - self.begin >= arguments.seconds and self.steps >= arguments.steps
+
+        def _begin(self):
+            if arguments.together:
+                print("ready", flush=True)
+                sys.stdin.readline()
+            self.begin, self.first = time.monotonic(), self.num_timesteps
 
         def _on_step(self):
-            # Called after the environment's step and before its update: the first update is over one call later.
-            if self.num_timesteps == arguments.warmup + 1:
-                self.start_seconds = time.monotonic() - arguments.launched
-            if self.num_timesteps == arguments.settled:
-                if arguments.together:
-                    print("ready", flush=True)
-                    sys.stdin.readline()
-                self.begin = time.monotonic()
-            if self.num_timesteps <= arguments.settled:
-                return True
-            self.steps, self.end = self.num_timesteps - arguments.settled, time.monotonic()
-            return self.end - self.begin < arguments.seconds or self.steps < arguments.steps
+            return not self.is_over
 
     return Clock()
 
@@ -105,7 +87,9 @@ def main():
     from stable_baselines3.common.monitor import Monitor
 
     torch.set_num_threads(len(cores))
-    model = make_model(arguments, gymnasium.make(arguments.task))
+    model = make_model(arguments.library, arguments.algorithm, arguments.task, TASK_SEED, arguments.warmup - 1)
+    if arguments.algorithm != "ppo":
+        fill(model.replay_buffer)
     clock = make_clock(arguments)
     callbacks = [clock]
     if arguments.evaluation_interval:
