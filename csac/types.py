@@ -23,7 +23,7 @@ class Spec(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """One environment step, or a batch of them. Actions lie in [-1, 1].
+    """One environment step, or a batch of them. Actions are those that the algorithm chose, before any clipping.
 
     `next_observation` is the observation that the step produced, also where the episode ended; only `terminated` means
     that nothing follows. A `truncated` step is one after which the environment was merely stopped.
@@ -44,16 +44,39 @@ class Layer(NamedTuple):
     bias: Array  # [out]
 
 
+class Normaliser(NamedTuple):
+    """Observations on a common scale: (observation - mean) / std, clipped to ± limit."""
+
+    mean: Array  # [observation]
+    std: Array  # [observation]
+    limit: Array  # []
+
+
+class PolicyParameters(NamedTuple):
+    """The arrays of a policy.
+
+    With several actors there is one critic for each, an MLP with ReLU from (observation, action) to [1]: the action
+    taken is the one that its own actor's critic values most, the first of equals.
+    """
+
+    actors: tuple[tuple[Layer, ...], ...]
+    critics: tuple[tuple[Layer, ...], ...] = ()
+    normaliser: Normaliser | None = None
+    log_std: Array | None = None  # [action] of a head whose spread does not depend on the observation
+
+
 class PolicyNetwork(NamedTuple):
     """A policy as plain layers: what `deploy` needs to run it without the algorithm that trained it.
 
-    With the head `tanh_gaussian` the last layer gives the mean and the log standard deviation side by side; the
-    deterministic action is the tanh of the mean.
+    The head says what an actor's outputs mean and how its deterministic action comes of them:
+    `tanh_gaussian`, mean and log standard deviation side by side [2 action], tanh(mean);
+    `tanh`, [action], tanh(output), the same when asked to be stochastic;
+    `clipped_gaussian`, the mean [action] beside the parameter `log_std`, the mean clipped to [-1, 1].
     """
 
-    actor: tuple[Layer, ...]
+    parameters: PolicyParameters
     activation: Literal["relu", "tanh"] = "relu"
-    head: Literal["tanh_gaussian"] = "tanh_gaussian"
+    head: Literal["tanh_gaussian", "tanh", "clipped_gaussian"] = "tanh_gaussian"
 
 
 class Algorithm(Protocol):
@@ -71,25 +94,41 @@ class Algorithm(Protocol):
         ...
 
     @property
-    def updates_per_step(self) -> int:
-        """Calls of `update` after each environment step once the warm-up is over."""
+    def update_interval(self) -> int:
+        """Environment steps from one update to the next: 1, or as many as a rollout has."""
         ...
 
     @property
-    def batch_size(self) -> int:
-        """Transitions that one update draws from the memory."""
+    def updates_per_step(self) -> int:
+        """Calls of `update` after each of those environment steps, once the warm-up is over."""
+        ...
+
+    @property
+    def transitions_per_update(self) -> int:
+        """Transitions that one call of `update` is given."""
+        ...
+
+    @property
+    def has_schedule(self) -> bool:
+        """Whether what is learnt depends on how many steps the run has in all, so that it cannot be extended."""
         ...
 
     def memory(self, spec: Spec, steps: int) -> Any:
-        """Return the memory that the algorithm wants for a run of `steps` environment steps."""
+        """Return the memory that the algorithm wants for a run of `steps` environment steps: a Replay or a Rollout."""
         ...
 
-    def init(self, key: jax.Array, spec: Spec) -> Any:
-        """Return the first state. No two leaves of it share a buffer, so that it can be donated."""
+    def init(self, key: jax.Array, spec: Spec, steps: int) -> Any:
+        """Return the first state of a run of `steps` environment steps.
+
+        No two leaves of it share a buffer, so that it can be donated.
+        """
         ...
 
     def act(self, state: Any, observation: jax.Array, key: jax.Array, explore: bool) -> jax.Array:
-        """Return the action in [-1, 1] for one observation: sampled to explore, else deterministic."""
+        """Return the action for one observation: sampled to explore, else deterministic.
+
+        Actions lie in [-1, 1]; the environment clips what lies outside, and the memory keeps what was returned.
+        """
         ...
 
     def update(self, state: Any, batch: Transition, key: jax.Array, step: jax.Array) -> tuple[Any, Metrics]:

@@ -17,7 +17,7 @@ from csac.arguments import peek
 from csac.cli import main
 from csac.deploy.policy import Contract, Policy
 from csac.record.run import RunDirectory
-from csac.types import Layer, PolicyNetwork
+from csac.types import Layer, PolicyNetwork, PolicyParameters
 
 TESTS = Path(__file__).parent
 TINY = "--batch-size 8 --actor-hidden-sizes 8 --critic-hidden-sizes 8"
@@ -100,7 +100,7 @@ def make_run(path, task, observation_size, low, high, seeds=(0, 1)):
     generator = np.random.default_rng(0)
     for seed in seeds:
         weight = generator.normal(size=(observation_size, 2 * len(low))).astype(np.float32)
-        network = PolicyNetwork((Layer(weight, np.zeros(2 * len(low), np.float32)),))
+        network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * len(low), np.float32)),),)))
         Policy(network, contract).save(path / "policy" / f"seed_{seed}.safetensors")
         rows = {"seed": seed, "step": 100, "episode": 0, "return": float(seed), "length": 5, "success": None}
         run.append("evaluations", [rows])

@@ -81,7 +81,7 @@ def after_updates(algorithm, updates=50):
         batch = Transition(vectors[:, :3], action, reward, vectors[:, 3:], terminated, jnp.zeros(32))
         return algorithm.update(state, batch, key, step)[0], None
 
-    state = algorithm.init(jax.random.key(1), SPEC)
+    state = algorithm.init(jax.random.key(1), SPEC, 1000)
     return jax.jit(lambda state: jax.lax.scan(one, state, jnp.arange(updates))[0])(state)
 
 

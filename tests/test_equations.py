@@ -155,7 +155,7 @@ def test_the_actor_descends_against_the_new_critics_and_targets_move_last(algori
     # step. The slope of Q in the action turns from 0.01 to -0.09: the actor goes down if it sees the new critics, and
     # up if it sees the old ones. Targets: halfway from (0, 0, -20) to the new (-0.1, -0.09, -0.1).
     critic, target_critic = linear([[0.0], [0.01]], [0.0]), linear([[0.0], [0.0]], [-20.0])
-    state = algorithm.init(jax.random.key(0), ONE)._replace(
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(
         actor=gaussian(0.0, 1.0), critics=(critic, critic), target_critics=(target_critic, target_critic)
     )
     state, metrics = update(algorithm, state, batch_of(transition(action=1.0, reward=0.0)))
@@ -170,7 +170,7 @@ def test_the_actor_descends_against_the_new_critics_and_targets_move_last(algori
 @pytest.mark.parametrize(("target_entropy", "expected"), [(-100.0, -0.1), (100.0, 0.1)])
 def test_the_automatic_temperature_moves_after_it_was_used(target_entropy, expected):
     algorithm = SAC(target_entropy=target_entropy, temperature_learning_rate=0.1, **LINEAR)
-    state = algorithm.init(jax.random.key(0), ONE)
+    state = algorithm.init(jax.random.key(0), ONE, 1000)
     state, metrics = update(algorithm, state, batch_of(transition()))
     assert float(state.log_temperature) == pytest.approx(expected, abs=1e-5)
     assert float(metrics["temperature"]) == 1.0
@@ -178,7 +178,7 @@ def test_the_automatic_temperature_moves_after_it_was_used(target_entropy, expec
 
 def test_a_fixed_temperature_stays():
     algorithm = SAC(temperature="fixed", entropy_weight=0.2, **LINEAR)
-    state, _ = update(algorithm, algorithm.init(jax.random.key(0), ONE), batch_of(transition()))
+    state, _ = update(algorithm, algorithm.init(jax.random.key(0), ONE, 1000), batch_of(transition()))
     assert float(state.log_temperature) == pytest.approx(math.log(0.2))
 
 
@@ -187,7 +187,9 @@ def test_the_target_entropy_is_minus_the_number_of_action_dimensions(log_std, ex
     # Near u = 0 the tanh changes little: the entropy of three dimensions is about 3 (1.4189385 + log_std), which is
     # -3.5 at -2.6 and -2.3 at -2.2. The target is -3: the temperature rises below it and falls above.
     algorithm = SAC(temperature_learning_rate=0.1, **LINEAR)
-    state = algorithm.init(jax.random.key(0), Spec(1, 3))._replace(actor=linear([[0.0] * 6], [0.0] * 3 + [log_std] * 3))
+    state = algorithm.init(jax.random.key(0), Spec(1, 3), 1000)._replace(
+        actor=linear([[0.0] * 6], [0.0] * 3 + [log_std] * 3)
+    )
     batch = batch_of(*[transition()._replace(action=np.zeros(3, np.float32))] * 1000)
     state, _ = update(algorithm, state, batch)
     assert float(state.log_temperature) == pytest.approx(expected, abs=1e-4)
@@ -211,7 +213,7 @@ def test_reference_policy_over_time(choice):
         critic_hidden_sizes=(),
     )
     batch = batch_of(*(transition(observation=x, action=x / 3) for x in (-2.0, 0.5, 1.0)))
-    state, actors, reported = algorithm.init(jax.random.key(0), ONE), [], []
+    state, actors, reported = algorithm.init(jax.random.key(0), ONE, 1000), [], []
     for k in range(7):
         actors.append(state.actor)
         state, metrics = update(algorithm, state, batch, k)
@@ -249,7 +251,7 @@ def test_the_critic_target_of_an_update_uses_the_reference_policy(choice, step, 
         entropy_weight=0.0, relative_entropy_weight=0.5, reference_policy=choice, reference_period=4, **LINEAR
     )
     nothing, three = linear([[0.0], [0.0]], [0.0]), linear([[0.0], [0.0]], [3.0])
-    state = algorithm.init(jax.random.key(0), ONE)._replace(
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(
         actor=POLICY, reference=REFERENCE, critics=(nothing, nothing), target_critics=(three, three)
     )
     _, metrics = update(algorithm, state, batch_of(transition()), step)
@@ -258,7 +260,7 @@ def test_the_critic_target_of_an_update_uses_the_reference_policy(choice, step, 
 
 @pytest.mark.parametrize("algorithm", [CSAC(**LINEAR), SAC(**LINEAR)], ids=lambda algorithm: algorithm.name)
 def test_actions_are_the_tanh_of_the_mean_or_of_a_sample(algorithm):
-    state = algorithm.init(jax.random.key(0), ONE)._replace(actor=gaussian(0.5, 0.1))
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(actor=gaussian(0.5, 0.1))
     act = jax.vmap(algorithm.act, in_axes=(None, None, 0, None))
     keys = jax.random.split(jax.random.key(1), 4000)
     np.testing.assert_allclose(act(state, jnp.ones(1), keys, False), math.tanh(0.5), rtol=1e-6)
@@ -269,14 +271,14 @@ def test_actions_are_the_tanh_of_the_mean_or_of_a_sample(algorithm):
 
 @pytest.mark.parametrize("algorithm", [CSAC(), SAC()], ids=lambda algorithm: algorithm.name)
 def test_no_two_parts_of_the_first_state_share_a_buffer(algorithm):
-    state = replace(algorithm, actor_hidden_sizes=(4,), critic_hidden_sizes=(4,)).init(jax.random.key(0), ONE)
+    state = replace(algorithm, actor_hidden_sizes=(4,), critic_hidden_sizes=(4,)).init(jax.random.key(0), ONE, 1000)
     pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state)]
     assert len(set(pointers)) == len(pointers)
 
 
 @pytest.mark.parametrize("algorithm", [CSAC(), SAC()], ids=lambda algorithm: algorithm.name)
 def test_targets_and_reference_begin_as_copies_and_critics_differ(algorithm):
-    state = replace(algorithm, actor_hidden_sizes=(4,), critic_hidden_sizes=(4,)).init(jax.random.key(0), ONE)
+    state = replace(algorithm, actor_hidden_sizes=(4,), critic_hidden_sizes=(4,)).init(jax.random.key(0), ONE, 1000)
     jax.tree.map(np.testing.assert_array_equal, state.critics, state.target_critics)
     if algorithm.name == "csac":
         jax.tree.map(np.testing.assert_array_equal, state.actor, state.reference)

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from csac.deploy.policy import Contract, Policy
 from csac.training.environments import EVALUATION_SEED, FRESH_EVALUATION_SEED, Environment, Task
 from csac.training.evaluation import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, evaluate
-from csac.types import InputError, Layer, PolicyNetwork
+from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 
 
 def policy_for(task: Task, weight: float = 0.0, bias: float = 0.0, log_std: float = 0.0) -> Policy:
@@ -22,7 +22,7 @@ def policy_for(task: Task, weight: float = 0.0, bias: float = 0.0, log_std: floa
     observation_size, action_size = environment.spec
     mean = np.full((observation_size, action_size), weight)
     biases = np.concatenate([np.full(action_size, bias), np.full(action_size, log_std)])
-    network = PolicyNetwork((Layer(np.concatenate([mean, np.zeros_like(mean)], axis=1), biases),))
+    network = PolicyNetwork(PolicyParameters(((Layer(np.concatenate([mean, np.zeros_like(mean)], axis=1), biases),),)))
     return Policy(network, Contract("Task-v0", "csac", "relu", "tanh_gaussian", *environment.contract_parts))
 
 

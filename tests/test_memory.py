@@ -1,4 +1,4 @@
-"""The replay: what goes in comes out, whole and aligned, uniformly, and from one's own seed alone."""
+"""Replay and rollout: what goes in comes out, whole and aligned, uniformly, and from one's own seed alone."""
 
 from __future__ import annotations
 
@@ -14,37 +14,42 @@ from scipy.stats import chisquare
 from trainer import run
 
 from csac.algorithms import CSAC, SAC
-from csac.algorithms.memory import Replay, pack, row_width, unpack
+from csac.algorithms.memory import Replay, Rollout, pack, row_width, unpack
 from csac.training.environments import training_seed
-from csac.types import Layer, PolicyNetwork, Spec, Transition
+from csac.types import Layer, PolicyNetwork, PolicyParameters, Spec, Transition
 
 SPEC = Spec(2, 1)
 
 
-def numbered(k) -> Transition:
-    """A transition whose every number says which it is and where it belongs."""
+def numbered(numbers) -> Transition:
+    """Transitions [n, ...] whose every number says which it is and where it belongs."""
+    k = np.asarray(numbers, np.float32)
     return Transition(
-        observation=jnp.stack([k + 0.125, k + 0.25]),
-        action=jnp.stack([k + 0.375]),
+        observation=np.stack([k + 0.125, k + 0.25], axis=1),
+        action=np.stack([k + 0.375], axis=1),
         reward=k + 0.5,
-        next_observation=jnp.stack([k + 0.625, k + 0.75]),
-        terminated=k % 2,
+        next_observation=np.stack([k + 0.625, k + 0.75], axis=1),
+        terminated=k % 2 == 1,
         truncated=k % 3,
     )
 
 
 def filled(capacity: int, count: int) -> Replay:
+    rows = jnp.asarray(pack(numbered(range(count))))
+
     def add(replay, k):
-        return replay.add(pack(numbered(k.astype(jnp.float32))), k), None
+        return replay.add(jax.lax.dynamic_slice_in_dim(rows, k, 1), k), None
 
     return jax.jit(lambda: jax.lax.scan(add, Replay.create(capacity, SPEC), jnp.arange(count))[0])()
 
 
 def test_a_row_holds_the_fields_in_their_order():
-    row = pack(numbered(jnp.float32(4.0)))
-    np.testing.assert_array_equal(row, [4.125, 4.25, 4.375, 4.5, 4.625, 4.75, 0.0, 1.0])
-    assert row_width(SPEC) == 8
-    jax.tree.map(np.testing.assert_array_equal, unpack(row, SPEC), numbered(jnp.float32(4.0)))
+    rows = pack(numbered([4, 7]))
+    np.testing.assert_array_equal(rows[0], [4.125, 4.25, 4.375, 4.5, 4.625, 4.75, 0.0, 1.0])
+    assert rows.dtype == np.float32
+    assert row_width(SPEC) == rows.shape[1] == 8
+    unpacked = jax.vmap(unpack, in_axes=(0, None))(jnp.asarray(rows), SPEC)
+    jax.tree.map(np.testing.assert_array_equal, unpacked, numbered([4, 7]))
 
 
 @pytest.mark.parametrize(
@@ -55,7 +60,15 @@ def test_a_ring_of_five_holds_the_newest_five(count, held):
     batch = filled(5, count).draw(jax.random.key(0), jnp.int32(count), 300, SPEC)
     numbers = np.floor(batch.reward)
     assert sorted(set(numbers.tolist())) == held
-    jax.tree.map(np.testing.assert_array_equal, batch, jax.vmap(numbered)(jnp.array(numbers)))
+    jax.tree.map(np.testing.assert_array_equal, batch, numbered(numbers))
+
+
+def test_a_rollout_gives_the_newest_steps_whole_and_in_order():
+    rollout = Rollout.create(3, SPEC)
+    for first in (0, 3):
+        rollout = rollout.add(jnp.asarray(pack(numbered(range(first, first + 3)))), jnp.int32(first))
+    batch = rollout.draw(jax.random.key(0), jnp.int32(6), 3, SPEC)
+    jax.tree.map(np.testing.assert_array_equal, batch, numbered([3, 4, 5]))
 
 
 def test_draws_are_uniform():
@@ -89,12 +102,18 @@ class Watcher:
     warmup_steps: int = 10
     updates_per_step: int = 2
     batch_size: int = 16
+    update_interval: int = 1
+    has_schedule = False
     name: ClassVar[str] = "watcher"
+
+    @property
+    def transitions_per_update(self):
+        return self.batch_size
 
     def memory(self, spec, steps):
         return Replay.create(steps, spec)
 
-    def init(self, key, spec):
+    def init(self, key, spec, steps):
         drawn = jnp.zeros((100, self.batch_size, spec.observation_size))
         return Seen(drawn, jnp.zeros(100), jnp.zeros((spec.observation_size, 2 * spec.action_size)))
 
@@ -106,7 +125,8 @@ class Watcher:
         return state._replace(drawn=drawn, times=times), {"step": step}
 
     def policy(self, state):
-        return PolicyNetwork((Layer(state.weight, jnp.zeros(2)),))  # a bias that is in no state has no seed axis
+        layer = Layer(state.weight, jnp.zeros(2))  # a bias that is in no state has no seed axis
+        return PolicyNetwork(PolicyParameters(((layer,),)))
 
 
 @pytest.fixture(scope="module")
@@ -149,3 +169,30 @@ def test_each_seed_draws_for_itself_from_what_it_has(watched):
         assert len({tuple(batch) for batch in indices}) == 42
     first, second = (state.drawn[:42, :, 1:3] for state in watched.states)  # episode and step, alike in every seed
     assert (first != second).any(axis=(1, 2)).all()
+
+
+class RolloutWatcher(Watcher):
+    """Learns from five steps at a time, as they came."""
+
+    def memory(self, spec, steps):
+        return Rollout.create(self.update_interval, spec)
+
+
+def test_a_rollout_reaches_its_update_whole_and_in_order():
+    watcher = RolloutWatcher(warmup_steps=0, updates_per_step=1, batch_size=5, update_interval=5)
+    outcome = run(watcher, probes.IdEncoded, 23, SEEDS)
+    for seed, state, rows in zip(SEEDS, outcome.states, outcome.memories, strict=True):
+        # Updates follow the steps 5, 10, 15 and 20; the last three steps wait for ever.
+        np.testing.assert_array_equal(state.times, [1.0] * 4 + [0.0] * 96)
+        np.testing.assert_array_equal(state.drawn[3], rows[:, :4])
+        reset_seed, episode, number, last_action = state.drawn[:4].reshape(20, 4).T
+        np.testing.assert_array_equal(reset_seed, [training_seed(seed, int(e)) % 65536 for e in episode])
+        # Episodes of 2, 3 and 4 steps in turn.
+        np.testing.assert_array_equal(number, [0, 1, 0, 1, 2, 0, 1, 2, 3] * 2 + [0, 1])
+        assert len(set(last_action[number > 0])) == 13  # each step had an action of its own
+
+
+def test_the_warm_up_of_a_rollout_ends_with_a_whole_one():
+    watcher = RolloutWatcher(warmup_steps=7, updates_per_step=2, batch_size=5, update_interval=5)
+    state = run(watcher, probes.IdEncoded, 20, SEEDS).states[0]
+    np.testing.assert_array_equal(state.times, [1.0] * 6 + [0.0] * 94)  # after the steps 10, 15 and 20

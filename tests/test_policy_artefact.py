@@ -16,26 +16,36 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from csac.deploy.policy import Activation, Contract, Policy, load
-from csac.types import InputError, Layer, PolicyNetwork, Spec
+from csac.deploy.policy import Activation, Contract, Head, Policy, load
+from csac.types import InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
 
 DICT_PARTS = (("achieved", (2,)), ("position", (1, 2)), ("speed", ()))
 
 
-def contract(parts=((None, (2,)),), action_shape=(1,), low=-1.0, high=1.0, activation: Activation = "relu") -> Contract:
+def contract(
+    parts=((None, (2,)),),
+    action_shape=(1,),
+    low=-1.0,
+    high=1.0,
+    activation: Activation = "relu",
+    head: Head = "tanh_gaussian",
+) -> Contract:
     size = math.prod(action_shape)
     bounds = [np.full(size, bound, np.float32) for bound in (low, high)]
-    return Contract("Task-v0", "csac", activation, "tanh_gaussian", parts, action_shape, *bounds)
+    return Contract("Task-v0", "csac", activation, head, parts, action_shape, *bounds)
+
+
+def random_layers(*sizes: int, seed: int = 0) -> tuple[Layer, ...]:
+    generator = np.random.default_rng(seed)
+    return tuple(
+        Layer(generator.normal(size=(inputs, outputs)), generator.normal(size=outputs))
+        for inputs, outputs in pairwise(sizes)
+    )
 
 
 def random_network(spec: Spec, width: int = 8, seed: int = 0) -> PolicyNetwork:
-    generator = np.random.default_rng(seed)
-    sizes = (spec.observation_size, width, width, 2 * spec.action_size)
-    layers = [
-        Layer(generator.normal(size=(inputs, outputs)), generator.normal(size=outputs))
-        for inputs, outputs in pairwise(sizes)
-    ]
-    return PolicyNetwork(tuple(layers))
+    layers = random_layers(spec.observation_size, width, width, 2 * spec.action_size, seed=seed)
+    return PolicyNetwork(PolicyParameters((layers,)))
 
 
 def random_policy(contract: Contract, seed: int = 0) -> Policy:
@@ -48,7 +58,7 @@ def hand_made(activation: Activation = "relu", log_std_bias=0.0, **settings) -> 
         Layer(np.array([[1.0, 0.0], [-1.0, 1.0]]), np.array([0.0, 1.0])),
         Layer(np.array([[1.0, 1.0], [2.0, 0.0]]), np.array([-3.0, log_std_bias])),
     )
-    return Policy(PolicyNetwork(layers, activation), contract(activation=activation, **settings))
+    return Policy(PolicyNetwork(PolicyParameters((layers,)), activation), contract(activation=activation, **settings))
 
 
 def test_the_deterministic_action_is_the_tanh_of_the_mean():
@@ -172,7 +182,7 @@ def test_the_policy_keeps_its_own_copy_of_the_layers():
     network, agreement = random_network(Spec(2, 1)), contract()
     policy = Policy(network, agreement)
     before, _ = policy.predict(np.ones(2))
-    for layer in network.actor:
+    for layer in network.parameters.actors[0]:
         layer.weight[:] = 0.0
         layer.bias[:] = 0.0
     np.testing.assert_array_equal(policy.predict(np.ones(2))[0], before)
@@ -181,16 +191,88 @@ def test_the_policy_keeps_its_own_copy_of_the_layers():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda network: network._replace(actor=network.actor[:-1]), "gives 8 outputs"),
-        (lambda network: network._replace(actor=network.actor[1:]), "after 2 inputs"),
-        (lambda network: network._replace(actor=()), "no layers"),
-        (lambda network: network._replace(activation="tanh"), "not as the contract says"),
-        (lambda network: network._replace(activation="gelu"), "'gelu'"),
+        ({"actors": (random_layers(2, 8, 8),)}, "gives 8 outputs where the task takes 2"),
+        ({"actors": (random_layers(3, 8, 2),)}, "after 2 inputs"),
+        ({"actors": ((),)}, "no layers in its actor"),
+        ({"actors": ()}, "no actor"),
+        ({"actors": (random_layers(2, 2), random_layers(2, 2))}, "2 actors and 0 critics"),
+        ({"critics": (random_layers(3, 1),)}, "1 actors and 1 critics"),
+        ({"log_std": np.zeros(1)}, "a tanh_gaussian policy has a log_std"),
+        ({"normaliser": Normaliser(np.zeros(3), np.ones(3), np.array(1.0))}, "for 2 inputs"),
+        ({"normaliser": Normaliser(np.zeros(2), np.zeros(2), np.array(1.0))}, "more than 0"),
     ],
 )
-def test_layers_that_do_not_fit_are_refused(change, message):
+def test_parameters_that_do_not_fit_are_refused(change, message):
+    network = random_network(Spec(2, 1))
     with pytest.raises(InputError, match=message):
-        Policy(change(random_network(Spec(2, 1))), contract())
+        Policy(network._replace(parameters=network.parameters._replace(**change)), contract())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"activation": "tanh"}, "not as the contract says"),
+        ({"activation": "gelu"}, "'gelu'"),
+        ({"head": "tanh"}, "not as the contract says"),
+    ],
+)
+def test_a_network_that_the_contract_does_not_know_is_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        Policy(random_network(Spec(2, 1))._replace(**change), contract())
+
+
+def clipped_gaussian(log_std: float = 0.0) -> Policy:
+    """Inputs: (x - [1, 0]) / [2, 1], clipped to ±3. Mean: input0 + input1."""
+    normaliser = Normaliser(np.array([1.0, 0.0]), np.array([2.0, 1.0]), np.array(3.0))
+    layer = Layer(np.array([[1.0], [1.0]]), np.zeros(1))
+    parameters = PolicyParameters(((layer,),), normaliser=normaliser, log_std=np.full(1, log_std))
+    return Policy(PolicyNetwork(parameters, "tanh", "clipped_gaussian"), CLIPPED)
+
+
+CLIPPED = contract(activation="tanh", head="clipped_gaussian")
+
+
+def test_a_clipped_gaussian_normalises_and_clips():
+    # [2, 0.25]: 0.5 + 0.25. [3, 9]: 1 + 3, the second input clipped to 3, and the action to 1. [-9, 0]: -3, so -1.
+    actions = clipped_gaussian().act(np.array([[2.0, 0.25], [3.0, 9.0], [-9.0, 0.0]], np.float32))
+    np.testing.assert_allclose(actions, [[0.75], [1.0], [-1.0]], atol=1e-7)
+
+
+def test_a_clipped_gaussian_adds_its_spread_before_clipping():
+    # Mean 0, std 2: noise of 0.25 gives 0.5, noise of -3 gives -6, clipped to -1.
+    noise = np.array([[0.25], [-3.0]], np.float32)
+    actions = clipped_gaussian(np.log(2.0)).act(np.array([[1.0, 0.0]] * 2, np.float32), False, noise)
+    np.testing.assert_allclose(actions, [[0.5], [-1.0]], atol=1e-6)
+
+
+def two_actors() -> Policy:
+    """Actors x0 and -x0, beneath the tanh; critic 0 values x1, critic 1 values half of its action."""
+    actors = [(Layer(np.array([[sign], [0.0]]), np.zeros(1)),) for sign in (1.0, -1.0)]
+    critics = [(Layer(np.array(weight)[:, None], np.zeros(1)),) for weight in ([0.0, 1.0, 0.0], [0.0, 0.0, 0.5])]
+    return Policy(PolicyNetwork(PolicyParameters(tuple(actors), tuple(critics)), head="tanh"), contract(head="tanh"))
+
+
+def test_of_two_actors_each_row_gets_the_action_valued_more():
+    # Values: [1, 0]: 0 against -tanh(1) / 2, so the first actor. [-1, 0]: 0 against tanh(1) / 2, so the second.
+    # [0, 0]: 0 against 0, so the first. [1, -9]: -9 against -tanh(1) / 2, so the second.
+    observations = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 0.0], [1.0, -9.0]], np.float32)
+    expected = [[math.tanh(1.0)], [math.tanh(1.0)], [0.0], [-math.tanh(1.0)]]
+    for deterministic in (True, False):
+        np.testing.assert_allclose(two_actors().act(observations, deterministic), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("make", [clipped_gaussian, two_actors])
+def test_every_kind_of_policy_is_the_same_after_saving_and_loading(tmp_path, make):
+    policy = make()
+    policy.save(tmp_path / "policy")
+    policy.contract.save(tmp_path / "contract.json")
+    again = Policy.load(tmp_path / "policy", Contract.load(tmp_path / "contract.json"))
+    observations = np.random.default_rng(2).normal(size=(7, 2)).astype(np.float32)
+    noise = np.ones((7, 1), np.float32)
+    for deterministic in (True, False):
+        np.testing.assert_array_equal(
+            again.act(observations, deterministic, noise), policy.act(observations, deterministic, noise)
+        )
 
 
 def test_a_policy_is_the_same_after_saving_and_loading(tmp_path):
@@ -290,7 +372,7 @@ def test_a_damaged_policy_is_refused(tmp_path, damage):
 
 def test_a_policy_that_is_not_a_number_is_refused(tmp_path):
     network, agreement = random_network(Spec(2, 1)), contract()
-    network.actor[1].bias[3] = np.nan
+    network.parameters.actors[0][1].bias[3] = np.nan
     Policy(network, agreement).save(tmp_path / "policy")
     with pytest.raises(InputError, match="not finite float32"):
         Policy.load(tmp_path / "policy", agreement)

@@ -23,7 +23,7 @@ from csac.algorithms.networks import (
     polyak,
     q_values,
 )
-from csac.types import Metrics, PolicyNetwork, Spec, Transition
+from csac.types import Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
 class State(NamedTuple):
@@ -87,16 +87,23 @@ class CSAC:
     max_gradient_norm: float = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
+    update_interval = 1
+    has_schedule = False
     name: ClassVar[str] = "csac"
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
 
+    @property
+    def transitions_per_update(self) -> int:
+        """Transitions that one call of `update` is given."""
+        return self.batch_size
+
     def memory(self, spec: Spec, steps: int) -> Replay:
         """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
         return Replay.create(min(self.replay_size, steps), spec)
 
-    def init(self, key: jax.Array, spec: Spec) -> State:
+    def init(self, key: jax.Array, spec: Spec, steps: int) -> State:
         """Return random networks; targets and reference are copies."""
         actor_key, critics_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, 2 * spec.action_size)
@@ -202,7 +209,7 @@ class CSAC:
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers."""
-        return PolicyNetwork(state.actor.layers)
+        return PolicyNetwork(PolicyParameters((state.actor.layers,)))
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
         return make_optimiser(learning_rate, self.max_gradient_norm)

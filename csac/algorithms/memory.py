@@ -1,4 +1,4 @@
-"""Where transitions wait to be learnt from. Everything here is for one seed."""
+"""Where transitions wait to be learnt from. Everything here but `pack` is for one seed."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from csac.types import Transition
 
@@ -26,10 +27,13 @@ class Replay(NamedTuple):
         """Return an empty ring."""
         return cls(jnp.zeros((capacity, row_width(spec)), jnp.float32))
 
-    def add(self, row: jax.Array, count: jax.Array) -> Replay:
-        """Return the ring with a packed row [width] written over the oldest. `count` rows were added before it."""
+    def add(self, rows: jax.Array, count: jax.Array) -> Replay:
+        """Return the ring with packed rows [n, width] written over the oldest; `count` rows were added before them.
+
+        `n` divides both `count` and the capacity, so that rows added together lie together.
+        """
         start = (count % self.rows.shape[0], 0)
-        return Replay(jax.lax.dynamic_update_slice(self.rows, row[None], start))
+        return Replay(jax.lax.dynamic_update_slice(self.rows, rows, start))
 
     def draw(self, key: jax.Array, count: jax.Array, batch_size: int, spec: Spec) -> Transition:
         """Return a batch drawn uniformly with replacement from the `count` rows added, or the newest `capacity`."""
@@ -37,14 +41,34 @@ class Replay(NamedTuple):
         return jax.vmap(unpack, in_axes=(0, None))(self.rows[indices], spec)
 
 
+class Rollout(NamedTuple):
+    """The newest transitions, in order, for an algorithm that learns from what its own policy has just done."""
+
+    rows: jax.Array  # [steps, 2 observation + action + 3]
+
+    @classmethod
+    def create(cls, steps: int, spec: Spec) -> Rollout:
+        """Return a rollout yet to be made."""
+        return cls(jnp.zeros((steps, row_width(spec)), jnp.float32))
+
+    def add(self, rows: jax.Array, count: jax.Array) -> Rollout:
+        """Return the rollout that consists of these packed rows [steps, width]."""
+        return Rollout(jnp.reshape(rows, self.rows.shape))
+
+    def draw(self, key: jax.Array, count: jax.Array, batch_size: int, spec: Spec) -> Transition:
+        """Return all of it: transitions with a leading axis of time."""
+        return jax.vmap(unpack, in_axes=(0, None))(self.rows, spec)
+
+
 def row_width(spec: Spec) -> int:
     """Return the number of floats in a packed transition."""
     return 2 * spec.observation_size + spec.action_size + 3
 
 
-def pack(transition: Transition) -> jax.Array:
-    """Return one transition as one row [width], its fields in their order."""
-    return jnp.concatenate([jnp.atleast_1d(jnp.asarray(field, jnp.float32)) for field in transition])
+def pack(transition: Transition) -> np.ndarray:
+    """Return transitions of several seeds, NumPy arrays [seed, ...], as rows [seed, width], fields in their order."""
+    fields = [np.reshape(field, (len(field), -1)) for field in transition]
+    return np.concatenate(fields, axis=1, dtype=np.float32, casting="unsafe")
 
 
 def unpack(row: jax.Array, spec: Spec) -> Transition:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax
@@ -16,14 +16,16 @@ if TYPE_CHECKING:
 
 
 class MLP(eqx.Module):
-    """A multilayer perceptron with ReLU between its layers, for one example."""
+    """A multilayer perceptron with ReLU or tanh between its layers, for one example."""
 
     layers: tuple[Layer, ...]
+    activation: Literal["relu", "tanh"] = eqx.field(static=True, default="relu")
 
     def __call__(self, inputs: jax.Array) -> jax.Array:
         """Map [in] to [out]."""
+        activate = jax.nn.relu if self.activation == "relu" else jnp.tanh
         for layer in self.layers[:-1]:
-            inputs = jax.nn.relu(inputs @ layer.weight + layer.bias)
+            inputs = activate(inputs @ layer.weight + layer.bias)
         return inputs @ self.layers[-1].weight + self.layers[-1].bias
 
 
@@ -39,6 +41,20 @@ def _make_layer(key: jax.Array, n_in: int, n_out: int) -> Layer:
     bound = 1.0 / n_in**0.5
     weight = jax.random.uniform(weight_key, (n_in, n_out), minval=-bound, maxval=bound)
     return Layer(weight, jax.random.uniform(bias_key, (n_out,), minval=-bound, maxval=bound))
+
+
+def make_orthogonal_mlp(
+    key: jax.Array, input_size: int, hidden_sizes: Sequence[int], output_size: int, output_gain: float
+) -> MLP:
+    """Return an MLP with tanh, orthogonal weights of gain √2 (`output_gain` in the last layer) and no biases yet."""
+    sizes = (input_size, *hidden_sizes, output_size)
+    gains = (2.0**0.5,) * len(hidden_sizes) + (output_gain,)
+    keys = jax.random.split(key, len(gains))
+    layers = [
+        Layer(jax.nn.initializers.orthogonal(gain)(k, (n_in, n_out)), jnp.zeros(n_out))
+        for k, gain, n_in, n_out in zip(keys, gains, sizes[:-1], sizes[1:], strict=True)
+    ]
+    return MLP(tuple(layers), activation="tanh")
 
 
 def make_critics(
@@ -66,9 +82,11 @@ def copy_tree(tree: Any) -> Any:
     return jax.tree.map(jnp.copy, tree)
 
 
-def make_optimiser(learning_rate: float, max_gradient_norm: float = 0.0) -> optax.GradientTransformation:
+def make_optimiser(
+    learning_rate: float | jax.Array, max_gradient_norm: float = 0.0, epsilon: float = 1e-8
+) -> optax.GradientTransformation:
     """Return Adam, after clipping by the global norm of the gradient where a positive bound is given."""
-    adam = optax.adam(learning_rate)
+    adam = optax.adam(learning_rate, eps=epsilon)
     if max_gradient_norm > 0:
         return optax.chain(optax.clip_by_global_norm(max_gradient_norm), adam)
     return adam

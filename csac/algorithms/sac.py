@@ -23,7 +23,7 @@ from csac.algorithms.networks import (
     polyak,
     q_values,
 )
-from csac.types import InputError, Metrics, PolicyNetwork, Spec, Transition
+from csac.types import InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
 class State(NamedTuple):
@@ -73,6 +73,8 @@ class SAC:
     max_gradient_norm: float = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
+    update_interval = 1
+    has_schedule = False
     name: ClassVar[str] = "sac"
 
     def __post_init__(self) -> None:
@@ -80,11 +82,16 @@ class SAC:
         if self.temperature == "automatic" and self.entropy_weight == 0:
             raise InputError("entropy_weight must be more than 0 to begin an automatic temperature")
 
+    @property
+    def transitions_per_update(self) -> int:
+        """Transitions that one call of `update` is given."""
+        return self.batch_size
+
     def memory(self, spec: Spec, steps: int) -> Replay:
         """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
         return Replay.create(min(self.replay_size, steps), spec)
 
-    def init(self, key: jax.Array, spec: Spec) -> State:
+    def init(self, key: jax.Array, spec: Spec, steps: int) -> State:
         """Return random networks; the targets are copies."""
         actor_key, critics_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, 2 * spec.action_size)
@@ -184,7 +191,7 @@ class SAC:
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers."""
-        return PolicyNetwork(state.actor.layers)
+        return PolicyNetwork(PolicyParameters((state.actor.layers,)))
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
         return make_optimiser(learning_rate, self.max_gradient_norm)

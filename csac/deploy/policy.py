@@ -10,13 +10,13 @@ import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import safetensors
 import safetensors.numpy
 
-from csac.types import InputError, Layer, PolicyNetwork, Spec
+from csac.types import InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,7 +26,7 @@ LOG_STD_RANGE = (-20.0, 2.0)
 EVALUATION_POINTS = 3
 
 Activation = Literal["relu", "tanh"]
-Head = Literal["tanh_gaussian"]
+Head = Literal["tanh_gaussian", "tanh", "clipped_gaussian"]
 Which = Literal["last", "best"]
 
 
@@ -167,18 +167,11 @@ class Policy:
     """
 
     def __init__(self, network: PolicyNetwork, contract: Contract, seed: int = 0) -> None:
-        layers = tuple(
-            Layer(*(np.array(array, dtype=np.float32, order="C") for array in layer)) for layer in network.actor
-        )
-        self.network = network._replace(actor=layers)
+        self.network = network._replace(parameters=_copied(network.parameters))
         self.contract = contract
-        _check_layers(self.network, contract)
+        _check_network(self.network, contract)
         self._generator = np.random.default_rng(seed)
-        self._action_size = size = contract.spec.action_size
-        self._hidden = layers[:-1]
-        weight, bias = layers[-1]
-        self._mean = Layer(np.ascontiguousarray(weight[:, :size]), bias[:size])
-        self._log_std = Layer(np.ascontiguousarray(weight[:, size:]), bias[size:])
+        self._actors = [_split_actor(actor, contract) for actor in self.network.parameters.actors]
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -197,30 +190,39 @@ class Policy:
     def act(self, observations: np.ndarray, deterministic: bool = True, noise: np.ndarray | None = None) -> np.ndarray:
         """Return actions in [-1, 1], [n, action], for flat float32 observations [n, observation].
 
-        A stochastic action is tanh(mean + std * noise); `noise`, standard normal [n, action], is drawn where not given.
+        A stochastic action adds std * noise to the mean before the head's tanh or clip; `noise`, standard normal
+        [n, action], is drawn where not given. The head `tanh` has no spread: it gives the same action either way.
         """
-        hidden = observations
-        for weight, bias in self._hidden:
-            hidden = hidden @ weight
-            hidden += bias
-            _activate(hidden, self.network.activation)
-        action = hidden @ self._mean.weight
-        action += self._mean.bias
-        if not deterministic:
-            if noise is None:
-                noise = self._generator.standard_normal(action.shape, dtype=np.float32)
-            std = hidden @ self._log_std.weight + self._log_std.bias
-            action += np.exp(np.clip(std, *LOG_STD_RANGE)) * noise
+        normaliser = self.network.parameters.normaliser
+        inputs = observations if normaliser is None else _normalised(observations, normaliser)
+        if not deterministic and noise is None:
+            noise = self._generator.standard_normal((len(inputs), self.contract.spec.action_size), dtype=np.float32)
+        actions = [self._action(actor, inputs, None if deterministic else noise) for actor in self._actors]
+        return actions[0] if len(actions) == 1 else self._most_valued(inputs, actions)
+
+    def _action(self, actor: _Actor, inputs: np.ndarray, noise: np.ndarray | None) -> np.ndarray:
+        hidden = _hidden(actor.hidden, inputs, self.network.activation)
+        action = hidden @ actor.mean.weight
+        action += actor.mean.bias
+        if noise is not None and self.network.head == "tanh_gaussian":
+            log_std = hidden @ actor.log_std.weight + actor.log_std.bias
+            action += np.exp(np.clip(log_std, *LOG_STD_RANGE)) * noise
+        if (log_std := self.network.parameters.log_std) is not None:
+            action += 0.0 if noise is None else np.exp(log_std) * noise
+            return np.clip(action, -1.0, 1.0, out=action)
         return np.tanh(action, out=action)
+
+    def _most_valued(self, inputs: np.ndarray, actions: list[np.ndarray]) -> np.ndarray:
+        """Return row by row the action that its own actor's critic values most, the first of equals."""
+        values = [
+            _outputs(critic, np.concatenate([inputs, action], axis=1))[:, 0]
+            for critic, action in zip(self.network.parameters.critics, actions, strict=True)
+        ]
+        return np.stack(actions)[np.argmax(values, axis=0), np.arange(len(inputs))]
 
     def save(self, path: str | Path) -> None:
         """Write the layers as safetensors, whole or not at all."""
-        tensors = {
-            f"actor.{index}.{name}": array
-            for index, layer in enumerate(self.network.actor)
-            for name, array in layer._asdict().items()
-        }
-        _write(Path(path), safetensors.numpy.save(tensors))
+        _write(Path(path), safetensors.numpy.save(_tensors(self.network.parameters)))
 
     @staticmethod
     def load(path: str | Path, contract: Contract, seed: int = 0) -> Policy:
@@ -234,7 +236,7 @@ class Policy:
         except (safetensors.SafetensorError, KeyError, ValueError) as error:
             raise InputError(f"{path} is damaged ({error}): restore it from a copy") from error
         try:
-            network = PolicyNetwork(_layers(tensors), contract.activation, contract.head)
+            network = PolicyNetwork(_parameters(tensors), contract.activation, contract.head)
             return Policy(network, contract, seed)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
@@ -302,37 +304,141 @@ def _listed(seeds: list[int]) -> str:
     return ", ".join(str(seed) for seed in seeds)
 
 
-def _activate(array: np.ndarray, activation: str) -> None:
-    if activation == "relu":
-        np.maximum(array, 0, out=array)
-    else:
-        np.tanh(array, out=array)
+class _Actor(NamedTuple):
+    """An actor's layers, its last one split into what gives the mean and, in some heads, the log standard deviation."""
+
+    hidden: tuple[Layer, ...]
+    mean: Layer
+    log_std: Layer
 
 
-def _check_layers(network: PolicyNetwork, contract: Contract) -> None:
+def _split_actor(layers: tuple[Layer, ...], contract: Contract) -> _Actor:
+    (weight, bias), size = layers[-1], contract.spec.action_size
+    mean = Layer(np.ascontiguousarray(weight[:, :size]), bias[:size])
+    return _Actor(layers[:-1], mean, Layer(np.ascontiguousarray(weight[:, size:]), bias[size:]))
+
+
+def _normalised(observations: np.ndarray, normaliser: Normaliser) -> np.ndarray:
+    scaled = (observations - normaliser.mean) / normaliser.std
+    return np.clip(scaled, -normaliser.limit, normaliser.limit, out=scaled)
+
+
+def _hidden(layers: tuple[Layer, ...], inputs: np.ndarray, activation: Activation) -> np.ndarray:
+    """Return the activations [n, width] after the last of these layers."""
+    for weight, bias in layers:
+        inputs = inputs @ weight
+        inputs += bias
+        if activation == "relu":
+            np.maximum(inputs, 0, out=inputs)
+        else:
+            np.tanh(inputs, out=inputs)
+    return inputs
+
+
+def _outputs(layers: tuple[Layer, ...], inputs: np.ndarray) -> np.ndarray:
+    return _hidden(layers[:-1], inputs, "relu") @ layers[-1].weight + layers[-1].bias
+
+
+def _copied(parameters: PolicyParameters) -> PolicyParameters:
+    """Return the same numbers as float32 arrays of their own."""
+
+    def own(array: Any) -> np.ndarray:
+        return np.array(array, dtype=np.float32, order="C")
+
+    def mlps(networks: tuple[tuple[Layer, ...], ...]) -> tuple[tuple[Layer, ...], ...]:
+        return tuple(tuple(Layer(own(layer[0]), own(layer[1])) for layer in layers) for layers in networks)
+
+    normaliser = parameters.normaliser and Normaliser(*map(own, parameters.normaliser))
+    log_std = None if parameters.log_std is None else own(parameters.log_std)
+    return PolicyParameters(mlps(parameters.actors), mlps(parameters.critics), normaliser, log_std)
+
+
+def _check_network(network: PolicyNetwork, contract: Contract) -> None:
     observation_size, action_size = contract.spec
+    actors, critics, normaliser, log_std = network.parameters
     if network.activation not in get_args(Activation) or network.head not in get_args(Head):
         raise InputError(f"the policy's activation {network.activation!r} or head {network.head!r} is not known")
     if (network.activation, network.head) != (contract.activation, contract.head):
         raise InputError(f"the policy is {network.activation}/{network.head}, not as the contract says")
-    if not network.actor:
-        raise InputError("the policy has no layers")
-    width = observation_size
-    for index, (weight, bias) in enumerate(network.actor):
+    if not actors:
+        raise InputError("the policy has no actor")
+    if len(critics) != (len(actors) if len(actors) > 1 else 0):
+        raise InputError(f"the policy has {len(actors)} actors and {len(critics)} critics to choose between them")
+    outputs = 2 * action_size if network.head == "tanh_gaussian" else action_size
+    for actor in actors:
+        _check_layers("actor", actor, observation_size, outputs)
+    for critic in critics:
+        _check_layers("critic", critic, observation_size + action_size, 1)
+    if (log_std is not None) != (network.head == "clipped_gaussian"):
+        raise InputError(f"a {network.head} policy {'has' if log_std is not None else 'lacks'} a log_std of its own")
+    if log_std is not None and log_std.shape != (action_size,):
+        raise InputError(f"the policy's log_std has shape {log_std.shape} where the task has {action_size} actions")
+    if normaliser is not None:
+        _check_normaliser(normaliser, observation_size)
+
+
+def _check_layers(name: str, layers: tuple[Layer, ...], inputs: int, outputs: int) -> None:
+    if not layers:
+        raise InputError(f"the policy has no layers in its {name}")
+    width = inputs
+    for index, (weight, bias) in enumerate(layers):
         if weight.ndim != 2 or bias.shape != weight.shape[1:] or weight.shape[0] != width:
-            raise InputError(f"actor layer {index} has shapes {weight.shape} and {bias.shape} after {width} inputs")
+            raise InputError(f"{name} layer {index} has shapes {weight.shape} and {bias.shape} after {width} inputs")
         width = weight.shape[1]
-    if width != 2 * action_size:
-        raise InputError(f"the policy gives {width} outputs where the task's {action_size} actions take twice as many")
+    if width != outputs:
+        raise InputError(f"the {name} gives {width} outputs where the task takes {outputs}")
 
 
-def _layers(tensors: dict[str, np.ndarray]) -> tuple[Layer, ...]:
-    names = [(f"actor.{index}.weight", f"actor.{index}.bias") for index in range(len(tensors) // 2)]
-    if set(tensors) != {name for pair in names for name in pair}:
-        raise InputError(f"not the layers of an actor: {sorted(tensors)}")
+def _check_normaliser(normaliser: Normaliser, observation_size: int) -> None:
+    mean, std, limit = normaliser
+    if mean.shape != (observation_size,) or std.shape != mean.shape or limit.shape != ():
+        raise InputError(
+            f"the normaliser has shapes {mean.shape}, {std.shape} and {limit.shape} for {observation_size} inputs"
+        )
+    if not (std > 0).all() or not limit > 0:
+        raise InputError("the normaliser's std and limit are to be more than 0")
+
+
+def _tensors(parameters: PolicyParameters) -> dict[str, np.ndarray]:
+    """Return every array by the name that it has in a file."""
+    tensors = {
+        f"{kind}.{number}.{index}.{name}": array
+        for kind, networks in (("actor", parameters.actors), ("critic", parameters.critics))
+        for number, layers in enumerate(networks)
+        for index, layer in enumerate(layers)
+        for name, array in layer._asdict().items()
+    }
+    if parameters.normaliser is not None:
+        tensors |= {f"normaliser.{name}": array for name, array in parameters.normaliser._asdict().items()}
+    if parameters.log_std is not None:
+        tensors["log_std"] = parameters.log_std
+    return tensors
+
+
+def _parameters(tensors: dict[str, np.ndarray]) -> PolicyParameters:
+    """Return the parameters that `_tensors` named so; InputError where these are none."""
     if any(array.dtype != np.float32 or not np.isfinite(array).all() for array in tensors.values()):
         raise InputError("its numbers are not finite float32: restore it from a copy")
-    return tuple(Layer(tensors[weight], tensors[bias]) for weight, bias in names)
+    normaliser = [tensors.get(f"normaliser.{name}") for name in Normaliser._fields]
+    parameters = PolicyParameters(
+        _mlps(tensors, "actor"),
+        _mlps(tensors, "critic"),
+        None if any(array is None for array in normaliser) else Normaliser(*normaliser),
+        tensors.get("log_std"),
+    )
+    if set(tensors) != set(_tensors(parameters)):
+        raise InputError(f"not the parameters of a policy: {sorted(tensors)}")
+    return parameters
+
+
+def _mlps(tensors: dict[str, np.ndarray], kind: str) -> tuple[tuple[Layer, ...], ...]:
+    networks: list[tuple[Layer, ...]] = []
+    while f"{kind}.{len(networks)}.0.weight" in tensors:
+        prefix, layers = f"{kind}.{len(networks)}", []
+        while f"{prefix}.{len(layers)}.weight" in tensors and f"{prefix}.{len(layers)}.bias" in tensors:
+            layers.append(Layer(*(tensors[f"{prefix}.{len(layers)}.{name}"] for name in Layer._fields)))
+        networks.append(tuple(layers))
+    return tuple(networks)
 
 
 def _contract(fields: Any) -> Contract:

@@ -8,16 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from csac.algorithms.memory import pack, row_width
 from csac.deploy.policy import Contract, Policy
 from csac.training.environments import SeedEnvironments
 from csac.training.evaluation import EvaluationFailure, Evaluator
-from csac.types import Layer, PolicyNetwork
+from csac.types import PolicyNetwork, Transition
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from csac.training.environments import Steps, Task
-    from csac.types import Algorithm, Spec
+    from csac.types import Algorithm, PolicyParameters, Spec
 
 METRICS_INTERVAL = 1_000
 PROGRESS_INTERVAL = 250
@@ -131,7 +132,7 @@ def train_group(settings: Settings, seeds: Sequence[int], should_stop: Callable[
 class Learner:
     """The compiled programs of one group. Seeds are the leading axis of everything that enters and leaves.
 
-    What is learnt is kept as a flat list of buffers, donated at every call: flattening nested modules in Python at
+    What is learnt is kept as a flat list of buffers, donated at every update: flattening nested modules in Python at
     each environment step would cost more than the environment. A seed that is alone has no seed axis in there: for an
     axis of size one XLA transposes the weight gradients, which costs 4-8 % of an update.
     """
@@ -141,54 +142,53 @@ class Learner:
         self._is_alone = len(seeds) == 1
         self._metrics: list[str] = []
         self._updates_summed = 0
+        self._waiting = np.zeros((len(seeds), algorithm.update_interval, row_width(spec)), np.float32)
         keys = np.stack([np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds])
         begin = jax.jit(lambda key: self._begin(key, steps))
         carry = begin(keys[0]) if self._is_alone else jax.vmap(begin)(keys)
         self._buffers, self._structure = jax.tree.flatten(carry)
         self._explore = self._compiled(self._remember_and_explore)
         self._learn = self._compiled(self._remember_and_learn)
-        self.network = algorithm.policy(jax.eval_shape(lambda: carry[0]))  # for all but its layers
+        self._act_alone = self._compiled_to_act(self._act)
+        self._explore_alone = self._compiled_to_act(self._uniform)
+        self.network = algorithm.policy(jax.eval_shape(lambda: carry[0]))  # for all but its parameters
 
     def first_actions(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions [seed, action] for the first observations [seed, observation]."""
-        act = self._uniform if self.algorithm.warmup_steps else self._act
-        if self._is_alone:
-            return np.asarray(jax.jit(act)(self._carry, observations[0], 0))[None]
-        return np.asarray(jax.jit(jax.vmap(act, in_axes=(0, 0, None)))(self._carry, observations, 0))
+        return self._next_actions(observations, 0)
 
     def step(self, observations: np.ndarray, actions: np.ndarray, outcome: Steps, step: int) -> np.ndarray:
-        """Remember environment step number `step`, learn if the warm-up is over, and return the next actions.
+        """Remember environment step number `step`, learn where it is time to, and return the next actions.
 
-        One dispatch, whatever the algorithm does.
+        One dispatch, whatever the algorithm does. Between updates transitions wait on the host, so that an algorithm
+        that learns from rollouts is only asked to act.
         """
-        rows = np.concatenate(
-            (
-                observations,
-                actions,
-                outcome.reward[:, None],
-                outcome.next_observation,
-                outcome.terminated[:, None],
-                outcome.truncated[:, None],
-            ),
-            axis=1,
-            dtype=np.float32,
+        interval = self.algorithm.update_interval
+        self._waiting[:, (step - 1) % interval] = pack(
+            Transition(
+                observations, actions, outcome.reward, outcome.next_observation, outcome.terminated, outcome.truncated
+            )
         )
+        if step % interval:
+            return self._next_actions(outcome.observation, step)
         program = self._explore
         if step >= self.algorithm.warmup_steps:
             program = self._learn
             self._updates_summed += self.algorithm.updates_per_step
-        next_actions, self._buffers = program(self._buffers, rows, outcome.observation, np.int32(step))
+        next_actions, self._buffers = program(self._buffers, self._waiting, outcome.observation, np.int32(step))
         return np.asarray(next_actions)
 
     def networks(self) -> list[PolicyNetwork]:
         """Return each seed's policy as NumPy layers."""
 
-        def layers_of(state: Any) -> tuple[Layer, ...]:
-            return self.algorithm.policy(state).actor
+        def parameters_of(state: Any) -> PolicyParameters:
+            return self.algorithm.policy(state).parameters
 
         states = self._carry[0]
-        layers = jax.tree.map(np.array, layers_of(states) if self._is_alone else jax.vmap(layers_of)(states))
-        return [self.network._replace(actor=actor) for actor in self._by_seed(layers)]
+        parameters = jax.tree.map(
+            np.array, parameters_of(states) if self._is_alone else jax.vmap(parameters_of)(states)
+        )
+        return [self.network._replace(parameters=seed) for seed in self._by_seed(parameters)]
 
     def take_metrics(self) -> list[dict[str, float]]:
         """Return each seed's metrics, averaged over the updates since the last call; none if there were no updates."""
@@ -211,6 +211,10 @@ class Learner:
         seeds = len(jax.tree.leaves(tree)[0])
         return [jax.tree.map(lambda leaf: leaf[i], tree) for i in range(seeds)]  # noqa: B023
 
+    def _next_actions(self, observations: np.ndarray, step: int) -> np.ndarray:
+        program = self._explore_alone if step < self.algorithm.warmup_steps else self._act_alone
+        return np.asarray(program(self._buffers, observations, np.int32(step)))
+
     def _compiled(self, program: Callable) -> Callable:
         """Return a program of one seed as one dispatch for all: (buffers, rows, observations, step)."""
 
@@ -224,30 +228,41 @@ class Learner:
 
         return jax.jit(flat, donate_argnums=0)
 
+    def _compiled_to_act(self, act: Callable) -> Callable:
+        """Return what gives one seed's action as one dispatch for all: (buffers, observations, step)."""
+
+        def flat(buffers: list[jax.Array], observations: jax.Array, step: jax.Array) -> jax.Array:
+            carry = jax.tree.unflatten(self._structure, buffers)
+            if self._is_alone:
+                return act(carry, observations[0], step)[None]
+            return jax.vmap(act, in_axes=(0, 0, None))(carry, observations, step)
+
+        return jax.jit(flat)
+
     # What follows speaks of one seed; a carry is (state, memory, sums of metrics, key data).
 
     def _begin(self, key_data: jax.Array, steps: int) -> tuple[Any, Any, jax.Array, jax.Array]:
         init_key, run_key = jax.random.split(jax.random.wrap_key_data(key_data))
-        state, memory = self.algorithm.init(init_key, self.spec), self.algorithm.memory(self.spec, steps)
-        batch = jax.eval_shape(lambda: memory.draw(run_key, 1, self.algorithm.batch_size, self.spec))
+        state, memory = self.algorithm.init(init_key, self.spec, steps), self.algorithm.memory(self.spec, steps)
+        batch = jax.eval_shape(lambda: self._draw(memory, run_key, jnp.int32(1)))
         metrics = jax.eval_shape(self.algorithm.update, state, batch, run_key, jnp.int32(0))[1]
         self._metrics = list(metrics)
         return state, memory, jnp.zeros(len(metrics)), jax.random.key_data(run_key)
 
-    def _remember_and_explore(self, carry: tuple, row: jax.Array, observation: jax.Array, step: jax.Array):
+    def _remember_and_explore(self, carry: tuple, rows: jax.Array, observation: jax.Array, step: jax.Array):
         state, memory, sums, key_data = carry
-        carry = (state, memory.add(row, step - 1), sums, key_data)
+        carry = (state, memory.add(rows, step - len(rows)), sums, key_data)
         return self._uniform(carry, observation, step), carry
 
-    def _remember_and_learn(self, carry: tuple, row: jax.Array, observation: jax.Array, step: jax.Array):
+    def _remember_and_learn(self, carry: tuple, rows: jax.Array, observation: jax.Array, step: jax.Array):
         state, memory, sums, key_data = carry
-        memory = memory.add(row, step - 1)
-        first = (step - max(self.algorithm.warmup_steps, 1)) * self.algorithm.updates_per_step
+        memory = memory.add(rows, step - len(rows))
         draw_key, update_key, _ = self._keys(key_data, step)
+        first = self._updates_before(step)
 
         def update(i: jax.Array, learnt: tuple) -> tuple:
             state, sums = learnt
-            batch = memory.draw(jax.random.fold_in(draw_key, i), step, self.algorithm.batch_size, self.spec)
+            batch = self._draw(memory, jax.random.fold_in(draw_key, i), step)
             state, metrics = self.algorithm.update(state, batch, jax.random.fold_in(update_key, i), first + i)
             return state, sums + jnp.stack([metrics[name] for name in self._metrics])
 
@@ -257,6 +272,15 @@ class Learner:
             state, sums = jax.lax.fori_loop(0, self.algorithm.updates_per_step, update, (state, sums))
         carry = (state, memory, sums, key_data)
         return self._act(carry, observation, step), carry
+
+    def _draw(self, memory: Any, key: jax.Array, count: jax.Array) -> Transition:
+        return memory.draw(key, count, self.algorithm.transitions_per_update, self.spec)
+
+    def _updates_before(self, step: jax.Array) -> jax.Array:
+        """Return how many updates came before those that follow environment step `step`."""
+        interval = self.algorithm.update_interval
+        first_step = -(-max(self.algorithm.warmup_steps, 1) // interval) * interval
+        return (step - first_step) // interval * self.algorithm.updates_per_step
 
     def _act(self, carry: tuple, observation: jax.Array, step: jax.Array) -> jax.Array:
         return self.algorithm.act(carry[0], observation, self._keys(carry[3], step)[2], True)
@@ -319,4 +343,4 @@ def _metrics_rows(
 
 
 def _is_finite(network: PolicyNetwork) -> bool:
-    return all(np.isfinite(layer.weight).all() and np.isfinite(layer.bias).all() for layer in network.actor)
+    return all(np.isfinite(array).all() for array in jax.tree.leaves(network.parameters))

@@ -237,7 +237,8 @@ def _choose_device(device: str) -> None:
 def _memory_note(algorithm: Algorithm, spec: Spec, steps: int, seeds: int, processes: int) -> str:
     """Return the line that predicts the memory needed; refuse what cannot fit."""
     shapes = jax.eval_shape(
-        lambda key: (algorithm.init(key, spec), algorithm.memory(spec, steps)), jax.ShapeDtypeStruct((2,), "uint32")
+        lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)),
+        jax.ShapeDtypeStruct((2,), "uint32"),
     )
     per_seed = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
     needed = seeds * per_seed + processes * BYTES_PER_PROCESS
