@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from csac.algorithms.csac import CSAC
+    from csac.algorithms.ppo import PPO
     from csac.algorithms.sac import SAC
     from csac.deploy.policy import Policy, load
     from csac.training.evaluation import evaluate
@@ -24,10 +25,11 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = ["CSAC", "SAC", "InputError", "Policy", "__version__", "evaluate", "load", "train"]
+__all__ = ["CSAC", "PPO", "SAC", "InputError", "Policy", "__version__", "evaluate", "load", "train"]
 
 _MODULES = {
     "CSAC": "csac.algorithms.csac",
+    "PPO": "csac.algorithms.ppo",
     "SAC": "csac.algorithms.sac",
     "InputError": "csac.types",
     "Policy": "csac.deploy.policy",

@@ -40,6 +40,27 @@ _PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
         # PARL's SAC, on which the paper built: a fixed temperature.
         "sac": {**_PAPER_COMMON, "temperature": "fixed", "entropy_weight": 0.2},
+        # The paper's column PPO where it says something ("batch size 32" read as 32 minibatches), else PARL's example.
+        "ppo": {
+            "learning_rate": 3e-4,
+            "learning_rate_schedule": "linear",
+            "hidden_sizes": (64, 64),
+            "discount": 0.99,
+            "trace_decay": 0.95,
+            "rollout_steps": 2048,
+            "minibatches": 32,
+            "epochs": 10,
+            "clip_range": 0.2,
+            "clip_value_loss": True,
+            "value_loss_weight": 0.5,
+            "entropy_weight": 0.0,
+            "max_gradient_norm": 0.5,
+            "adam_epsilon": 1e-5,
+            "normalise_advantages": True,
+            "normalise_observations": True,
+            "normalise_rewards": True,
+            "normalisation_limit": 10.0,
+        },
     }
 )
 

@@ -63,6 +63,8 @@ def check_hyperparameters(algorithm: Any) -> None:
         value, hint = getattr(algorithm, field.name), hints[field.name]
         if get_origin(hint) is Literal and value not in get_args(hint):
             raise InputError(f"{field.name} must be one of {', '.join(get_args(hint))}, not {value!r}")
+        if hint is bool and not isinstance(value, bool):
+            raise InputError(f"{field.name} must be true or false, not {value!r}")
         if hint is int and not _is_whole(value):
             raise InputError(f"{field.name} must be a whole number, not {value!r}")
         optional = hint == float | None and value is None

@@ -178,7 +178,7 @@ class PPO:
         return jnp.clip(normalised, -self.normalisation_limit, self.normalisation_limit)
 
     def discounted_returns(self, start: jax.Array, batch: Transition) -> tuple[jax.Array, jax.Array]:
-        """Return R = γ R + r after each step [steps], and the last one; R starts from 0 where an episode ended before."""
+        """Return R_t = r_t + γ R_{t-1} [steps], from 0 in each episode, and what the next rollout goes on from."""
 
         def advance(running: jax.Array, transition: Transition) -> tuple[jax.Array, jax.Array]:
             running = self.discount * running + transition.reward
@@ -224,13 +224,12 @@ class PPO:
         policy_loss = self.policy_loss(log_ratio, sample.advantage)
         value_loss = self.value_loss(value_at(parameters, sample.observation), sample.value, sample.target)
         entropy = policy.entropy()
-        ratio = jnp.exp(log_ratio)
         return policy_loss + self.value_loss_weight * value_loss - self.entropy_weight * entropy, {
             "actor_loss": policy_loss,
             "critic_loss": value_loss,
             "entropy": entropy,
-            "approximate_kl": ratio - 1.0 - log_ratio,  # of mean KL(π_old ‖ π), and never negative (Schulman 2020)
-            "clip_fraction": jnp.abs(ratio - 1.0) > self.clip_range,
+            "approximate_kl": jnp.expm1(log_ratio) - log_ratio,  # its mean is KL(π_old ‖ π), and it is never negative
+            "clip_fraction": jnp.abs(jnp.expm1(log_ratio)) > self.clip_range,
         }
 
     def update(self, state: State, batch: Transition, key: jax.Array, step: jax.Array) -> tuple[State, Metrics]:
@@ -319,7 +318,8 @@ class PPO:
         return minibatch._replace(advantage=(advantages - advantages.mean()) / (advantages.std() + EPSILON))
 
     def _optimiser(self, learning_rate: float | jax.Array) -> optax.GradientTransformation:
-        return make_optimiser(learning_rate, self.max_gradient_norm, self.adam_epsilon)
+        # As one vector: few buffers to hand over when acting, which takes longer than the networks do.
+        return optax.flatten(make_optimiser(learning_rate, self.max_gradient_norm, self.adam_epsilon))
 
 
 def policy_at(parameters: Parameters, observation: jax.Array) -> Gaussian:
