@@ -1,0 +1,234 @@
+"""Softmax Deep Double Deterministic policy gradients (Pan, Cai and Huang 2020)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from csac.algorithms.hyperparameters import check_hyperparameters
+from csac.algorithms.memory import Replay
+from csac.algorithms.networks import (
+    MLP,
+    begin_descent,
+    copy_tree,
+    descend,
+    make_mlp,
+    make_optimiser,
+    polyak,
+    q_values,
+)
+from csac.types import Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
+
+# Targets computed at once. A product of all examples' samples would leave the processor's caches: the examples of a
+# batch in groups of this many take about 20 % less time on a CPU.
+EXAMPLES_AT_ONCE = 32
+
+
+class Pair(NamedTuple):
+    """An actor, the critic that it climbs, and the targets of both."""
+
+    actor: MLP
+    critic: MLP
+    target_actor: MLP
+    target_critic: MLP
+    actor_optimiser: Any
+    critic_optimiser: Any
+
+
+class State(NamedTuple):
+    """Everything that one seed of SD3 learns."""
+
+    first: Pair
+    second: Pair
+
+
+@dataclass(frozen=True)
+class SD3:
+    """Softmax Deep Double Deterministic policy gradients (its Algorithm 1)."""
+
+    inverse_temperature: float = 0.05
+    """How far the value of a state leans to its best sampled action (the paper's beta): 0 is the mean."""
+    noise_samples: int = 50
+    """Actions sampled around the target actor's to value a state (the paper's K)."""
+    importance_sampling: bool = False
+    """Whether to divide each sample's weight by its density (as the paper derives it); its authors' code does not."""
+    exploration_noise: float = 0.1
+    """Standard deviation of the noise on the actions that explore."""
+    target_noise: float = 0.2
+    """Standard deviation of the noise on the target actors' actions (the paper's sigma)."""
+    target_noise_clip: float = 0.5
+    """Bound on that noise (the paper's c)."""
+    discount: float = 0.99
+    """Discount factor (gamma)."""
+    target_rate: float = 0.005
+    """Soft update rate of the targets (the paper's tau)."""
+    actor_learning_rate: float = 1e-3
+    """Learning rate of the actors."""
+    critic_learning_rate: float = 1e-3
+    """Learning rate of the critics."""
+    actor_hidden_sizes: tuple[int, ...] = (256, 256)
+    """Widths of each actor's hidden layers."""
+    critic_hidden_sizes: tuple[int, ...] = (256, 256)
+    """Widths of each critic's hidden layers."""
+    batch_size: int = 256
+    """Transitions for each of the two pairs in one update."""
+    replay_size: int = 1_000_000
+    """Transitions that the replay keeps."""
+    warmup_steps: int = 10_000
+    """Environment steps with uniform random actions before learning starts."""
+    updates_per_step: int = 1
+    """Updates after each environment step."""
+    max_gradient_norm: float = 0.0
+    """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
+
+    update_interval: ClassVar[int] = 1
+    has_schedule: ClassVar[bool] = False
+    name: ClassVar[str] = "sd3"
+
+    def __post_init__(self) -> None:
+        check_hyperparameters(self)
+
+    @property
+    def transitions_per_update(self) -> int:
+        """Transitions that one call of `update` is given: a mini-batch for each pair."""
+        return 2 * self.batch_size
+
+    def memory(self, spec: Spec, steps: int) -> Replay:
+        """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
+        return Replay.create(min(self.replay_size, steps), spec)
+
+    def init(self, key: jax.Array, spec: Spec, steps: int) -> State:
+        """Return two pairs of random networks; the targets are copies."""
+        first_key, second_key = jax.random.split(key)
+        return State(self._make_pair(first_key, spec), self._make_pair(second_key, spec))
+
+    def _make_pair(self, key: jax.Array, spec: Spec) -> Pair:
+        actor_key, critic_key = jax.random.split(key)
+        actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, spec.action_size)
+        critic = make_mlp(critic_key, spec.observation_size + spec.action_size, self.critic_hidden_sizes, 1)
+        return Pair(
+            actor=actor,
+            critic=critic,
+            target_actor=copy_tree(actor),
+            target_critic=copy_tree(critic),
+            actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
+            critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critic),
+        )
+
+    def act(self, state: State, observation: jax.Array, key: jax.Array, explore: bool) -> jax.Array:
+        """Return the action of the actor whose own critic values it more, with noise and clipped to explore."""
+        first, second = (jnp.tanh(pair.actor(observation)) for pair in state)
+        first_value, second_value = (
+            q_value(pair.critic, observation, action) for pair, action in zip(state, (first, second), strict=True)
+        )
+        action = jnp.where(first_value >= second_value, first, second)
+        if not explore:
+            return action
+        return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
+
+    def critic_target(
+        self, target_actor: MLP, target_critics: tuple[MLP, MLP], transition: Transition, noise: jax.Array
+    ) -> jax.Array:
+        """Return y = r + γ softmax of min Q'(s', ãₖ) at ãₖ = clip(π'(s') + clip(σ ξₖ, -c, c), -1, 1) (Algorithm 1).
+
+        `noise` are the ξₖ ~ N(0, I) [sample, action]; nothing follows a terminal step.
+        """
+        observation = transition.next_observation
+        mean = jnp.tanh(target_actor(observation))
+
+        def value(noise: jax.Array) -> jax.Array:
+            noise = jnp.clip(self.target_noise * noise, -self.target_noise_clip, self.target_noise_clip)
+            return jnp.minimum(*q_values(target_critics, observation, jnp.clip(mean + noise, -1.0, 1.0)))
+
+        log_weights = -log_density(noise) if self.importance_sampling else jnp.zeros(len(noise))
+        softmax_value = softmax_operator(jax.vmap(value)(noise), self.inverse_temperature, log_weights)
+        return transition.reward + self.discount * (1.0 - transition.terminated) * softmax_value
+
+    def update(self, state: State, batch: Transition, key: jax.Array, step: jax.Array) -> tuple[State, Metrics]:
+        """Update the first pair on half of the batch, then the second, which sees its new target, on the rest."""
+        first_key, second_key = jax.random.split(key)
+        first_batch = jax.tree.map(lambda leaf: leaf[: self.batch_size], batch)
+        second_batch = jax.tree.map(lambda leaf: leaf[self.batch_size :], batch)
+        first, first_metrics = self.update_pair(state.first, state.second.target_critic, first_batch, first_key)
+        second, second_metrics = self.update_pair(state.second, first.target_critic, second_batch, second_key)
+        return State(first, second), jax.tree.map(lambda a, b: (a + b) / 2.0, first_metrics, second_metrics)
+
+    def update_pair(
+        self, pair: Pair, other_target_critic: MLP, batch: Transition, key: jax.Array
+    ) -> tuple[Pair, Metrics]:
+        """Take one gradient step on the critic, then one on the actor, then move the targets of both."""
+        noise = jax.random.normal(key, (len(batch.action), self.noise_samples, batch.action.shape[-1]))
+        target_critics = (pair.target_critic, other_target_critic)
+        targets = jax.lax.map(
+            lambda example: self.critic_target(pair.target_actor, target_critics, *example),
+            (batch, noise),
+            batch_size=EXAMPLES_AT_ONCE,
+        )
+
+        def mean_critic_loss(critic: MLP) -> tuple[jax.Array, Metrics]:
+            losses, metrics = jax.vmap(critic_loss, in_axes=(None, 0, 0))(critic, batch, targets)
+            return jnp.mean(losses), jax.tree.map(jnp.mean, {"critic_loss": losses, **metrics})
+
+        critic, critic_optimiser, critic_metrics = descend(
+            self._optimiser(self.critic_learning_rate), mean_critic_loss, pair.critic, pair.critic_optimiser
+        )
+
+        def mean_actor_loss(actor: MLP) -> tuple[jax.Array, Metrics]:
+            loss = jnp.mean(jax.vmap(actor_loss, in_axes=(None, None, 0))(actor, critic, batch.observation))
+            return loss, {"actor_loss": loss}
+
+        actor, actor_optimiser, actor_metrics = descend(
+            self._optimiser(self.actor_learning_rate), mean_actor_loss, pair.actor, pair.actor_optimiser
+        )
+        new_pair = Pair(
+            actor=actor,
+            critic=critic,
+            target_actor=polyak(pair.target_actor, actor, self.target_rate),
+            target_critic=polyak(pair.target_critic, critic, self.target_rate),
+            actor_optimiser=actor_optimiser,
+            critic_optimiser=critic_optimiser,
+        )
+        return new_pair, {**critic_metrics, **actor_metrics}
+
+    def policy(self, state: State) -> PolicyNetwork:
+        """Return both actors' and both critics' layers: the critics choose the actor."""
+        actors, critics = (state.first.actor, state.second.actor), (state.first.critic, state.second.critic)
+        parameters = PolicyParameters(
+            tuple(actor.layers for actor in actors), tuple(critic.layers for critic in critics)
+        )
+        return PolicyNetwork(parameters, head="tanh")
+
+    def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
+        return make_optimiser(learning_rate, self.max_gradient_norm)
+
+
+def softmax_operator(values: jax.Array, inverse_temperature: float, log_weights: jax.Array) -> jax.Array:
+    """Return Σ wₖ exp(β Qₖ) Qₖ / Σ wₖ exp(β Qₖ) over the samples [sample], wₖ = exp(log_weights)."""
+    # The differences are taken before they are scaled, so that large values keep their digits.
+    logits = inverse_temperature * (values - jnp.max(values)) + log_weights
+    return jnp.sum(jax.nn.softmax(logits) * values)
+
+
+def log_density(noise: jax.Array) -> jax.Array:
+    """Return the log-density of unclipped standard noise [sample, action], but for what all samples share."""
+    return -0.5 * jnp.sum(noise**2, axis=-1)
+
+
+def critic_loss(critic: MLP, transition: Transition, target: jax.Array) -> tuple[jax.Array, Metrics]:
+    """Return [Qᵢ(s, a) - y]² (Algorithm 1), and what to log."""
+    value = q_value(critic, transition.observation, transition.action)
+    return (value - target) ** 2, {"q_mean": value}
+
+
+def actor_loss(actor: MLP, critic: MLP, observation: jax.Array) -> jax.Array:
+    """Return -Qᵢ(s, πᵢ(s)), whose gradient is the deterministic policy gradient against its sign (Algorithm 1)."""
+    return -q_value(critic, observation, jnp.tanh(actor(observation)))
+
+
+def q_value(critic: MLP, observation: jax.Array, action: jax.Array) -> jax.Array:
+    """Return one critic's value of one pair."""
+    return critic(jnp.concatenate([observation, action]))[0]
