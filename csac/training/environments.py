@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from csac.deploy.policy import ActionBounds
+from csac.training.snapshots import Snapshot, restore, snapshot
 from csac.types import InputError, Spec
 
 Task = str | Callable[..., gymnasium.Env]
@@ -119,6 +120,22 @@ class Environment:
         except Exception as error:
             raise EnvironmentFailure(f"step raised {_one_line(error)}") from error
         return self._flatten(observation), _scalar(reward), terminated, truncated, info
+
+    def snapshot(self) -> Snapshot | None:
+        """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell."""
+        return snapshot(self.raw)
+
+    def restore(self, seed: int, saved: Snapshot) -> None:
+        """Go on where `saved` was taken, in an episode that was reset with `seed`.
+
+        Raises:
+            EnvironmentFailure: the environment does not take it back.
+        """
+        self.reset(seed)
+        try:
+            restore(self.raw, saved)
+        except Exception as error:
+            raise EnvironmentFailure(f"the environment does not take its snapshot back: {_one_line(error)}") from error
 
     def close(self) -> None:
         """Close the Gymnasium environment."""
@@ -226,6 +243,48 @@ class SeedEnvironments:
         """Step the seed at this place in the group no more."""
         self.alive[index] = False
         self._rest(index)
+
+    def save(self, index: int) -> Snapshot:
+        """Return what the seed at this place needs to go on; without "exact", from the start of its episode."""
+        inner = self.environments[index].snapshot() if self.alive[index] else None
+        arrays = {"observation": self._observation[index].copy(), **(inner.arrays if inner else {})}
+        values = {
+            "alive": bool(self.alive[index]),
+            "reward": float(self._reward[index]),
+            "episodes_begun": self._begun[index],
+            "episode_return": self._returns[index],
+            "episode_length": self._lengths[index],
+            "exact": inner is not None,
+            "environment": inner.values if inner else {},
+        }
+        return Snapshot(arrays, values)
+
+    def take_back(self, index: int, saved: Snapshot) -> None:
+        """Let the seed at this place go on from `save`; its episode starts anew where the snapshot is not exact.
+
+        A seed whose environment fails here is reported by the next `step`.
+        """
+        arrays, values = dict(saved.arrays), saved.values
+        self._begun[index] = values["episodes_begun"]
+        self._observation, self._reward = self._observation.copy(), self._reward.copy()
+        self._observation[index], self._reward[index] = arrays.pop("observation"), values["reward"]
+        if not values["alive"]:
+            self.stop(index)
+        elif values["exact"]:
+            self._returns[index], self._lengths[index] = values["episode_return"], values["episode_length"]
+            seed = training_seed(self.seeds[index], self._begun[index] - 1)
+            try:
+                self.environments[index].restore(seed, Snapshot(arrays, values["environment"]))
+            except EnvironmentFailure as error:
+                self._fail(index, error)
+        else:
+            self._begun[index] -= 1
+            self._reset(index)
+
+    @property
+    def observations(self) -> np.ndarray:
+        """What to act on next: [seed, observation]."""
+        return self._observation
 
     def close(self) -> None:
         """Close every environment."""

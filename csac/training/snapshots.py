@@ -1,0 +1,96 @@
+"""What a Gymnasium environment needs to go on exactly in the middle of an episode: arrays by name and JSON values.
+
+An environment offers it with `get_snapshot() -> (arrays, values)` and `set_snapshot(arrays, values)`, the latter called
+after a `reset` with the seed of the episode. For Gymnasium's own MuJoCo tasks both are built in. The time limit and the
+random generator are taken care of here.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+
+if TYPE_CHECKING:
+    import gymnasium
+
+# MuJoCo makes these anew in every step, in sizes that depend on the contacts of the moment.
+_MADE_ANEW = ("efc_", "iefc_", "island_", "iacc", "ifrc_", "map_")
+_KNOWN_WRAPPERS = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
+
+
+class Snapshot(NamedTuple):
+    """Arrays by name, and values that JSON can hold."""
+
+    arrays: dict[str, np.ndarray]
+    values: dict[str, Any]
+
+
+def snapshot(environment: gymnasium.Env) -> Snapshot | None:
+    """Return the episode in progress, or None where it cannot be had whole."""
+    inner = environment.unwrapped
+    if _time_limits(environment) is None:
+        return None
+    if callable(getattr(inner, "get_snapshot", None)):
+        arrays, values = inner.get_snapshot()  # pyright: ignore[reportAttributeAccessIssue]
+        arrays = {f"own.{name}": np.array(array) for name, array in arrays.items()}
+        values = {"own": values}
+    elif _is_mujoco(inner):
+        arrays = {f"mujoco.{name}": array.copy() for name, array in _mujoco_arrays(inner).items()}
+        values = {"mujoco_time": float(inner.data.time)}  # pyright: ignore[reportAttributeAccessIssue]
+    else:
+        return None
+    elapsed = [limit._elapsed_steps for limit in _time_limits(environment) or ()]
+    return Snapshot(arrays, {**values, "elapsed_steps": elapsed, "generator": inner.np_random.bit_generator.state})
+
+
+def restore(environment: gymnasium.Env, saved: Snapshot) -> None:
+    """Let an environment that was just reset go on where `saved` was taken. Raises where it does not fit."""
+    inner, values = environment.unwrapped, saved.values
+    if "own" in values:
+        arrays = {name.removeprefix("own."): array for name, array in saved.arrays.items()}
+        inner.set_snapshot(arrays, values["own"])  # pyright: ignore[reportAttributeAccessIssue]
+    else:
+        _set_mujoco(inner, saved)
+    for limit, elapsed in zip(_time_limits(environment) or (), values["elapsed_steps"], strict=True):
+        limit._elapsed_steps = elapsed
+    inner.np_random.bit_generator.state = values["generator"]
+
+
+def _time_limits(environment: gymnasium.Env) -> list[TimeLimit] | None:
+    """Return the time limits around an environment, or None where another wrapper could hold anything."""
+    limits = []
+    while environment is not environment.unwrapped:
+        if type(environment) not in _KNOWN_WRAPPERS:
+            return None
+        if isinstance(environment, TimeLimit):
+            limits.append(environment)
+        environment = environment.env  # pyright: ignore[reportAttributeAccessIssue]
+    return limits
+
+
+def _is_mujoco(environment: gymnasium.Env) -> bool:
+    """Whether this is one of Gymnasium's own MuJoCo tasks: a class derived from one may hold more than its physics."""
+    return type(environment).__module__.startswith("gymnasium.envs.mujoco.") and hasattr(environment, "data")
+
+
+def _mujoco_arrays(environment: Any) -> dict[str, np.ndarray]:
+    """Return views of the arrays of MjData that last from step to step.
+
+    All of them, since positions and velocities are not enough: Ant's reward reads body positions that are a step old.
+    """
+    data = environment.data
+    names = (name for name in dir(data) if not name.startswith(("_", *_MADE_ANEW)))
+    arrays = ((name, getattr(data, name)) for name in names)
+    return {name: array for name, array in arrays if isinstance(array, np.ndarray) and array.size}
+
+
+def _set_mujoco(environment: Any, saved: Snapshot) -> None:
+    arrays = _mujoco_arrays(environment)
+    given = {name.removeprefix("mujoco."): array for name, array in saved.arrays.items()}
+    if {name: array.shape for name, array in arrays.items()} != {name: array.shape for name, array in given.items()}:
+        raise ValueError("its physics has other arrays: MuJoCo or the task has changed")
+    for name, array in arrays.items():
+        array[...] = given[name]
+    environment.data.time = saved.values["mujoco_time"]

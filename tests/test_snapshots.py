@@ -1,0 +1,157 @@
+"""An episode goes on from its snapshot, in another environment, as if nothing had happened."""
+
+from __future__ import annotations
+
+import json
+
+import gymnasium
+import numpy as np
+import probes
+import pytest
+
+from csac.training.environments import Environment, EnvironmentFailure, SeedEnvironments
+from csac.training.snapshots import Snapshot
+
+PAPER_TASKS = ["HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"]
+OTHERS = ["Ant-v5", "Humanoid-v5", "Reacher-v5", "Pusher-v5", "InvertedDoublePendulum-v5"]
+
+
+def actions(environment: Environment, count: int) -> np.ndarray:
+    return np.random.default_rng(3).uniform(-0.3, 0.3, (count, environment.spec.action_size)).astype(np.float32)
+
+
+def play(environment: Environment, chosen: np.ndarray) -> list[tuple]:
+    """Step until the actions or the episode end: (observation, reward, terminated, truncated)."""
+    steps = []
+    for action in chosen:
+        observation, *rest, _ = environment.step(action)
+        steps.append((tuple(observation), *rest))
+        if rest[1] or rest[2]:
+            break
+    return steps
+
+
+def through_json(saved: Snapshot) -> Snapshot:
+    return Snapshot({name: array.copy() for name, array in saved.arrays.items()}, json.loads(json.dumps(saved.values)))
+
+
+@pytest.mark.parametrize("task", PAPER_TASKS + OTHERS)
+def test_a_mujoco_episode_goes_on_bit_for_bit(task):
+    first, second = Environment(task), Environment(task)
+    first.reset(7)
+    chosen = actions(first, 120)
+    play(first, chosen[:3])
+    saved = first.snapshot()
+    assert saved
+    saved = through_json(saved)
+    second.reset(8)
+    play(second, chosen[50:55])  # whatever it did before
+    second.restore(7, saved)
+    after = play(first, chosen[3:])
+    assert len(after) > 1
+    assert play(second, chosen[3:]) == after
+
+
+def test_the_time_limit_and_the_generator_go_on():
+    first, second = Environment("Reacher-v5"), Environment("Reacher-v5")
+    first.reset(1)
+    chosen = actions(first, 60)
+    play(first, chosen[:20])
+    first.raw.unwrapped.np_random.random(5)
+    saved = first.snapshot()
+    assert saved
+    second.restore(1, saved)
+    assert len(play(second, chosen)) == 30  # of the 50 that an episode has
+    assert second.raw.unwrapped.np_random.random() == first.raw.unwrapped.np_random.random()
+
+
+class Counting(probes.Endless):
+    """Its reward counts its steps; it can be saved."""
+
+    def step(self, action):
+        super().step(action)
+        return self.observation, float(self.steps), False, self.steps == self.length, {}
+
+    def get_snapshot(self):
+        return {"observation": self.observation}, {"steps": self.steps}
+
+    def set_snapshot(self, arrays, values):
+        self.observation, self.steps = arrays["observation"], values["steps"]
+
+
+def test_an_environment_can_offer_its_own_snapshot():
+    first, second = Environment(Counting), Environment(Counting)
+    first.reset(0)
+    play(first, actions(first, 4))
+    saved = first.snapshot()
+    assert saved
+    second.restore(0, through_json(saved))
+    assert [reward for _, reward, _, _ in play(second, actions(second, 9))] == [5, 6, 7, 8, 9, 10]
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        "Pendulum-v1",
+        probes.Endless,
+        lambda: gymnasium.wrappers.FrameStackObservation(gymnasium.make("Hopper-v5"), 2),
+        lambda: type("Own", (type(gymnasium.make("Hopper-v5").unwrapped),), {"__module__": "own"})(),
+    ],
+    ids=["no MuJoCo", "nothing offered", "a wrapper that remembers", "a class of one's own"],
+)
+def test_what_cannot_be_had_whole_is_not_offered(task):
+    environment = Environment(task)
+    environment.reset(0)
+    assert environment.snapshot() is None
+
+
+def test_a_snapshot_of_another_physics_is_refused():
+    ant, hopper = Environment("Ant-v4"), Environment("Hopper-v4")
+    ant.reset(0)
+    saved = ant.snapshot()
+    assert saved
+    with pytest.raises(EnvironmentFailure, match="has other arrays"):
+        hopper.restore(0, saved)
+
+
+def steps_of(environments: SeedEnvironments, count: int) -> list[tuple]:
+    generator, outcomes = np.random.default_rng(5), []
+    for _ in range(count):
+        shape = (len(environments.seeds), environments.spec.action_size)
+        outcome = environments.step(generator.uniform(-1, 1, shape).astype(np.float32))
+        outcomes.append((outcome.next_observation.tolist(), outcome.reward.tolist(), outcome.episodes))
+    return outcomes
+
+
+def test_seeds_go_on_with_their_episodes_and_their_counts():
+    first, second = (SeedEnvironments("Hopper-v4", None, (4, 9)) for _ in range(2))
+    first.reset()
+    steps_of(first, 90)
+    for index in range(2):
+        second.take_back(index, through_json(first.save(index)))
+    np.testing.assert_array_equal(second.observations, first.observations)
+    after = steps_of(first, 120)
+    assert sum(len(episodes) for _, _, episodes in after) > 3
+    assert steps_of(second, 120) == after
+
+
+def test_an_episode_that_cannot_be_saved_starts_anew_with_its_own_seed():
+    first, second = (SeedEnvironments(probes.IdEncoded, None, (4,)) for _ in range(2))
+    first.reset()
+    steps_of(first, 3)  # an episode of two steps, and one step of the second episode
+    saved = through_json(first.save(0))
+    assert not saved.values["exact"]
+    second.take_back(0, saved)
+    assert second.observations[0, 0] == first.observations[0, 0]  # the reset seed
+    assert second.observations[0, 2] == 0  # the step
+
+
+def test_a_seed_that_has_failed_stays_so():
+    first, second = (SeedEnvironments("Hopper-v4", None, (4, 9)) for _ in range(2))
+    first.reset()
+    steps_of(first, 3)
+    first.stop(1)
+    for index in range(2):
+        second.take_back(index, first.save(index))
+    assert second.alive.tolist() == [True, False]
+    assert steps_of(second, 5) == steps_of(first, 5)
