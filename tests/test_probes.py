@@ -11,9 +11,10 @@ import probes
 import pytest
 from trainer import run
 
-from csac.algorithms import CSAC, SAC
+from csac.algorithms import CSAC, PPO, SAC
 from csac.algorithms.distributions import TanhGaussian, policy_at
 from csac.algorithms.networks import q_values
+from csac.algorithms.ppo import value_at
 
 DISCOUNT = 0.9
 SETTINGS: dict[str, Any] = {
@@ -104,3 +105,61 @@ def test_entropy_has_its_weight_in_the_value(algorithm):
     policy_entropy = entropy(policy_at(state.actor, jnp.zeros(1)))
     assert np.log(2) - 0.1 < policy_entropy < np.log(2)
     np.testing.assert_allclose(values(state, 0.0), (1 + DISCOUNT * policy_entropy) / (1 - DISCOUNT), atol=0.6)
+
+
+PPO_SETTINGS: dict[str, Any] = {
+    "discount": DISCOUNT,
+    "learning_rate": 3e-3,
+    "learning_rate_schedule": "constant",
+    "clip_value_loss": False,
+    "rollout_steps": 128,
+    "minibatches": 4,
+    "hidden_sizes": (32, 32),
+    "normalise_rewards": False,
+}
+
+
+@pytest.mark.parametrize(
+    ("probe", "steps", "expected"),
+    [
+        (probes.ConstantReward, 1024, {0.0: 1.0}),
+        (probes.ObservationReward, 1024, {-1.0: -1.0, 1.0: 1.0}),
+        (probes.DelayedReward, 1536, {0.0: DISCOUNT, 1.0: 1.0}),
+        # As above: 10, not 3.57. Rollouts of 128 steps end within an episode of 10 as well.
+        (probes.Endless, 3072, {0.0: 10.0}),
+    ],
+)
+def test_ppo_learns_known_values(probe, steps, expected):
+    algorithm = PPO(**PPO_SETTINGS)
+    state = run(algorithm, probe, steps).states[0]
+    for observation, value in expected.items():
+        assert state_value(algorithm, state, observation) == pytest.approx(value, rel=0.02)
+
+
+def test_ppo_learns_values_in_units_of_the_spread_of_returns():
+    algorithm = PPO(**{**PPO_SETTINGS, "normalise_rewards": True})
+    state = run(algorithm, probes.DelayedReward, 1536).states[0]
+    # Half of the discounted returns so far are 0, half are 1.
+    assert float(state.returns.std) == pytest.approx(0.5)
+    assert state_value(algorithm, state, 0.0) == pytest.approx(DISCOUNT / 0.5, rel=0.02)
+    assert state_value(algorithm, state, 1.0) == pytest.approx(1.0 / 0.5, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("probe", "steps", "best_actions"),
+    [(probes.ActionReward, 2048, {0.0: 0.5}), (probes.ObservationActionReward, 3072, {-1.0: -0.5, 1.0: 0.5})],
+)
+def test_ppo_finds_the_best_action_and_values_its_own_noise(probe, steps, best_actions):
+    algorithm = PPO(**PPO_SETTINGS)
+    state = run(algorithm, probe, steps).states[0]
+    std = float(np.exp(state.parameters.log_std[0]))
+    assert std < 0.25
+    for observation, best in best_actions.items():
+        mean = float(algorithm.act(state, jnp.array([observation]), jax.random.key(0), explore=False)[0])
+        assert mean == pytest.approx(best, abs=0.1)
+        # E -(a - best)² of a Gaussian action
+        assert state_value(algorithm, state, observation) == pytest.approx(-(std**2) - (mean - best) ** 2, abs=0.02)
+
+
+def state_value(algorithm: PPO, state, observation: float) -> float:
+    return float(value_at(state.parameters, algorithm.normalise(state.observations, jnp.array([observation]))))

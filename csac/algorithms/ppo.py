@@ -97,7 +97,7 @@ class PPO:
     max_gradient_norm: float = 0.5
     """Bound on the norm of the gradient of all parameters together; 0 leaves gradients alone."""
     adam_epsilon: float = 1e-5
-    """Adam's epsilon."""
+    """Added to the root of Adam's second moment (its epsilon)."""
     rollout_steps: int = 2048
     """Environment steps from one update to the next, all of which it learns from."""
     minibatches: int = 32
