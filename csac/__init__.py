@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from csac.algorithms.csac import CSAC
     from csac.algorithms.ppo import PPO
     from csac.algorithms.sac import SAC
+    from csac.algorithms.sd3 import SD3
+    from csac.algorithms.td3 import TD3
     from csac.deploy.policy import Policy, load
     from csac.training.evaluation import evaluate
     from csac.training.train import train
@@ -25,12 +27,14 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = ["CSAC", "PPO", "SAC", "InputError", "Policy", "__version__", "evaluate", "load", "train"]
+__all__ = ["CSAC", "PPO", "SAC", "SD3", "TD3", "InputError", "Policy", "__version__", "evaluate", "load", "train"]
 
 _MODULES = {
     "CSAC": "csac.algorithms.csac",
     "PPO": "csac.algorithms.ppo",
     "SAC": "csac.algorithms.sac",
+    "SD3": "csac.algorithms.sd3",
+    "TD3": "csac.algorithms.td3",
     "InputError": "csac.types",
     "Policy": "csac.deploy.policy",
     "evaluate": "csac.training.evaluation",

@@ -28,6 +28,9 @@ _PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
     }
 )
 
+# What the table does not say of TD3 and SD3, and the papers of both say alike.
+_NOISE: Mapping[str, Any] = MappingProxyType({"exploration_noise": 0.1, "target_noise": 0.2, "target_noise_clip": 0.5})
+
 _PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         # "For CSAC, sigma was set to 0.2 and tau to 0.5 across all MuJoCo tasks"; Algorithm 1 for the reference policy.
@@ -40,6 +43,17 @@ _PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
         # PARL's SAC, on which the paper built: a fixed temperature.
         "sac": {**_PAPER_COMMON, "temperature": "fixed", "entropy_weight": 0.2},
+        "td3": {**_PAPER_COMMON, **_NOISE, "policy_delay": 2},
+        # The paper's column SD3, and the settings of SD3's authors for what it leaves out.
+        "sd3": {
+            **_PAPER_COMMON,
+            **_NOISE,
+            "actor_learning_rate": 1e-3,
+            "critic_learning_rate": 1e-3,
+            "inverse_temperature": 0.05,
+            "noise_samples": 50,
+            "importance_sampling": False,
+        },
         # The paper's column PPO where it says something ("batch size 32" read as 32 minibatches), else PARL's example.
         "ppo": {
             "learning_rate": 3e-4,
@@ -64,9 +78,21 @@ _PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     }
 )
 
+# The inverse temperatures of SD3's authors, task by task.
+_SD3_TASKS: Mapping[str, float] = MappingProxyType(
+    {"Ant": 0.001, "HalfCheetah": 0.005, "Hopper": 0.05, "Walker2d": 0.1}
+)
+
 # The paper's "Specific hyperparameters of CSAC"; its PandaReach row equals the MuJoCo tasks' values.
 _PAPER_TASKS: Mapping[tuple[str, str], Mapping[str, Any]] = MappingProxyType(
-    {("csac", "PyFlyt/QuadX-Waypoints-v1"): {"relative_entropy_weight": 0.1}}
+    {
+        ("csac", "PyFlyt/QuadX-Waypoints-v1"): {"relative_entropy_weight": 0.1},
+        **{
+            ("sd3", f"{task}-{version}"): {"inverse_temperature": beta}
+            for task, beta in _SD3_TASKS.items()
+            for version in ("v4", "v5")
+        },
+    }
 )
 
 PRESETS: tuple[str, ...] = ("paper",)

@@ -60,6 +60,38 @@ def test_paper_tau_depends_on_the_task(task, tau):
     assert presets.hyperparameters("paper", "csac", task)["relative_entropy_weight"] == tau
 
 
+def test_paper_td3_has_the_papers_table_and_its_own_noise():
+    given = presets.hyperparameters("paper", "td3", "Walker2d-v4")
+
+    assert {name: given[name] for name in PAPER_TABLE} == PAPER_TABLE
+    assert (given["exploration_noise"], given["target_noise"], given["target_noise_clip"]) == (0.1, 0.2, 0.5)
+    assert given["policy_delay"] == 2
+
+
+def test_paper_sd3_learns_faster():
+    given = presets.hyperparameters("paper", "sd3", "Walker2d-v4")
+
+    learning_rates = {"actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3}
+    assert {name: given[name] for name in PAPER_TABLE} == PAPER_TABLE | learning_rates
+    assert (given["noise_samples"], given["importance_sampling"]) == (50, False)
+
+
+@pytest.mark.parametrize(
+    ("task", "beta"),
+    [
+        ("Ant-v4", 0.001),
+        ("HalfCheetah-v4", 0.005),
+        ("Hopper-v4", 0.05),
+        ("Walker2d-v4", 0.1),
+        ("Walker2d-v5", 0.1),
+        ("PandaReach-v3", 0.05),
+        ("PyFlyt.gym_envs:PyFlyt/QuadX-Waypoints-v1", 0.05),
+    ],
+)
+def test_paper_beta_depends_on_the_task(task, beta):
+    assert presets.hyperparameters("paper", "sd3", task)["inverse_temperature"] == beta
+
+
 def test_changing_what_was_given_changes_no_preset():
     presets.hyperparameters("paper", "csac", "Ant-v4")["discount"] = 0.0
 

@@ -3,5 +3,7 @@
 from csac.algorithms.csac import CSAC
 from csac.algorithms.ppo import PPO
 from csac.algorithms.sac import SAC
+from csac.algorithms.sd3 import SD3
+from csac.algorithms.td3 import TD3
 
-ALGORITHMS = {algorithm.name: algorithm for algorithm in (CSAC, SAC, PPO)}
+ALGORITHMS = {algorithm.name: algorithm for algorithm in (CSAC, SAC, TD3, SD3, PPO)}
