@@ -1,0 +1,240 @@
+"""TD3's equations against numbers worked by hand, and its delay."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from csac.algorithms.networks import MLP
+from csac.algorithms.td3 import TD3, actor_loss, critic_loss
+from csac.deploy.policy import Contract, Policy
+from csac.types import InputError, Layer, Spec, Transition
+
+ONE = Spec(1, 1)
+LINEAR: dict[str, Any] = {
+    "actor_hidden_sizes": (),
+    "critic_hidden_sizes": (),
+    "discount": 0.5,
+    "target_rate": 0.5,
+    "actor_learning_rate": 0.1,
+    "critic_learning_rate": 0.1,
+}
+
+
+def linear(weight: list[list[float]], bias: list[float]) -> MLP:
+    return MLP((Layer(jnp.array(weight), jnp.array(bias)),))
+
+
+def always(action: float) -> MLP:
+    """An actor whose action is this one everywhere."""
+    return linear([[0.0]], [math.atanh(action)])
+
+
+def transition(observation=1.0, action=0.5, reward=2.0, next_observation=1.0, terminated=0.0, truncated=0.0):
+    observation, action, next_observation = (np.array([x], np.float32) for x in (observation, action, next_observation))
+    reward, terminated, truncated = (np.array(x, np.float32) for x in (reward, terminated, truncated))
+    return Transition(observation, action, reward, next_observation, terminated, truncated)
+
+
+def batch_of(*transitions: Transition) -> Transition:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *transitions)
+
+
+@partial(jax.jit, static_argnums=0)
+def update(algorithm, state, batch: Transition, step: int):
+    return algorithm.update(state, batch, jax.random.key(0), step)
+
+
+# The target actor's action is 0.3. Q₁' = s + 2a and Q₂' = 3 - a at s = 1 cross at a = 2/3.
+TARGET_CRITICS = (linear([[1.0], [2.0]], [0.0]), linear([[0.0], [-1.0]], [3.0]))
+
+
+@pytest.mark.parametrize(
+    ("action", "noise", "expected"),
+    [
+        (0.3, 0.0, 0.3),
+        (0.3, 1.0, 0.5),  # 0.2 ξ
+        (0.3, 10.0, 0.8),  # 2 is clipped to 0.5
+        (0.3, -10.0, -0.2),
+        (0.9, 1.0, 1.0),  # 1.1 is no action
+        (-0.9, -10.0, -1.0),
+    ],
+)
+def test_target_actions_are_smoothed_and_clipped_twice(action, noise, expected):
+    smoothed = TD3().smoothed_action(always(action), jnp.ones(1), jnp.array([noise]))
+    assert float(smoothed[0]) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("noise", "terminated", "truncated", "expected"),
+    [
+        (0.0, 0.0, 0.0, 3.44),  # a = 0.3: min(1.6, 2.7), 2 + 0.9·1.6
+        (10.0, 0.0, 0.0, 3.98),  # a = 0.8: min(2.6, 2.2), 2 + 0.9·2.2: the second critic is the smaller one
+        (-1.0, 0.0, 0.0, 3.08),  # a = 0.1: min(1.2, 2.9), 2 + 0.9·1.2
+        (0.0, 1.0, 0.0, 2.0),  # nothing follows
+        (0.0, 1.0, 1.0, 2.0),
+        (0.0, 0.0, 1.0, 3.44),  # the environment was only stopped
+    ],
+)
+def test_the_critic_target(noise, terminated, truncated, expected):
+    step = transition(terminated=terminated, truncated=truncated)
+    target = TD3(discount=0.9).critic_target(always(0.3), TARGET_CRITICS, step, jnp.array([noise]))
+    assert float(target) == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_losses():
+    # Q₁(1, 0.5) = 2 and Q₂(1, 0.5) = 2.5 with target 3: 1² + 0.5². The actor gets Q₁ at 0.8 too, where Q₂ is smaller.
+    loss, metrics = critic_loss(TARGET_CRITICS, transition(), jnp.float32(3.0))
+    assert (float(loss), float(metrics["q_mean"])) == pytest.approx((1.25, 2.0))
+    assert float(actor_loss(always(0.3), TARGET_CRITICS, jnp.ones(1))) == pytest.approx(-1.6)
+    assert float(actor_loss(always(0.8), TARGET_CRITICS, jnp.ones(1))) == pytest.approx(-2.6)
+
+
+def linear_state(algorithm: TD3):
+    """Both critics Q = 0.01 a, target critics -20, the actor 0 and its target atanh(0.5), everywhere."""
+    critic, target_critic = linear([[0.0], [0.01]], [0.0]), linear([[0.0], [0.0]], [-20.0])
+    return algorithm.init(jax.random.key(0), ONE, 1000)._replace(
+        actor=always(0.0),
+        target_actor=always(0.5),
+        critics=(critic, critic),
+        target_critics=(target_critic, target_critic),
+    )
+
+
+def test_a_delayed_update_moves_the_actor_against_the_new_critics_and_the_targets_last():
+    # y = 0 + 0.5·(-20) = -10 and Q = 0.01 at a = 1, so the loss is 2·10.01². In Adam's first step each parameter of the
+    # critics goes down by the learning rate. The slope in the action turns from 0.01 to -0.09: the actor goes down only
+    # if it sees the new critics. Targets: halfway from the old ones to the new.
+    algorithm = TD3(**LINEAR)
+    before = linear_state(algorithm)
+    state, metrics = update(algorithm, before, batch_of(transition(action=1.0, reward=0.0)), 1)
+    assert float(metrics["critic_loss"]) == pytest.approx(200.4002, rel=1e-6)
+    assert float(metrics["q_mean"]) == pytest.approx(0.01)
+    assert float(metrics["actor_loss"]) == pytest.approx(0.2, abs=1e-5)  # -Q₁ = 0.1 s + 0.09 a + 0.1 at s = 1, a = 0
+    assert float(state.actor.layers[0].bias[0]) == pytest.approx(-0.1, abs=1e-5)
+    assert float(state.target_actor.layers[0].bias[0]) == pytest.approx((math.atanh(0.5) - 0.1) / 2, abs=1e-5)
+    for new, target in zip(state.critics, state.target_critics, strict=True):
+        np.testing.assert_allclose(new.layers[0].weight, [[-0.1], [-0.09]], atol=1e-6)
+        np.testing.assert_allclose(target.layers[0].weight, [[-0.05], [-0.045]], atol=1e-6)
+        np.testing.assert_allclose(target.layers[0].bias, [-10.05], atol=1e-5)
+
+
+def test_the_actor_climbs_the_first_critic_alone():
+    # The critics' learning rate is too small to matter. Slopes in the action: 1 for the first, -5 for the second.
+    algorithm = TD3(**{**LINEAR, "critic_learning_rate": 1e-9})
+    critics = (linear([[0.0], [1.0]], [0.0]), linear([[0.0], [-5.0]], [-9.0]))
+    state = linear_state(algorithm)._replace(critics=critics)
+    state, _ = update(algorithm, state, batch_of(transition()), 1)
+    assert float(state.actor.layers[0].bias[0]) == pytest.approx(0.1, abs=1e-5)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3])
+def test_actor_and_targets_move_with_every_delay_th_update_alone(delay):
+    algorithm = TD3(policy_delay=delay, **LINEAR)
+    state, batch, loss = linear_state(algorithm), batch_of(transition()), 0.0
+    for step in range(6):
+        before = state
+        state, metrics = update(algorithm, before, batch, step)
+        is_due = step % delay == delay - 1
+        for name in ("actor", "target_actor", "target_critics", "actor_optimiser"):
+            ours, theirs = (jax.tree.leaves(getattr(x, name)) for x in (before, state))
+            moved = not all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
+            assert moved == is_due, (name, step)
+        assert not np.array_equal(before.critics[0].layers[0].bias, state.critics[0].layers[0].bias)
+        assert (float(metrics["actor_loss"]) != loss) == is_due  # that of the last move until then
+        loss = float(metrics["actor_loss"])
+
+
+def equations(jaxpr) -> list[Any]:
+    """Every equation of a program, those of its sub-programs too."""
+    found = []
+    for equation in jaxpr.eqns:
+        found.append(equation)
+        for sub in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+            found += equations(getattr(sub, "jaxpr", sub)) if hasattr(sub, "eqns") else []
+    return found
+
+
+def program_of_three_seeds(step_axis: int | None) -> tuple[Any, list[Any]]:
+    """Three seeds' states, and every equation of their update."""
+    algorithm = TD3(actor_hidden_sizes=(5,), critic_hidden_sizes=(6,))
+    keys = jax.random.split(jax.random.key(0), 3)
+    states = jax.eval_shape(jax.vmap(lambda key: algorithm.init(key, ONE, 1000)), keys)
+    batches = batch_of(*[batch_of(*[transition()] * 4)] * 3)
+    step = jnp.int32(0) if step_axis is None else jnp.arange(3)
+    update = jax.vmap(algorithm.update, in_axes=(0, 0, 0, step_axis))
+    return states, equations(jax.make_jaxpr(update)(states, batches, keys, step).jaxpr)
+
+
+def parameters_selected(states: Any, program: list[Any]) -> bool:
+    selected = {equation.outvars[0].aval.shape for equation in program if equation.primitive.name == "select_n"}
+    return bool(selected & {leaf.shape for leaf in jax.tree.leaves(states) if leaf.ndim > 2})
+
+
+def test_seeds_side_by_side_still_choose_one_of_two_programs():
+    states, program = program_of_three_seeds(None)
+    (choice,) = [equation for equation in program if equation.primitive.name == "cond"]
+    assert choice.invars[0].aval.shape == ()
+    stay, move = (equations(branch.jaxpr) for branch in choice.params["branches"])
+    assert not stay
+    assert any(equation.primitive.name == "dot_general" for equation in move)
+    assert not parameters_selected(states, program)
+
+    states, program = program_of_three_seeds(0)  # a step for each seed: both are computed, then one selected
+    assert parameters_selected(states, program)
+
+
+def test_actions_explore_with_noise_within_the_bounds():
+    algorithm = TD3(exploration_noise=0.1, **LINEAR)
+    act = jax.vmap(algorithm.act, in_axes=(None, None, 0, None))
+    keys = jax.random.split(jax.random.key(1), 4000)
+    state = linear_state(algorithm)._replace(actor=always(0.4))
+    np.testing.assert_allclose(act(state, jnp.ones(1), keys, False), 0.4, rtol=1e-6)
+    explored = np.asarray(act(state, jnp.ones(1), keys, True))
+    assert explored.mean() == pytest.approx(0.4, abs=0.01)  # standard error 0.0016
+    assert explored.std() == pytest.approx(0.1, abs=0.01)
+    # At 0.95 the bound is half a standard deviation away: 31 % of the noise goes past it.
+    at_the_edge = np.asarray(act(state._replace(actor=always(0.95)), jnp.ones(1), keys, True))
+    assert at_the_edge.max() == 1.0
+    assert np.mean(at_the_edge == 1.0) == pytest.approx(0.309, abs=0.03)
+
+
+def test_the_policy_that_leaves_acts_as_the_algorithm_does():
+    spec = Spec(3, 2)
+    algorithm = TD3(actor_hidden_sizes=(8, 8), critic_hidden_sizes=(4,))
+    state = algorithm.init(jax.random.key(3), spec, 1000)
+    network = jax.tree.map(
+        lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, algorithm.policy(state)
+    )
+    bound = np.ones(2, np.float32)
+    policy = Policy(
+        network, Contract("Task-v0", "td3", network.activation, network.head, ((None, (3,)),), (2,), -bound, bound)
+    )
+    observations = jax.random.normal(jax.random.key(0), (20, 3))
+    actions = jax.vmap(algorithm.act, in_axes=(None, 0, None, None))(state, observations, jax.random.key(0), False)
+    np.testing.assert_allclose(policy.act(np.asarray(observations)), actions, atol=1e-6)
+
+
+def test_the_first_state_has_copies_for_targets_and_two_different_critics():
+    state = TD3(actor_hidden_sizes=(4,), critic_hidden_sizes=(4,)).init(jax.random.key(0), ONE, 1000)
+    jax.tree.map(np.testing.assert_array_equal, state.actor, state.target_actor)
+    jax.tree.map(np.testing.assert_array_equal, state.critics, state.target_critics)
+    assert not np.allclose(*(critic.layers[0].weight for critic in state.critics))
+    pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state)]
+    assert len(set(pointers)) == len(pointers)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("policy_delay", 0), ("policy_delay", 1.5), ("target_noise_clip", -0.5), ("exploration_noise", -0.1)],
+)
+def test_bad_values_are_refused(name, value):
+    settings: dict[str, Any] = {name: value}
+    with pytest.raises(InputError, match=name):
+        TD3(**settings)
