@@ -11,14 +11,13 @@ import probes
 import pytest
 from trainer import run
 
-from csac.algorithms import CSAC, PPO, SAC
+from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
 from csac.algorithms.distributions import TanhGaussian, policy_at
 from csac.algorithms.networks import q_values
 from csac.algorithms.ppo import value_at
 
 DISCOUNT = 0.9
-SETTINGS: dict[str, Any] = {
-    "entropy_weight": 1e-3,
+COMMON: dict[str, Any] = {
     "discount": DISCOUNT,
     "target_rate": 0.1,
     "actor_learning_rate": 3e-3,
@@ -29,12 +28,19 @@ SETTINGS: dict[str, Any] = {
     "warmup_steps": 64,
     "replay_size": 500,
 }
+SETTINGS: dict[str, Any] = {**COMMON, "entropy_weight": 1e-3}
+# Noise enough to see all actions: critics are asked about those that the actor would not take, too.
+NOISY: dict[str, Any] = {**COMMON, "exploration_noise": 0.5}
 
 
-@pytest.fixture(params=["csac", "sac", "csac-periodic"])
+@pytest.fixture(params=["csac", "sac", "csac-periodic", "td3", "sd3"])
 def algorithm(request):
     if request.param == "sac":
         return SAC(temperature="fixed", **SETTINGS)
+    if request.param == "td3":
+        return TD3(**NOISY)
+    if request.param == "sd3":
+        return SD3(noise_samples=4, **NOISY)
     if request.param == "csac":
         return CSAC(
             relative_entropy_weight=0.01, reference_policy="average", relative_entropy_estimator="sampled", **SETTINGS
@@ -45,11 +51,12 @@ def algorithm(request):
 def values(state, observation: float, actions=(-0.8, 0.0, 0.8)) -> np.ndarray:
     """Both critics' values of a few actions, [critic, action]."""
     pairs = jnp.array([observation]), jnp.array(actions)[:, None]
-    return np.stack(jax.vmap(q_values, in_axes=(None, None, 0))(state.critics, *pairs))
+    critics = state.critics if hasattr(state, "critics") else (state.first.critic, state.second.critic)
+    return np.stack(jax.vmap(q_values, in_axes=(None, None, 0))(critics, *pairs))
 
 
-def best_action(state, observation: float) -> float:
-    return float(policy_at(state.actor, jnp.array([observation])).mode()[0])
+def best_action(algorithm, state, observation: float) -> float:
+    return float(algorithm.act(state, jnp.array([observation]), jax.random.key(0), explore=False)[0])
 
 
 def entropy(policy: TanhGaussian) -> float:
@@ -78,7 +85,7 @@ def test_a_reward_one_step_later_is_discounted(algorithm):
 
 def test_the_best_action_is_found(algorithm):
     state = run(algorithm, probes.ActionReward, 1500).states[0]
-    assert best_action(state, 0.0) == pytest.approx(0.5, abs=0.1)
+    assert best_action(algorithm, state, 0.0) == pytest.approx(0.5, abs=0.1)
     # -(a - 0.5)² = -0.25, -0.01, 0, -0.09
     np.testing.assert_allclose(values(state, 0.0, (0.0, 0.4, 0.5, 0.8)), [[-0.25, -0.01, 0.0, -0.09]] * 2, atol=0.05)
 
@@ -86,7 +93,7 @@ def test_the_best_action_is_found(algorithm):
 def test_the_best_action_depends_on_the_observation(algorithm):
     state = run(algorithm, probes.ObservationActionReward, 2500).states[0]
     for observation in (-1.0, 1.0):
-        assert best_action(state, observation) == pytest.approx(observation / 2, abs=0.15)
+        assert best_action(algorithm, state, observation) == pytest.approx(observation / 2, abs=0.15)
         np.testing.assert_allclose(values(state, observation, (observation / 2,)), 0.0, atol=0.06)
 
 

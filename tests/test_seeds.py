@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from trainer import run
 
-from csac.algorithms import CSAC, SAC
+from csac.algorithms import CSAC, SAC, SD3, TD3
 from csac.training.train import train
 
 SMALL: dict[str, Any] = {
@@ -22,7 +22,11 @@ SMALL: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("algorithm", [CSAC(reference_period=7, **SMALL), SAC(**SMALL)], ids=lambda a: a.name)
+@pytest.mark.parametrize(
+    "algorithm",
+    [CSAC(reference_period=7, **SMALL), SAC(**SMALL), TD3(**SMALL), SD3(noise_samples=4, **SMALL)],
+    ids=lambda a: a.name,
+)
 def test_seeds_together_equal_seeds_alone(algorithm):
     seeds, steps = (0, 1, 2), 100
     together = run(algorithm, "Pendulum-v1", steps, seeds)
