@@ -1,6 +1,6 @@
 """Measure csac against stable-baselines3 and SBX: environment steps, each with its update, per second.
 
-    make bench                       # everything, twelve minutes on a quiet machine; writes the table of README.md
+    make bench                       # everything, sixteen minutes on a quiet machine; writes the table of README.md
     make bench ARGS=--quick          # does it run? Its numbers mean nothing and are only printed
 
 Every measurement is a process of its own, bound to its processors. README.md says how it is done and what was found.
@@ -47,6 +47,7 @@ class Case(NamedTuple):
     seeds: int = 1
     cores: int = 2
     together: int = 1  # processes side by side, the cores divided among them
+    threads: int = 0  # of PyTorch, 0 for one on each core
     evaluated: bool = False
     repeated: bool = False  # measured in every repetition, and not only in the first
 
@@ -76,6 +77,7 @@ CASES = [
     Case(PPO, "csac PPO", "csac", "ppo", repeated=True),
     Case(PPO, "SBX PPO", "sbx", "ppo", repeated=True),
     Case(PPO, "SB3 PPO", "sb3", "ppo", repeated=True),
+    Case(PPO, "SB3 PPO, 1 thread", "sb3", "ppo", threads=1, repeated=True),
 ]
 
 REACHES = [
@@ -84,6 +86,7 @@ REACHES = [
     Reach(FIVE, "csac SAC", "SBX SAC, two at a time", 1.25),
     Reach(TD3, "csac TD3", "SBX TD3", 1.3),
     Reach(PPO, "csac PPO", "SB3 PPO", 3.0),
+    Reach(PPO, "csac PPO", "SB3 PPO, 1 thread", 3.0),
 ]
 
 
@@ -146,7 +149,9 @@ def _launch(case: Case, protocol: Protocol, cores: Sequence[int], folder: str, e
         "evaluation-interval": protocol.evaluation_interval if case.evaluated else 0,
         "evaluation-episodes": protocol.evaluation_episodes,
     }
-    command = [sys.executable, str(script)] if ours else [PEERS_PYTHON, str(script), f"--library={case.library}"]
+    if not ours:
+        arguments |= {"library": case.library, "threads": case.threads or len(cores)}
+    command = [sys.executable if ours else PEERS_PYTHON, str(script)]
     command += [f"--{name}={value}" for name, value in arguments.items()]
     return subprocess.Popen(
         command + ["--together"] * (case.together > 1),

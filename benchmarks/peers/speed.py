@@ -1,7 +1,7 @@
 """One measurement of SB3 or SBX, in a process of its own; `benchmarks/speed.py` runs it with the peers' Python.
 
-It prints one line of JSON. The two scripts that measure take the same arguments, and this one `--library` and
-`--together` as well.
+It prints one line of JSON. The two scripts that measure take the same arguments, and this one `--library`, `--threads`
+and `--together` as well.
 """
 
 import argparse
@@ -25,6 +25,7 @@ def parse():
     parser.add_argument("--task", required=True)
     parser.add_argument("--seeds", type=int, choices=(1,), required=True)
     parser.add_argument("--cores", required=True)
+    parser.add_argument("--threads", type=int, required=True)
     parser.add_argument("--launched", type=float, required=True)
     parser.add_argument("--warmup", type=int, required=True)
     parser.add_argument("--settled", type=int, required=True)
@@ -77,8 +78,7 @@ def make_clock(arguments):
 def main():
     """Train until the window is over and print what was measured."""
     arguments = parse()
-    cores = [int(core) for core in arguments.cores.split(",")]
-    os.sched_setaffinity(0, cores)
+    os.sched_setaffinity(0, [int(core) for core in arguments.cores.split(",")])
     warnings.filterwarnings("ignore")
 
     import gymnasium
@@ -86,7 +86,7 @@ def main():
     from stable_baselines3.common.callbacks import EvalCallback
     from stable_baselines3.common.monitor import Monitor
 
-    torch.set_num_threads(len(cores))
+    torch.set_num_threads(arguments.threads)
     model = make_model(arguments.library, arguments.algorithm, arguments.task, TASK_SEED, arguments.warmup - 1)
     if arguments.algorithm != "ppo":
         fill(model.replay_buffer)
