@@ -1,4 +1,4 @@
-"""Both algorithms learn to swing a pendulum up, and do not where the actor climbs its loss."""
+"""Each algorithm learns to swing a pendulum up, and does not where the actor climbs its loss."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from trainer import run
 
-from csac.algorithms import CSAC, SAC
+from csac.algorithms import CSAC, SAC, SD3, TD3
 from csac.training.loop import Evaluated
 
 SETTINGS: dict[str, Any] = {
@@ -38,7 +38,16 @@ def mean_return(algorithm, steps: int = 3000, seed: int = 0) -> float:
     return float(np.mean([row["return"] for row in rows]))
 
 
-@pytest.mark.parametrize("algorithm", [CSAC(**SETTINGS), SAC(temperature_learning_rate=2e-3, **SETTINGS)])
+@pytest.mark.parametrize(
+    "algorithm",
+    [
+        CSAC(**SETTINGS),
+        SAC(temperature_learning_rate=2e-3, **SETTINGS),
+        TD3(**SETTINGS),
+        SD3(noise_samples=8, **SETTINGS),
+    ],
+    ids=lambda algorithm: algorithm.name,
+)
 def test_the_pendulum_is_learnt(algorithm):
     assert mean_return(algorithm) > THRESHOLD
 

@@ -137,34 +137,33 @@ def test_the_losses_are_those_of_one_pair():
 
 
 def pair(algorithm: SD3, target_value: float) -> Pair:
-    """Q = 0.01 a, a target critic that says `target_value`, the actor 0 and its target atanh(0.5), everywhere."""
+    """Q = 0.01 a, the actor 0 and its target 0.5, everywhere: its target critic 4a + b says `target_value` there."""
     made = algorithm.init(jax.random.key(0), ONE, 1000).first
     return made._replace(
         actor=always(0.0),
         critic=linear([[0.0], [0.01]], [0.0]),
         target_actor=always(0.5),
-        target_critic=linear([[0.0], [0.0]], [target_value]),
+        target_critic=linear([[0.0], [4.0]], [target_value - 2.0]),
     )
 
 
-# No target noise: nothing of the two tests below depends on it.
 ONE_BY_ONE = SD3(batch_size=1, target_noise=0.0, **LINEAR)
 
 
 def test_each_pair_learns_in_turn_from_its_own_batch():
     # First pair, reward 0: y = 0.5 min(-20, -18) = -10 and Q(1, 1) = 0.01, a loss of 10.01². In Adam's first step all
     # three parameters go down by 0.1: the slope in the action turns from 0.01 to -0.09, and the actor, which sees the
-    # new critic, goes down. Its target critic moves halfway, to -10.05 - 0.05 s - 0.045 a.
-    # Second pair, reward 7: y = 7 + 0.5 min(-18, -10.05 - 0.045·0.5) = -2, a loss of 2.01², and all else is alike.
+    # new critic, goes down. Its target critic moves halfway, to -11.05 - 0.05 s + 1.955 a.
+    # Second pair, reward 7: y = 7 + 0.5 min(-18, -11.05 + 1.955·0.5) = -2, a loss of 2.01², and all else is alike.
     batch = batch_of(transition(action=1.0, reward=0.0), transition(action=1.0, reward=7.0, next_observation=0.0))
     before = State(pair(ONE_BY_ONE, -20.0), pair(ONE_BY_ONE, -18.0))
     state, metrics = update(ONE_BY_ONE, before, batch)
     assert float(metrics["critic_loss"]) == pytest.approx((10.01**2 + 2.01**2) / 2, rel=1e-5)
     assert float(metrics["q_mean"]) == pytest.approx(0.01)
     assert float(metrics["actor_loss"]) == pytest.approx(0.2, abs=1e-5)  # 0.1 s + 0.09 a + 0.1 at s = 1, a = 0
-    for learnt, bias in zip(state, (-10.05, -9.05), strict=True):
+    for learnt, bias in zip(state, (-11.05, -10.05), strict=True):
         np.testing.assert_allclose(learnt.critic.layers[0].weight, [[-0.1], [-0.09]], atol=1e-6)
-        np.testing.assert_allclose(learnt.target_critic.layers[0].weight, [[-0.05], [-0.045]], atol=1e-6)
+        np.testing.assert_allclose(learnt.target_critic.layers[0].weight, [[-0.05], [1.955]], atol=1e-6)
         np.testing.assert_allclose(learnt.target_critic.layers[0].bias, [bias], atol=1e-5)
         assert float(learnt.actor.layers[0].bias[0]) == pytest.approx(-0.1, abs=1e-5)
         assert float(learnt.target_actor.layers[0].bias[0]) == pytest.approx((math.atanh(0.5) - 0.1) / 2, abs=1e-5)
@@ -172,7 +171,7 @@ def test_each_pair_learns_in_turn_from_its_own_batch():
 
 def test_the_second_pair_sees_the_new_target_of_the_first():
     # As above, but the second's own target critic says -1. The first's said -20 and says, at s' = -0.45 and a' = 0.5,
-    # -10.05 + 0.05·0.45 - 0.045·0.5 = -10.05: y = 7 - 5.025 = 1.975, where the old one would give -3.
+    # -11.05 + 0.05·0.45 + 1.955·0.5 = -10.05: y = 7 - 5.025 = 1.975, where the old one would give -3.
     batch = batch_of(transition(action=1.0, reward=0.0), transition(action=1.0, reward=7.0, next_observation=-0.45))
     before = State(pair(ONE_BY_ONE, -20.0), pair(ONE_BY_ONE, -1.0))
     _, metrics = update(ONE_BY_ONE, before, batch)
@@ -200,10 +199,7 @@ def act(algorithm: SD3, state: State, keys: jax.Array, explore: bool) -> np.ndar
     return np.asarray(jax.vmap(algorithm.act, in_axes=(None, None, 0, None))(state, jnp.ones(1), keys, explore))
 
 
-@pytest.mark.parametrize(
-    ("first_value", "second_value", "expected"),
-    [(1.0, 0.5, 0.4), (0.5, 1.0, -0.6), (1.0, 1.0, 0.4)],  # of equals, the first
-)
+@pytest.mark.parametrize(("first_value", "second_value", "expected"), [(1.0, 0.5, 0.4), (0.5, 1.0, -0.6)])
 def test_the_actor_acts_whose_own_critic_values_it_more(first_value, second_value, expected):
     # Each critic would value the other's action at ±100: that is not asked.
     algorithm = SD3(**LINEAR)
@@ -217,6 +213,13 @@ def test_the_actor_acts_whose_own_critic_values_it_more(first_value, second_valu
     explored = act(algorithm, state, keys, True)
     assert explored.mean() == pytest.approx(expected, abs=0.01)  # standard error 0.0016
     assert explored.std() == pytest.approx(0.1, abs=0.01)
+
+
+def test_of_actions_valued_the_same_the_first_is_taken():
+    algorithm, indifferent = SD3(**LINEAR), linear([[0.0], [0.0]], [1.0])
+    both = pair(algorithm, 0.0)._replace(critic=indifferent)
+    state = State(both._replace(actor=always(0.4)), both._replace(actor=always(-0.6)))
+    np.testing.assert_allclose(act(algorithm, state, jax.random.split(jax.random.key(1), 2), False), 0.4, rtol=1e-5)
 
 
 def test_exploration_stays_within_the_bounds():

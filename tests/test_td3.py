@@ -97,8 +97,8 @@ def test_the_losses():
 
 
 def linear_state(algorithm: TD3):
-    """Both critics Q = 0.01 a, target critics -20, the actor 0 and its target atanh(0.5), everywhere."""
-    critic, target_critic = linear([[0.0], [0.01]], [0.0]), linear([[0.0], [0.0]], [-20.0])
+    """Both critics Q = 0.01 a, target critics Q' = 4a - 22, the actor 0 and its target 0.5, everywhere."""
+    critic, target_critic = linear([[0.0], [0.01]], [0.0]), linear([[0.0], [4.0]], [-22.0])
     return algorithm.init(jax.random.key(0), ONE, 1000)._replace(
         actor=always(0.0),
         target_actor=always(0.5),
@@ -108,10 +108,10 @@ def linear_state(algorithm: TD3):
 
 
 def test_a_delayed_update_moves_the_actor_against_the_new_critics_and_the_targets_last():
-    # y = 0 + 0.5·(-20) = -10 and Q = 0.01 at a = 1, so the loss is 2·10.01². In Adam's first step each parameter of the
-    # critics goes down by the learning rate. The slope in the action turns from 0.01 to -0.09: the actor goes down only
-    # if it sees the new critics. Targets: halfway from the old ones to the new.
-    algorithm = TD3(**LINEAR)
+    # y = 0 + 0.5 (4·0.5 - 22) = -10 and Q = 0.01 at a = 1: a loss of 2·10.01². In Adam's first step all
+    # parameters of the critics go down by 0.1. The slope in the action turns from 0.01 to -0.09: the actor goes down
+    # only if it sees the new critics. Targets: halfway from the old ones to the new.
+    algorithm = TD3(target_noise=0.0, **LINEAR)
     before = linear_state(algorithm)
     state, metrics = update(algorithm, before, batch_of(transition(action=1.0, reward=0.0)), 1)
     assert float(metrics["critic_loss"]) == pytest.approx(200.4002, rel=1e-6)
@@ -121,8 +121,8 @@ def test_a_delayed_update_moves_the_actor_against_the_new_critics_and_the_target
     assert float(state.target_actor.layers[0].bias[0]) == pytest.approx((math.atanh(0.5) - 0.1) / 2, abs=1e-5)
     for new, target in zip(state.critics, state.target_critics, strict=True):
         np.testing.assert_allclose(new.layers[0].weight, [[-0.1], [-0.09]], atol=1e-6)
-        np.testing.assert_allclose(target.layers[0].weight, [[-0.05], [-0.045]], atol=1e-6)
-        np.testing.assert_allclose(target.layers[0].bias, [-10.05], atol=1e-5)
+        np.testing.assert_allclose(target.layers[0].weight, [[-0.05], [1.955]], atol=1e-6)
+        np.testing.assert_allclose(target.layers[0].bias, [-11.05], atol=1e-5)
 
 
 def test_the_actor_climbs_the_first_critic_alone():
