@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from trainer import run
 
-from csac.algorithms import CSAC, SAC, SD3, TD3
+from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
 from csac.training.train import train
 
 SMALL: dict[str, Any] = {
@@ -24,7 +24,13 @@ SMALL: dict[str, Any] = {
 
 @pytest.mark.parametrize(
     "algorithm",
-    [CSAC(reference_period=7, **SMALL), SAC(**SMALL), TD3(**SMALL), SD3(noise_samples=4, **SMALL)],
+    [
+        CSAC(reference_period=7, **SMALL),
+        SAC(**SMALL),
+        TD3(**SMALL),
+        SD3(noise_samples=4, **SMALL),
+        PPO(rollout_steps=32, minibatches=2, hidden_sizes=(16, 16)),
+    ],
     ids=lambda a: a.name,
 )
 def test_seeds_together_equal_seeds_alone(algorithm):
