@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from trainer import run
 
-from csac.algorithms import CSAC, SAC, SD3, TD3
+from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
 from csac.training.loop import Evaluated
 
 SETTINGS: dict[str, Any] = {
@@ -50,6 +50,13 @@ def mean_return(algorithm, steps: int = 3000, seed: int = 0) -> float:
 )
 def test_the_pendulum_is_learnt(algorithm):
     assert mean_return(algorithm) > THRESHOLD
+
+
+def test_ppo_learns_it_too_from_more_steps():
+    algorithm = PPO(
+        discount=0.9, learning_rate=1e-3, clip_value_loss=False, rollout_steps=512, minibatches=16, epochs=20
+    )
+    assert mean_return(algorithm, steps=30_000) > THRESHOLD
 
 
 def test_the_pendulum_is_not_learnt_with_the_sign_of_the_actor_loss_turned():
