@@ -83,7 +83,7 @@ def test_one_sample_is_its_own_value(beta):
 
 @pytest.mark.parametrize("shift", [-1e6, 1e6])
 def test_a_shift_of_the_values_shifts_the_result(shift):
-    # β Q is ± 5e8 here: without care its exponential overflows, or its digits are lost. Spacing of floats at 1e6: 1/16.
+    # β Q is ± 5e8 and ± 1e6 here, and its exponential no number. Floats at 1e6 lie 1/16 apart.
     assert operator([shift - 0.5, shift, shift + 0.5], 500.0) == shift + 0.5
     assert operator([shift, shift + 1.0], math.log(3.0)) == pytest.approx(shift + 0.75, abs=0.0625)
 

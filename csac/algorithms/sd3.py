@@ -208,9 +208,7 @@ class SD3:
 
 def softmax_operator(values: jax.Array, inverse_temperature: float, log_weights: jax.Array) -> jax.Array:
     """Return Σ wₖ exp(β Qₖ) Qₖ / Σ wₖ exp(β Qₖ) over the samples [sample], wₖ = exp(log_weights)."""
-    # The differences are taken before they are scaled, so that large values keep their digits.
-    logits = inverse_temperature * (values - jnp.max(values)) + log_weights
-    return jnp.sum(jax.nn.softmax(logits) * values)
+    return jnp.sum(jax.nn.softmax(inverse_temperature * values + log_weights) * values)
 
 
 def log_density(noise: jax.Array) -> jax.Array:
