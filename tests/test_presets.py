@@ -92,6 +92,17 @@ def test_paper_beta_depends_on_the_task(task, beta):
     assert presets.hyperparameters("paper", "sd3", task)["inverse_temperature"] == beta
 
 
+def test_paper_ppo_has_the_papers_table_and_parls_example_which_are_the_defaults():
+    given = presets.hyperparameters("paper", "ppo", "HalfCheetah-v4")
+
+    assert (given["learning_rate"], given["hidden_sizes"], given["discount"]) == (3e-4, (64, 64), 0.99)
+    assert (given["rollout_steps"], given["minibatches"], given["epochs"]) == (2048, 32, 10)
+    assert (given["clip_range"], given["trace_decay"], given["value_loss_weight"]) == (0.2, 0.95, 0.5)
+    assert (given["max_gradient_norm"], given["adam_epsilon"]) == (0.5, 1e-5)
+    assert given["learning_rate_schedule"] == "linear"
+    assert given == dataclasses.asdict(ALGORITHMS["ppo"]())
+
+
 def test_changing_what_was_given_changes_no_preset():
     presets.hyperparameters("paper", "csac", "Ant-v4")["discount"] = 0.0
 
