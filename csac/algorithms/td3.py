@@ -111,7 +111,7 @@ class TD3:
         return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
 
     def smoothed_action(self, target_actor: MLP, observation: jax.Array, noise: jax.Array) -> jax.Array:
-        """Return clip(π'(s') + clip(σ̃ ξ, -c, c), -1, 1) for ξ ~ N(0, I) [action] (Eq. 14)."""
+        """Return clip(π'(s') + clip(σ̃ ξ, -c, c), -1, 1) for ξ ~ N(0, I) [action] (Algorithm 1)."""
         noise = jnp.clip(self.target_noise * noise, -self.target_noise_clip, self.target_noise_clip)
         return jnp.clip(jnp.tanh(target_actor(observation)) + noise, -1.0, 1.0)
 
