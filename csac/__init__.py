@@ -22,12 +22,25 @@ if TYPE_CHECKING:
     from csac.algorithms.td3 import TD3
     from csac.deploy.policy import Policy, load
     from csac.training.evaluation import evaluate
-    from csac.training.train import train
+    from csac.training.train import resume, train
     from csac.types import InputError
 
     __version__: str
 
-__all__ = ["CSAC", "PPO", "SAC", "SD3", "TD3", "InputError", "Policy", "__version__", "evaluate", "load", "train"]
+__all__ = [
+    "CSAC",
+    "PPO",
+    "SAC",
+    "SD3",
+    "TD3",
+    "InputError",
+    "Policy",
+    "__version__",
+    "evaluate",
+    "load",
+    "resume",
+    "train",
+]
 
 _MODULES = {
     "CSAC": "csac.algorithms.csac",
@@ -40,6 +53,7 @@ _MODULES = {
     "evaluate": "csac.training.evaluation",
     "load": "csac.deploy.policy",
     "train": "csac.training.train",
+    "resume": "csac.training.train",
 }
 
 

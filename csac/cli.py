@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import json
 import os
 import shlex
 import sys
@@ -19,9 +20,11 @@ from csac.presets import PRESETS, hyperparameters
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from rich.console import Console
+
+    from csac.record.run import RunDirectory
 
 HELP = """\
 usage: csac COMMAND ...
@@ -29,6 +32,7 @@ usage: csac COMMAND ...
 Train controllers for continuous-control tasks with Conservative Soft Actor-Critic.
 
   csac train TASK      train controllers for a Gymnasium task, several seeds at once
+  csac resume DIR      go on with a run that was stopped or killed
   csac evaluate DIR    test the policies of a run on fresh episodes
   csac play DIR        watch the policy of a run, or write a video of it
   csac runs [DIR]      list the runs below a directory
@@ -61,6 +65,12 @@ class Train:
     """Label of the first seed; the others follow."""
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/TASK/ALGORITHM/DATE-TIME)")] = None
     """The run's own directory, new or empty."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Go on with the run in --directory, if there is one already."""
+    start_from: Annotated[str | None, arg(name="from", metavar="DIR[@STEP]", help_behavior_hint="(default: none)")] = (
+        None
+    )
+    """Begin with a copy of that run's checkpoint; what is not given here is as it was there."""
     env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
     """Keyword arguments for the environment, as a JSON object."""
     device: Literal["cpu", "gpu"] = "cpu"
@@ -71,6 +81,20 @@ class Train:
     """Environment steps between two evaluations; there is one at the last step as well."""
     evaluation_episodes: int = 10
     """Episodes of each evaluation."""
+    checkpoint_interval: int = 50_000
+    """Environment steps between checkpoints; there is one every ten minutes and at the end as well. 0 makes none."""
+    keep_checkpoints: int = 2
+    """How many of the newest checkpoints to keep; 0 keeps all."""
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Go on with a run from its newest checkpoint, as if it had never stopped."""
+
+    run: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The directory of a run."""
+    steps: Annotated[int | None, arg(help_behavior_hint="(default: as many as it was started for)")] = None
+    """Environment steps per seed in all, counted from the run's beginning; may be more than it was started for."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +162,7 @@ def _dispatch(arguments: list[str]) -> int:
 
         _say(f"csac {__version__}")
         return 0
-    commands = {"train": _train, "evaluate": _evaluate, "play": _play, "runs": _runs}
+    commands = {"train": _train, "resume": _resume, "evaluate": _evaluate, "play": _play, "runs": _runs}
     if arguments[0] not in commands:
         raise InputError(f"no command is called {arguments[0]!r}{nearest(arguments[0], commands)} (csac --help)")
     try:
@@ -150,21 +174,25 @@ def _dispatch(arguments: list[str]) -> int:
 def _train(arguments: list[str]) -> int:
     from csac.algorithms import ALGORITHMS
 
-    name = peek(arguments, "--algorithm", "csac")
+    source = _source(peek(arguments, "--from", None))
+    name = peek(arguments, "--algorithm", source["algorithm"] if source else "csac")
     if name not in ALGORITHMS:
         raise InputError(f"no algorithm is called {name!r}: choose {' or '.join(ALGORITHMS)}")
     preset, others = peek(arguments, "--preset", None), {k: v for k, v in ALGORITHMS.items() if k != name}
     # Twice: what a preset gives can depend on the task, and the task is known once the arguments are parsed.
-    options = parse(_with_algorithm(ALGORITHMS, name, preset, ""), arguments, "csac train", others)
+    options = parse(_with_algorithm(ALGORITHMS, name, preset, "", source), arguments, "csac train", others)
     if preset:
-        options = parse(_with_algorithm(ALGORITHMS, name, preset, options.task), arguments, "csac train", others)
+        options = parse(
+            _with_algorithm(ALGORITHMS, name, preset, options.task, source), arguments, "csac train", others
+        )
+    if options.resume and options.directory is None:
+        raise InputError("--resume needs the run's --directory (csac resume DIR does without)")
 
-    from csac.training.console import program
     from csac.training.progress import Reporter
-    from csac.training.train import Interrupted, train
+    from csac.training.train import train
 
-    try:
-        run = train(
+    return _exit_code(
+        lambda: train(
             getattr(options, name),
             options.task,
             steps=options.steps,
@@ -176,14 +204,49 @@ def _train(arguments: list[str]) -> int:
             evaluation_episodes=options.evaluation_episodes,
             environment_arguments=json_object("--env-kwargs", options.env_kwargs),
             device=options.device,
+            checkpoint_interval=options.checkpoint_interval,
+            keep_checkpoints=options.keep_checkpoints,
+            resume=options.resume,
+            start_from=options.start_from,
             preset=preset,
             reporter=Reporter(),
             command=shlex.join(["csac", "train", *arguments]),
         )
+    )
+
+
+def _resume(arguments: list[str]) -> int:
+    options = parse(Resume, arguments, "csac resume")
+    from csac.training.progress import Reporter
+    from csac.training.train import resume
+
+    command = shlex.join(["csac", "resume", *arguments])
+    return _exit_code(lambda: resume(options.run, steps=options.steps, reporter=Reporter(), command=command))
+
+
+def _exit_code(training: Callable[[], RunDirectory]) -> int:
+    """Train, and turn how it ended into an exit code and, where it did not reach its end, the line to type next."""
+    from csac.record.run import StorageFailure
+    from csac.training.console import program
+    from csac.training.train import Interrupted
+
+    try:
+        run = training()
     except Interrupted as interruption:
-        look = f"{program()} evaluate {shlex.quote(str(interruption.run.path))}"
-        return _complain(f"{interruption}; to test what was learnt, type: {look}", 128 + interruption.signal_number)
+        line = f"{program()} resume {shlex.quote(str(interruption.run.path))}"
+        return _complain(f"{interruption}; to go on, type: {line}", 128 + interruption.signal_number)
+    except StorageFailure as failure:
+        return _complain(f"{failure}; the run can go on from its last checkpoint (csac resume) once that is mended", 1)
     return 3 if run.manifest["state"] == "failed" else 0
+
+
+def _source(where: str | None) -> dict[str, Any] | None:
+    """Return the manifest of the run that another is to begin with."""
+    if where is None:
+        return None
+    from csac.training.resume import Source
+
+    return Source.find(where).run.manifest
 
 
 def _evaluate(arguments: list[str]) -> int:
@@ -236,12 +299,23 @@ def _runs(arguments: list[str]) -> int:
     return 0
 
 
-def _with_algorithm(algorithms: dict[str, Any], name: str, preset: str | None, task: str) -> type[Any]:
-    """Return `Train` with the options of one algorithm beside its own; a preset sets what they are by default."""
-    algorithm = algorithms[name](**(hyperparameters(preset, name, task) if preset else {}))
+def _with_algorithm(
+    algorithms: dict[str, Any], name: str, preset: str | None, task: str, source: dict[str, Any] | None
+) -> type[Any]:
+    """Return `Train` with the options of one algorithm beside its own.
+
+    What they are by default comes from a preset or from the manifest of the run to begin with, if one is given.
+    """
     presets: Any = Literal[PRESETS]
     hint = arg(help_behavior_hint=f"(default: {preset or 'none'})")
-    fields = [
+    algorithm = algorithms[name](**(hyperparameters(preset, name, task) if preset else {}))
+    fields: list[Any] = []
+    if source:
+        from csac.training.resume import algorithm_of
+
+        algorithm = algorithm_of(source) if source["algorithm"] == name and not preset else algorithm
+        fields += [(field, type_, dataclasses.field(default=value)) for field, type_, value in _inherited(source)]
+    fields += [
         ("algorithm", Literal[tuple(algorithms)], field(default=name)),
         ("preset", Annotated[presets | None, hint], field(default=preset)),
         (name, OmitArgPrefixes[type(algorithm)], field(default=algorithm)),
@@ -249,6 +323,16 @@ def _with_algorithm(algorithms: dict[str, Any], name: str, preset: str | None, t
     return dataclasses.make_dataclass(
         "Train", fields, bases=(Train,), frozen=True, namespace={"__doc__": Train.__doc__}
     )
+
+
+def _inherited(source: dict[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Return the options of `Train`, with their types, that a run takes from the one it begins with."""
+    return [
+        ("steps", int, source["steps"]),
+        ("seeds", int, len(source["seeds"])),
+        ("first_seed", int, source["seeds"][0]),
+        ("env_kwargs", Annotated[str, arg(metavar="JSON")], json.dumps(source.get("environment_arguments", {}))),
+    ]
 
 
 def _waiting(console: Console, doing: str) -> AbstractContextManager[Any]:

@@ -131,7 +131,7 @@ def words(text):
         ("train X --no_such_thing=3", "there is no option --no-such-thing (csac train --help)"),
         ("train X Y", "there is no place for 'Y' (csac train --help)"),
         ("train X --device tpu", "--device: 'tpu' is not one of 'cpu', 'gpu' (csac train --help)"),
-        ("train X --algorithm dqn", "no algorithm is called 'dqn': choose csac or sac"),
+        ("train X --algorithm dqn", "no algorithm is called 'dqn': choose csac or sac or td3 or sd3 or ppo"),
         ("train X --preset papr", "no preset is called 'papr': choose paper"),
         (
             "train X --temperature fixed",
@@ -183,7 +183,8 @@ def test_a_long_word_in_a_complaint_stays_whole(capsys):
 def test_train_passes_its_options_on(train_call):
     call = train_call(
         "Hopper-v4 --steps 1e5 --seeds 3 --first-seed 7 --directory some/where --device gpu --groups 2 "
-        "--evaluation-interval 1_000 --evaluation-episodes 4 --warmup-steps 2e3 --actor-hidden-sizes 8 9 "
+        "--evaluation-interval 1_000 --evaluation-episodes 4 --checkpoint-interval 5e3 --keep-checkpoints 0 --resume "
+        "--warmup-steps 2e3 --actor-hidden-sizes 8 9 "
         """--env-kwargs '{"ctrl_cost_weight": 0.5}'"""
     )
 
@@ -201,7 +202,11 @@ def test_train_passes_its_options_on(train_call):
         "groups": 2,
         "evaluation_interval": 1000,
         "evaluation_episodes": 4,
+        "checkpoint_interval": 5000,
+        "keep_checkpoints": 0,
+        "resume": True,
     }
+    assert call["start_from"] is None
 
 
 def test_train_without_options_uses_the_defaults(train_call):
@@ -210,6 +215,8 @@ def test_train_without_options_uses_the_defaults(train_call):
     assert call["algorithm"] == ALGORITHMS["csac"]()
     assert (call["steps"], call["seeds"], call["groups"], call["directory"]) == (1_000_000, 1, None, None)
     assert call["preset"] is None
+    assert (call["resume"], call["start_from"]) == (False, None)
+    assert (call["checkpoint_interval"], call["keep_checkpoints"]) == (50_000, 2)
 
 
 @pytest.mark.parametrize("name", sorted(ALGORITHMS))
@@ -254,7 +261,7 @@ def test_help_lists_the_commands(capsys):
     assert csac("--help") == 0
 
     output = capsys.readouterr().out
-    for command in ("train", "evaluate", "play", "runs"):
+    for command in ("train", "resume", "evaluate", "play", "runs"):
         assert output.count(f"csac {command} ") >= 2
 
 
@@ -394,7 +401,7 @@ def test_an_interrupted_run_says_what_to_type(monkeypatch, capsys, number, code)
     monkeypatch.setattr(training, "train", train)
 
     assert csac("train Hopper-v4") == code
-    assert capsys.readouterr().err.endswith("type: csac evaluate 'my run'\n")
+    assert capsys.readouterr().err.endswith("type: csac resume 'my run'\n")
 
 
 @pytest.mark.parametrize(
@@ -421,12 +428,14 @@ def test_a_signal_saves_what_was_learnt(tmp_path, number, groups):
     output, errors = process.communicate()
 
     assert process.returncode == 128 + number
-    told = f"csac: stopped by {number.name}; saved in run; to test what was learnt, type: csac evaluate run\n"
+    told = f"csac: stopped by {number.name}; saved in run; to go on, type: csac resume run\n"
     assert errors == told
     assert "stopped at step" in output
     assert "failed" not in output
     run = RunDirectory.open(tmp_path / "run")
     assert run.manifest["state"] == "interrupted"
+    assert run.manifest["steps_done"] >= 250
+    assert (run.path / "checkpoint" / f"step_{run.manifest['steps_done']}.json").exists()
     assert csac(f"evaluate {run.path} --episodes 1") == 0
 
 

@@ -116,7 +116,7 @@ def test_a_run_can_start_in_a_new_or_an_empty_directory(tmp_path):
 
 def test_a_directory_that_holds_a_run_is_refused_and_kept(run):
     before = (run.path / "manifest.json").read_bytes()
-    with pytest.raises(InputError, match=r"already holds a run; choose another directory"):
+    with pytest.raises(InputError, match=r"already holds a run; resume it, or choose another directory"):
         RunDirectory.create(run.path, {**MANIFEST, "task": "Ant-v4"})
     assert (run.path / "manifest.json").read_bytes() == before
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,14 +14,21 @@ import numpy as np
 from csac.record.tables import COLUMNS, append_rows, read_rows, structured
 from csac.types import InputError
 
+try:
+    import fcntl
+except ImportError:  # Windows: nothing keeps two processes apart there
+    fcntl = None
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
 __all__ = ["RunDirectory", "Table", "default_directory", "find_runs", "read_rows", "write_atomically"]
 
-Table = Literal["evaluations", "episodes", "metrics"]
+Table = Literal["episodes", "metrics", "evaluations"]
 
 SCHEMA_VERSION = 1
+GROWING_FILES = ("evaluations.csv", "episodes.csv", "metrics.csv", "log.txt")
+LOCK = ".lock"
 MANIFEST = "manifest.json"
 REQUIRED_FIELDS: dict[str, type] = {
     "task": str,
@@ -34,6 +41,10 @@ REQUIRED_FIELDS: dict[str, type] = {
     "history": list,
     "created": str,
 }
+
+
+class StorageFailure(RuntimeError):
+    """A run directory can no longer be written. The message says why, in one line."""
 
 
 class RunDirectory:
@@ -106,8 +117,54 @@ class RunDirectory:
         with open(self.path / "log.txt", "a", encoding="utf-8") as file:
             file.write(line.rstrip("\n") + "\n")
 
+    def sync(self) -> dict[str, int]:
+        """Push what was appended so far to the disk and return the size of each growing file in bytes."""
+        sizes = {}
+        for name in GROWING_FILES:
+            with suppress(FileNotFoundError), open(self.path / name, "rb") as file:
+                os.fsync(file.fileno())
+                sizes[name] = file.seek(0, os.SEEK_END)
+        return sizes
+
+    def cut_back(self, sizes: Mapping[str, int]) -> None:
+        """Undo what was appended after `sync` returned these sizes.
+
+        Raises InputError, and changes nothing, where a file is shorter than it was.
+        """
+        for name, size in sizes.items():
+            path = self.path / name
+            if not path.exists() or path.stat().st_size < size:
+                raise InputError(f"{path} has lost rows since the checkpoint: restore it from a copy")
+        for name in GROWING_FILES:
+            with suppress(FileNotFoundError):
+                os.truncate(self.path / name, sizes[name]) if name in sizes else (self.path / name).unlink()
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from writing to this run. The system gives the lock back if this process dies.
+
+        Raises InputError where another process holds it.
+        """
+        with open(self.path / LOCK, "a+") as file:
+            if fcntl:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    file.seek(0)
+                    holder = file.read().strip() or "unknown"
+                    raise InputError(f"{self.path} is in use by process {holder}: wait for it, or stop it") from None
+            file.truncate(0)
+            file.write(f"{os.getpid()}\n")
+            file.flush()
+            yield
+
     def _table(self, name: Table) -> Path:
         return self.path / f"{name}.csv"
+
+
+def is_run(path: str | Path) -> bool:
+    """Whether there is a run in this directory, sound or not."""
+    return (Path(path) / MANIFEST).exists()
 
 
 def find_runs(directory: str | Path) -> list[RunDirectory]:
@@ -173,7 +230,7 @@ def _claim(path: Path, manifest: dict[str, Any]) -> None:
 
 def _refuse_occupied(path: Path) -> None:
     if (path / MANIFEST).exists():
-        raise InputError(f"{path} already holds a run; choose another directory")
+        raise InputError(f"{path} already holds a run; resume it, or choose another directory")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path} is a file; choose another directory")
     if path.exists() and any(path.iterdir()):

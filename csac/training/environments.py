@@ -259,8 +259,8 @@ class SeedEnvironments:
         }
         return Snapshot(arrays, values)
 
-    def take_back(self, index: int, saved: Snapshot) -> None:
-        """Let the seed at this place go on from `save`; its episode starts anew where the snapshot is not exact.
+    def take_back(self, index: int, saved: Snapshot) -> bool:
+        """Let the seed at this place go on from `save`; return false where its episode had to start anew.
 
         A seed whose environment fails here is reported by the next `step`.
         """
@@ -280,6 +280,8 @@ class SeedEnvironments:
         else:
             self._begun[index] -= 1
             self._reset(index)
+            return False
+        return True
 
     @property
     def observations(self) -> np.ndarray:

@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
+import sys
+import time
 import traceback
 from contextlib import contextmanager
+from itertools import count
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from csac.training.loop import Ended, Progress, Settings, train_group
+from csac.training.loop import Ended, Event, Group, Progress, Saved, Settings, is_boundary
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
 
-    from csac.training.loop import Event
+    from csac.training.checkpoint import Checkpoints
+
+_PR_SET_PDEATHSIG = 1
 
 # More processes than this for each core only cost memory: the seeds of a larger run share processes.
 GROUPS_PER_CORE = 4
+
+
+# A checkpoint is made at least this often, whatever the interval in steps.
+SECONDS_BETWEEN_CHECKPOINTS = 600.0
+
+Order = Literal["save", "stop"] | list[int]  # to a worker: what to do, or the cores to take its next turn on
 
 
 class GroupCrashed(NamedTuple):
@@ -28,6 +40,22 @@ class GroupCrashed(NamedTuple):
 
     reason: str
     details: str
+
+
+class GroupRestarted(NamedTuple):
+    """A group's process died; another goes on from the newest checkpoint, at this step."""
+
+    reason: str
+    step: int
+
+
+class NotSaved(NamedTuple):
+    """A group could not write its files of a checkpoint."""
+
+    error: OSError
+
+
+Message = Event | GroupCrashed | GroupRestarted | NotSaved
 
 
 def usable_cores() -> list[int]:
@@ -55,19 +83,59 @@ def choose_groups(seeds: int, device: str) -> int:
 
 
 def run_groups(
-    settings: Settings, groups: Sequence[Sequence[int]], should_stop: Callable[[], bool]
-) -> Generator[tuple[int, Event | GroupCrashed], None, None]:
-    """Train every group and yield (group, event) as they come. A single group is trained in this process."""
+    settings: Settings,
+    groups: Sequence[Sequence[int]],
+    should_stop: Callable[[], bool],
+    checkpoints: Checkpoints | None = None,
+) -> Generator[tuple[int, Message], None, None]:
+    """Train every group and yield (group, what happened) as it comes. A single group is trained in this process.
+
+    All groups are saved at the same steps. Whoever takes the messages commits to `checkpoints`; here it is only read.
+    """
     if len(groups) == 1:
-        for event in train_group(settings, groups[0], should_stop):
-            yield 0, event
+        yield from ((0, event) for event in _run_here(settings, groups[0], should_stop))
         return
-    workers = [_Worker(settings, seeds) for seeds in groups]
+    scheduler = _Scheduler(settings, groups, should_stop, checkpoints)
     try:
-        yield from _Scheduler(workers, should_stop).run()
+        yield from scheduler.run()
     finally:
-        for worker in workers:
+        for worker in scheduler.workers:
             worker.kill()
+
+
+class _Timer:
+    """Says when a checkpoint is due by the clock."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self._began = time.monotonic()
+
+    def is_due(self) -> bool:
+        return time.monotonic() - self._began >= SECONDS_BETWEEN_CHECKPOINTS
+
+
+def _run_here(settings: Settings, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[Event]:
+    group, timer, saved = Group(settings, seeds), _Timer(), settings.begin
+    for event in group.run(should_stop):
+        over = isinstance(event, Ended) and group.environments.alive.any()
+        regular = isinstance(event, Progress) and (is_regular(settings, event.step) or timer.is_due())
+        if isinstance(event, Progress):
+            yield event
+        if settings.checkpoints and (over or regular) and group.step > saved:
+            saved = group.step
+            timer.reset()
+            yield group.save()
+        if not isinstance(event, Progress):
+            yield event
+    group.close()
+
+
+def is_regular(settings: Settings, step: int) -> bool:
+    """Whether there is a checkpoint at this step in any case."""
+    interval = settings.checkpoint_interval
+    return settings.checkpoints is not None and (step == settings.steps or bool(interval and step % interval == 0))
 
 
 class _Worker:
@@ -77,11 +145,18 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, settings, list(seeds)), daemon=True)
-        self.step, self.over = 0, False
+        self.begin = self.step = self.saved = settings.begin
+        self.seeds, self.over = seeds, False
         self.cores: list[int] | None = None
         with _worker_surroundings():
             self.process.start()
         theirs.close()
+
+    def tell(self, order: Order) -> None:
+        try:
+            self.connection.send(order)
+        except (BrokenPipeError, ConnectionResetError):
+            return  # its death is seen when we receive
 
     def kill(self) -> None:
         if self.process.is_alive():
@@ -94,75 +169,128 @@ class _Scheduler:
     """Hands sets of cores to the group that is furthest behind, a few hundred steps at a time.
 
     So five seeds on two cores all advance together and both cores are busy to the end, while nothing that a seed
-    computes depends on when its turn comes.
+    computes depends on when its turn comes. Between its turns a group can be saved: all of them are at the same steps,
+    the regular ones and a `target` that the clock or a request to stop sets.
     """
 
-    def __init__(self, workers: list[_Worker], should_stop: Callable[[], bool]) -> None:
-        self.workers, self.should_stop = workers, should_stop
+    def __init__(
+        self,
+        settings: Settings,
+        groups: Sequence[Sequence[int]],
+        should_stop: Callable[[], bool],
+        checkpoints: Checkpoints | None,
+    ) -> None:
+        self.settings, self.should_stop, self.checkpoints = settings, should_stop, checkpoints
+        self.workers = [_Worker(settings, seeds) for seeds in groups]
+        self.restarted: set[int] = set()
         cores = usable_cores()
-        sets = min(len(workers), len(cores))
+        sets = min(len(self.workers), len(cores))
         self.free = [cores[i::sets] for i in range(sets)]
-        self.waiting = list(workers)
-        self.stopping = False
+        self.waiting = list(self.workers)
+        self.stopping, self.target = False, -1
+        self.timer = _Timer()
 
-    def run(self) -> Generator[tuple[int, Event | GroupCrashed], None, None]:
+    def run(self) -> Generator[tuple[int, Message], None, None]:
         self._hand_out()
         while running := [worker for worker in self.workers if not worker.over]:
             if not self.stopping and self.should_stop():
-                self._stop(running)
+                self.stopping = True
+                self._set_target()
+            elif self.settings.checkpoints and self.timer.is_due():
+                self._set_target()
             ready = wait([worker.connection for worker in running], timeout=0.1)
             for index, worker in enumerate(self.workers):
                 if worker.connection in ready:
-                    yield index, self._receive(worker)
+                    yield index, self._receive(index, worker)
             self._hand_out()
 
-    def _receive(self, worker: _Worker) -> Event | GroupCrashed:
+    def _receive(self, index: int, worker: _Worker) -> Message:
         try:
-            event = worker.connection.recv()
+            message: Message = worker.connection.recv()
         except (EOFError, ConnectionResetError):
-            worker.process.join()
-            event = GroupCrashed(_cause_of_death(worker.process.exitcode), "")
-        worker.over = isinstance(event, Ended | GroupCrashed)
-        if worker.over or isinstance(event, Progress):
-            if worker.cores is not None:
-                self.free.append(worker.cores)
-                worker.cores = None
-            if isinstance(event, Progress):
-                worker.step = event.step
-                if not self.stopping:
-                    self.waiting.append(worker)
-        return event
+            return self._died(index, worker)
+        if isinstance(message, Progress):
+            worker.step = message.step
+            self._take_cores(worker)
+            self._next(worker)
+        elif isinstance(message, Saved):
+            worker.saved = message.step
+            self.timer.reset()
+            self._next(worker)
+        elif isinstance(message, Ended | GroupCrashed):
+            worker.over = True
+            self._take_cores(worker)
+        return message
+
+    def _died(self, index: int, worker: _Worker) -> Message:
+        """Let another process go on from the newest checkpoint, once."""
+        worker.kill()
+        self._take_cores(worker)
+        reason = _cause_of_death(worker.process.exitcode)
+        if index in self.restarted or self.stopping or not self.checkpoints:
+            worker.over = True
+            again = "for the second time, " if index in self.restarted else ""
+            return GroupCrashed(again + reason, "")
+        self.restarted.add(index)
+        begin = self.checkpoints.newest or 0
+        self.workers[index] = _Worker(self.settings._replace(begin=begin), worker.seeds)
+        self.waiting.append(self.workers[index])
+        return GroupRestarted(reason, begin)
+
+    def _next(self, worker: _Worker) -> None:
+        """Say what a group does that has just ended its turn or was saved."""
+        due = worker.step == self.target or is_regular(self.settings, worker.step)
+        if self.settings.checkpoints and due and worker.saved < worker.step:
+            worker.tell("save")
+        elif worker.step == self.settings.steps or (self.stopping and worker.step >= self.target):
+            worker.tell("stop")
+        else:
+            self.waiting.append(worker)
+
+    def _set_target(self) -> None:
+        """Choose the next step that every group passes as the one to be saved at, and to stop at if that is asked."""
+        self.timer.reset()
+        living = [worker for worker in self.workers if not worker.over]
+        if not self.settings.checkpoints or any(worker.step == worker.begin for worker in living):
+            self.target = -1  # a group that is still starting would keep the others waiting
+        else:
+            self.target = max(self._end_of_turn(worker) for worker in living)
+        waiting, self.waiting = self.waiting, []
+        for worker in waiting:
+            self._next(worker)
+
+    def _end_of_turn(self, worker: _Worker) -> int:
+        if worker.cores is None:
+            return worker.step
+        return next(step for step in count(worker.step + 1) if is_boundary(self.settings, step))
+
+    def _take_cores(self, worker: _Worker) -> None:
+        if worker.cores is not None:
+            self.free.append(worker.cores)
+            worker.cores = None
 
     def _hand_out(self) -> None:
         self.waiting.sort(key=lambda worker: worker.step, reverse=True)
         while self.free and self.waiting:
             worker = self.waiting.pop()
             worker.cores = self.free.pop(0)
-            _tell(worker, worker.cores)
-
-    def _stop(self, running: list[_Worker]) -> None:
-        """Ask every group to end; those that wait for cores finish on any."""
-        self.stopping, self.waiting = True, []
-        for worker in running:
-            _tell(worker, None)
-
-
-def _tell(worker: _Worker, cores: list[int] | None) -> None:
-    try:
-        worker.connection.send(cores)
-    except (BrokenPipeError, ConnectionResetError):
-        return  # its death is seen when we receive
+            worker.tell(worker.cores)
 
 
 def _work(connection: Connection, settings: Settings, seeds: list[int]) -> None:
     """Train one group in a process of its own, one turn at a time."""
+    _die_with_parent()
     turns = _Turns(connection)
     try:
-        turns.take()
-        for event in train_group(settings, seeds, turns.should_stop):
+        turns.take(None)
+        if turns.stopped:
+            connection.send(Ended(settings.begin, {}))
+            return
+        group = Group(settings, seeds)
+        for event in group.run(lambda: turns.stopped):
             connection.send(event)
-            if isinstance(event, Progress) and not turns.stopped:
-                turns.take()
+            if isinstance(event, Progress):
+                turns.take(group)
     except (BrokenPipeError, EOFError, ConnectionResetError):
         return  # the parent is gone, and with it whoever would write this down
     except Exception as error:
@@ -171,25 +299,42 @@ def _work(connection: Connection, settings: Settings, seeds: list[int]) -> None:
 
 
 class _Turns:
-    """A worker's view of the scheduler: the cores it may use now, and whether to stop."""
+    """A worker's view of the scheduler."""
 
     def __init__(self, connection: Connection) -> None:
         self.connection, self.stopped = connection, False
 
-    def take(self) -> None:
-        """Wait for a set of cores and move every thread of this process there."""
-        cores: list[int] | None = self.connection.recv()
-        if cores is None:
-            self.stopped = True
-        elif hasattr(os, "sched_setaffinity"):
-            for thread in os.listdir("/proc/self/task"):
-                os.sched_setaffinity(int(thread), cores)
+    def take(self, group: Group | None) -> None:
+        """Obey until it is this group's turn again, with every thread of this process on the cores given, or over."""
+        while not self.stopped:
+            order: Order = self.connection.recv()
+            if order == "stop":
+                self.stopped = True
+            elif order == "save":
+                assert group
+                self.connection.send(_saved(group))
+            else:
+                _move_to([int(core) for core in order])
+                return
 
-    def should_stop(self) -> bool:
-        """Return whether the parent has asked to stop; no other message comes during a turn."""
-        if not self.stopped and self.connection.poll():
-            self.stopped = self.connection.recv() is None
-        return self.stopped
+
+def _saved(group: Group) -> Saved | NotSaved:
+    try:
+        return group.save()
+    except OSError as error:
+        return NotSaved(error)
+
+
+def _move_to(cores: list[int]) -> None:
+    if hasattr(os, "sched_setaffinity"):
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setaffinity(int(thread), cores)
+
+
+def _die_with_parent() -> None:
+    """Ask Linux to kill this process with its parent, so that nobody writes into a run that another has taken over."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 @contextmanager

@@ -24,11 +24,18 @@ class TensorBoardLog:
 
     `rollout/ep_rew_mean` and `rollout/ep_len_mean` are means over the last 100 training episodes, `eval/mean_reward`,
     `eval/mean_ep_length` and `eval/success_rate` over one evaluation's episodes; `time/fps` is environment steps per
-    second of this seed since the log was made.
+    second of this seed since the log was made, for a run that goes on from step `begin` since then.
     """
 
-    def __init__(self, path: Path, seeds: Sequence[int], clock: Callable[[], float] = time.monotonic) -> None:
-        self._writers = {seed: SummaryWriter(str(path / f"seed_{seed}"), flush_secs=FLUSH_SECONDS) for seed in seeds}
+    def __init__(
+        self, path: Path, seeds: Sequence[int], begin: int = 0, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        purge = begin + 1 if begin else None  # what a run wrote after the step that it goes on from
+        self._writers = {
+            seed: SummaryWriter(str(path / f"seed_{seed}"), flush_secs=FLUSH_SECONDS, purge_step=purge)
+            for seed in seeds
+        }
+        self._begin = begin
         self._recent: dict[int, deque[tuple[float, int]]] = {seed: deque(maxlen=EPISODES_AVERAGED) for seed in seeds}
         self._clock, self._began = clock, clock()
 
@@ -46,7 +53,7 @@ class TensorBoardLog:
         for row in rows:
             values = {f"train/{name}": value for name, value in row.items() if name not in ("seed", "step")}
             if elapsed > 0:
-                values["time/fps"] = row["step"] / elapsed
+                values["time/fps"] = (row["step"] - self._begin) / elapsed
             self._write(row["seed"], row["step"], values)
 
     def evaluations(self, rows: Sequence[Row]) -> None:

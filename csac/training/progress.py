@@ -70,6 +70,16 @@ class Reporter:
             self._live = Live(get_renderable=self._display, console=self.console, refresh_per_second=2, transient=True)
             self._live.start()
 
+    def go_on(self, step: int, evaluations: np.ndarray, failures: Mapping[int, str]) -> None:
+        """Show what was there when the run was taken up again at `step`."""
+        self._failed = {seed: f"failed at {reason}" for seed, reason in failures.items()}
+        self._done.update(dict.fromkeys(self._done, step))
+        for at in np.unique(evaluations["step"]):
+            rows = evaluations[evaluations["step"] == at]
+            self._evaluated_at = int(at)
+            for seed in np.unique(rows["seed"]).tolist():
+                self._curves[seed].append(float(rows["return"][rows["seed"] == seed].mean()))
+
     def progress(self, steps_by_seed: Mapping[int, int]) -> None:
         """Note how far each seed is."""
         self._done.update(steps_by_seed)
@@ -91,6 +101,10 @@ class Reporter:
         """Show that a seed has stopped; the others go on."""
         self._failed[seed] = f"failed at step {step:,}: {reason}"
         self._print(Text(f"seed {seed} {self._failed[seed]}", "red"))
+
+    def note(self, text: str) -> None:
+        """Show one line about the run as a whole."""
+        self._print(Text(text, "dim"))
 
     def finish(self, run: RunDirectory) -> None:
         """Replace the display by the results, and say where they are and what to type next."""

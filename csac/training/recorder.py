@@ -3,27 +3,42 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from csac.training.groups import GroupCrashed
-from csac.training.loop import Ended, Evaluated, Failed, Progress, Rows
+from csac.record.run import Table
+from csac.training.checkpoint import facts_of, link
+from csac.training.groups import GroupCrashed, GroupRestarted, NotSaved
+from csac.training.loop import Ended, Evaluated, Failed, Noted, Progress, Rows, Saved
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
 
     from csac.deploy.policy import Policy
     from csac.record.run import RunDirectory
+    from csac.training.checkpoint import Checkpoints, Files
+    from csac.training.groups import Message
     from csac.training.logs import TensorBoardLog
-    from csac.training.loop import Event
     from csac.training.progress import Reporter
 
 OVER = np.iinfo(np.int64).max  # the step of a group that is over: it holds nobody back
 
 
 class Recorder:
-    """The only writer of a run directory. Rows wait until every group has passed their step, then go out in order."""
+    """The only writer of a run directory. Rows wait until every group has passed their step, then go out in order.
+
+    Args:
+        run: the run directory.
+        groups: the seeds of each group.
+        reporter: where progress is shown, or None.
+        tensorboard: where it is written as well, or None.
+        checkpoints: where checkpoints are committed, or None.
+        begin: the step that the run goes on from; 0 for a new run.
+        failures: the seeds that had failed by then, and how.
+    """
 
     def __init__(
         self,
@@ -31,33 +46,50 @@ class Recorder:
         groups: Sequence[Sequence[int]],
         reporter: Reporter | None,
         tensorboard: TensorBoardLog | None,
+        checkpoints: Checkpoints | None = None,
+        begin: int = 0,
+        failures: Mapping[int, str] = MappingProxyType({}),
     ) -> None:
         self.run, self.groups, self.reporter, self.tensorboard = run, groups, reporter, tensorboard
-        self.failures: dict[int, str] = {}
+        self.checkpoints = checkpoints
+        self.failures: dict[int, str] = dict(failures)
+        self._failed_at = dict.fromkeys(failures, begin)
+        self.inexact: set[int] = set()
         self.evaluated: list[tuple[int, dict[int, float]]] = []  # since the caller last emptied it
-        self._passed = [0] * len(groups)
-        self._steps = dict.fromkeys((seed for group in groups for seed in group), 0)
-        self._pending: dict[str, list[dict[str, Any]]] = defaultdict(list)
-        self._best: dict[int, float] = {}
+        self._passed = [begin] * len(groups)
+        self._received: list[dict[Table, int]] = [dict.fromkeys(get_args(Table), begin) for _ in groups]
+        self._steps = dict.fromkeys((seed for group in groups for seed in group), begin)
+        self._pending: dict[Table, list[dict[str, Any]]] = defaultdict(list)
+        self._saved: dict[int, dict[int, Files]] = defaultdict(dict)  # step -> group -> its files
+        self._best = _best_means(run.evaluations)
 
-    def handle(self, group: int, event: Event | GroupCrashed) -> None:
-        """Take one event of one group."""
-        match event:
+    def handle(self, group: int, message: Message) -> None:
+        """Take one message of one group."""
+        match message:
             case Rows(table, rows):
-                self._pending[table] += rows
+                self._take(group, table, rows)
             case Evaluated():
-                self._evaluated(event)
+                self._evaluated(group, message)
             case Failed():
-                self._failed(event)
+                self._failed(message)
             case Progress(step):
                 self._progress(group, step)
+            case Saved():
+                self._progress(group, message.step)
+                self._commit_when_whole(group, message)
             case Ended(step, policies):
                 self._progress(group, step)
                 self._save(policies)
                 self._passed[group] = OVER
                 self._flush()
             case GroupCrashed():
-                self._crashed(group, event)
+                self._crashed(group, message)
+            case GroupRestarted(reason, step):
+                self._note(f"{_seeds(self.groups[group])}: {reason}; started again from step {step:,}")
+            case Noted(text):
+                self._note(text)
+            case NotSaved(error):
+                raise error
 
     def close(self) -> None:
         """Write what still waits."""
@@ -65,15 +97,43 @@ class Recorder:
         self._flush()
         self.run.update_manifest(steps_done=max(self._steps.values()))
 
-    def _evaluated(self, event: Evaluated) -> None:
-        self._pending["evaluations"] += event.rows
+    def _take(self, group: int, table: Table, rows: list[dict[str, Any]]) -> None:
+        """Let rows wait for their turn, but for those that a restarted group makes for the second time."""
+        if not rows or rows[0]["step"] <= self._received[group][table]:
+            return
+        self._received[group][table] = rows[0]["step"]
+        self._pending[table] += rows
+
+    def _evaluated(self, group: int, event: Evaluated) -> None:
+        self._take(group, "evaluations", event.rows)
         self._save(event.policies)
         for seed, value in _mean_returns(event.rows).items():
             if value > self._best.get(seed, -np.inf):
                 self._best[seed] = value
-                event.policies[seed].save(self.run.path / "policy" / f"seed_{seed}.best.safetensors")
+                event.policies[seed].save(self._policy_file(seed, ".best"))
+
+    def _commit_when_whole(self, group: int, event: Saved) -> None:
+        """Keep a group's best policies with its files; with the last living group's files there is a checkpoint."""
+        assert self.checkpoints
+        files = dict(event.files)
+        for seed in self.groups[group]:
+            if self._policy_file(seed, ".best").exists():
+                name = f"step_{event.step}.seed_{seed}.best.safetensors"
+                link(self._policy_file(seed, ".best"), self.checkpoints.folder / name)
+                files[name] = facts_of(self.checkpoints.folder / name)
+        self.inexact.update(event.inexact)
+        self._saved[event.step][group] = files
+        if all(group in self._saved[event.step] for group in range(len(self.groups)) if self._passed[group] < OVER):
+            self._flush()
+            files = {name: facts for part in self._saved.pop(event.step).values() for name, facts in part.items()}
+            failures = {seed: text for seed, text in self.failures.items() if self._failed_at[seed] <= event.step}
+            values = {"sizes": self.run.sync(), "failures": failures, "groups": self.groups}
+            self.checkpoints.commit(event.step, files, values)
+            self.run.update_manifest(steps_done=event.step, inexact_seeds=sorted(self.inexact))
 
     def _failed(self, event: Failed) -> None:
+        if event.seed in self.failures:
+            return  # a restarted group meets the same failure again
         if event.policy is not None:
             self._save({event.seed: event.policy})
         self._note_failure(event.seed, event.step, event.reason, event.details)
@@ -85,14 +145,19 @@ class Recorder:
         self._flush()
 
     def _note_failure(self, seed: int, step: int, reason: str, details: str) -> None:
-        self.failures[seed] = f"step {step}: {reason}"
+        self.failures[seed], self._failed_at[seed] = f"step {step}: {reason}", step
         self.run.log(f"seed {seed} stopped at step {step}: {reason}\n{details}".rstrip())
         self.run.update_manifest(failures=self.failures)
         if self.reporter:
             self.reporter.failed(seed, step, reason)
 
+    def _note(self, text: str) -> None:
+        self.run.log(text)
+        if self.reporter:
+            self.reporter.note(text)
+
     def _progress(self, group: int, step: int) -> None:
-        self._passed[group] = step
+        self._passed[group] = max(step, self._passed[group])
         self._steps.update({seed: step for seed in self.groups[group] if seed not in self.failures})
         self._flush()
         if self.reporter:
@@ -104,12 +169,15 @@ class Recorder:
             if not contract.exists():
                 contract.parent.mkdir(exist_ok=True)
                 policy.contract.save(contract)
-            policy.save(self.run.path / "policy" / f"seed_{seed}.safetensors")
+            policy.save(self._policy_file(seed))
+
+    def _policy_file(self, seed: int, kind: str = "") -> Path:
+        return self.run.path / "policy" / f"seed_{seed}{kind}.safetensors"
 
     def _flush(self) -> None:
         """Write the rows that no group can precede any more."""
         limit = min(self._passed)
-        for table in ("episodes", "metrics", "evaluations"):
+        for table in get_args(Table):
             waiting = self._pending[table]
             ready = [row for row in waiting if row["step"] <= limit]
             if not ready:
@@ -133,8 +201,21 @@ class Recorder:
                 self.reporter.evaluated(step, returns)
 
 
-def _mean_returns(rows: list[dict[str, Any]]) -> dict[int, float]:
+def _best_means(evaluations: np.ndarray) -> dict[int, float]:
+    """Return each seed's best mean return so far."""
+    best: dict[int, float] = {}
+    for step in np.unique(evaluations["step"]):
+        for seed, value in _mean_returns(evaluations[evaluations["step"] == step]).items():
+            best[seed] = max(value, best.get(seed, -np.inf))
+    return best
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
+
+
+def _mean_returns(rows: Iterable[Any]) -> dict[int, float]:
     returns: dict[int, list[float]] = defaultdict(list)
     for row in rows:
-        returns[row["seed"]].append(row["return"])
+        returns[int(row["seed"])].append(float(row["return"]))
     return {seed: float(np.mean(values)) for seed, values in returns.items()}

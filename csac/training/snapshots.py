@@ -26,6 +26,12 @@ class Snapshot(NamedTuple):
     arrays: dict[str, np.ndarray]
     values: dict[str, Any]
 
+    def part(self, name: str) -> Snapshot:
+        """Return what was saved under this name: arrays called `name.<their name>`, and one of the values."""
+        prefix = f"{name}."
+        arrays = {key.removeprefix(prefix): array for key, array in self.arrays.items() if key.startswith(prefix)}
+        return Snapshot(arrays, self.values[name])
+
 
 def snapshot(environment: gymnasium.Env) -> Snapshot | None:
     """Return the episode in progress, or None where it cannot be had whole."""

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import pickle
 import platform
 import signal
 import subprocess
 import threading
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import psutil
 
 from csac import __version__
 from csac.record.plots import learning_curve
-from csac.record.run import RunDirectory, default_directory
+from csac.record.run import RunDirectory, StorageFailure, default_directory, is_run
+from csac.training.checkpoint import FOLDER, Checkpoints
 from csac.training.environments import Environment, Task
 from csac.training.groups import choose_groups, run_groups, split_seeds
 from csac.training.logs import TensorBoardLog
 from csac.training.loop import Settings
 from csac.training.recorder import Recorder
+from csac.training.resume import Source, algorithm_of, arguments_of, refuse_differences, roll_back
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -38,6 +41,18 @@ if TYPE_CHECKING:
 
 # Measured resident size of a worker process with JAX, MuJoCo and the compiled programs, before its replay.
 BYTES_PER_PROCESS = 600 * 2**20
+
+
+_CANNOT_WRITE = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOENT,
+    errno.EIO,
+    errno.EFBIG,
+)
 
 
 class Interrupted(Exception):
@@ -61,6 +76,10 @@ def train(
     evaluation_episodes: int = 10,
     environment_arguments: dict[str, Any] | None = None,
     device: str = "cpu",
+    checkpoint_interval: int = 50_000,
+    keep_checkpoints: int = 2,
+    resume: bool = False,
+    start_from: str | Path | None = None,
     preset: str | None = None,
     tensorboard: bool = True,
     reporter: Reporter | None = None,
@@ -83,6 +102,11 @@ def train(
         evaluation_episodes: episodes of each evaluation.
         environment_arguments: keyword arguments for the environment.
         device: "cpu" or "gpu".
+        checkpoint_interval: environment steps between checkpoints; there is one every ten minutes, at the last step and
+            when a signal stops the run as well. 0 makes none.
+        keep_checkpoints: how many of the newest checkpoints to keep; 0 keeps all.
+        resume: go on with the run in `directory`, where there is one, from its newest checkpoint.
+        start_from: `DIRECTORY` or `DIRECTORY@STEP` of a run: begin with a copy of its checkpoint of that step.
         preset: the name of the preset that the hyperparameters came from, for the manifest.
         tensorboard: whether to write TensorBoard files.
         reporter: where progress is shown; None is silent.
@@ -93,24 +117,35 @@ def train(
     Raises:
         InputError: a mistake in the arguments; nothing has been written then.
         Interrupted: on SIGINT or SIGTERM, after everything was saved.
+        StorageFailure: the run directory can no longer be written; it is as sound as if the run had been killed.
     """
     environment_arguments = dict(environment_arguments or {})
     _check(steps=steps, seeds=seeds, evaluation_interval=evaluation_interval, evaluation_episodes=evaluation_episodes)
-    if first_seed < 0:
-        raise InputError(f"first_seed must be 0 or more, not {first_seed}")
+    _check_not_negative(
+        first_seed=first_seed, checkpoint_interval=checkpoint_interval, keep_checkpoints=keep_checkpoints
+    )
     _choose_device(device)
     environment = Environment(task, environment_arguments)
     spec, task_name = environment.spec, environment.task_name
     environment.close()
 
+    path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
     labels = list(range(first_seed, first_seed + seeds))
-    parts = split_seeds(labels, groups if groups is not None else choose_groups(seeds, device))
-    settings = Settings(algorithm, task, environment_arguments, steps, evaluation_interval, evaluation_episodes)
+    existing = RunDirectory.open(path) if resume and is_run(path) else None
+    parts = split_seeds(labels, _choose_number_of_groups(groups, labels, device, existing))
+    settings = Settings(
+        algorithm,
+        task,
+        environment_arguments,
+        steps,
+        evaluation_interval,
+        evaluation_episodes,
+        (path / FOLDER).absolute() if checkpoint_interval else None,
+        checkpoint_interval,
+    )
     if len(parts) > 1:
         _check_picklable(settings)
     notes = [_memory_note(algorithm, spec, steps, seeds, len(parts)), *_warmup_note(algorithm, steps)]
-
-    path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
     manifest = {
         "task": task_name,
         "task_is_callable": not isinstance(task, str),
@@ -122,6 +157,7 @@ def train(
         "groups": parts,
         "steps": steps,
         "evaluation": {"interval": evaluation_interval, "episodes": evaluation_episodes},
+        "checkpoints": {"interval": checkpoint_interval, "keep": keep_checkpoints},
         "device": device,
         "machine": {"processor": _processor(), "cores": os.cpu_count(), "host": platform.node()},
         "versions": _versions(),
@@ -129,24 +165,118 @@ def train(
         "command": command,
         "process": os.getpid(),
     }
+    watchers = _Watchers(reporter, tensorboard, on_evaluation, stop_when)
+    if existing:
+        refuse_differences(existing, manifest, algorithm)
+        with existing.locked():
+            return _go_on(existing, settings, manifest, notes, watchers)
+    if start_from is not None:
+        source = Source.find(start_from)
+        source.refuse_misfit(manifest, algorithm, spec)
+        run = RunDirectory.create(path, {**manifest, "forked_from": source.described(manifest)})
+        with run.locked():
+            source.copy_to(run, keep_checkpoints)
+            return _go_on(run, settings, manifest, notes, watchers)
     run = RunDirectory.create(path, manifest)
+    with run.locked():
+        return _run(run, settings, notes, watchers, {})
+
+
+def resume(
+    directory: str | Path,
+    *,
+    steps: int | None = None,
+    reporter: Reporter | None = None,
+    command: str | None = None,
+    on_evaluation: OnEvaluation | None = None,
+    stop_when: StopWhen | None = None,
+) -> RunDirectory:
+    """Go on with a run from its newest checkpoint; everything but a larger number of `steps` comes from its manifest.
+
+    Raises:
+        InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
+            call `train` with it and `resume=True` then.
+        Interrupted: as `train`.
+        StorageFailure: as `train`.
+    """
+    run = RunDirectory.open(directory)
+    return train(
+        algorithm_of(run.manifest),
+        **arguments_of(run),
+        steps=run.manifest["steps"] if steps is None else steps,
+        directory=directory,
+        groups=None,
+        resume=True,
+        tensorboard=(run.path / "tensorboard").exists(),
+        reporter=reporter,
+        command=command,
+        on_evaluation=on_evaluation,
+        stop_when=stop_when,
+    )
+
+
+class _Watchers(NamedTuple):
+    """Who is told what happens, beside the run directory."""
+
+    reporter: Reporter | None
+    tensorboard: bool
+    on_evaluation: OnEvaluation | None
+    stop_when: StopWhen | None
+
+
+def _go_on(
+    run: RunDirectory, settings: Settings, manifest: dict[str, Any], notes: list[str], watchers: _Watchers
+) -> RunDirectory:
+    """Go on with a run from its newest sound checkpoint."""
+    point = roll_back(run)
+    if point.step >= settings.steps:
+        if watchers.reporter:
+            watchers.reporter.note(f"{run.path} has made its {settings.steps:,} steps already; more: --steps")
+        return run
+    history = [*run.manifest["history"], point.history_entry(run.manifest, manifest)]
+    current = {
+        name: manifest[name] for name in ("machine", "versions", "groups", "steps", "process", "device", "checkpoints")
+    }
+    notes = [*notes, *point.notes(run.manifest, manifest)]
+    run.update_manifest(**current, state="running", history=history, failures=point.failures, steps_done=point.step)
+    return _run(run, settings._replace(begin=point.step), notes, watchers, point.failures)
+
+
+def _run(
+    run: RunDirectory, settings: Settings, notes: list[str], watchers: _Watchers, failures: dict[int, str]
+) -> RunDirectory:
+    """Train until the last step, a signal or a failure, and write down what happens."""
+    reporter, labels, begin = watchers.reporter, run.manifest["seeds"], settings.begin
+    groups = [group for group in run.manifest["groups"] if not set(group) <= set(failures)]
     if reporter:
-        reporter.start(task_name, algorithm.name, labels, steps, path, notes)
-    log = TensorBoardLog(path / "tensorboard", labels) if tensorboard else None
-    recorder = Recorder(run, parts, reporter, log)
+        reporter.start(run.manifest["task"], run.manifest["algorithm"], labels, settings.steps, run.path, notes)
+        reporter.go_on(begin, run.evaluations, failures)
+    log = TensorBoardLog(run.path / "tensorboard", labels, begin) if watchers.tensorboard else None
+    checkpoints = (
+        Checkpoints(settings.checkpoints, run.manifest["checkpoints"]["keep"]) if settings.checkpoints else None
+    )
+    recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures)
+    received, told = [], False
     try:
-        with _signals() as (stop, received), closing(run_groups(settings, parts, stop.is_set)) as events:
-            for group, event in events:
-                recorder.handle(group, event)
-                if _tell_caller(recorder, on_evaluation, stop_when):
+        with (
+            _signals() as (stop, received),
+            closing(run_groups(settings, groups, stop.is_set, checkpoints)) as messages,
+        ):
+            for group, message in messages:
+                if received and reporter and not told:
+                    told = True
+                    reporter.note("stopping at the next step where all can be saved; once more to leave at once")
+                recorder.handle(group, message)
+                if _tell_caller(recorder, watchers.on_evaluation, watchers.stop_when):
                     stop.set()
         recorder.close()
         _finish(run, recorder, "interrupted" if received else "failed" if recorder.failures else "finished")
         if reporter:
             reporter.finish(run)
     except BaseException as error:
-        recorder.close()
-        run.update_manifest(state="interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+        _leave(run, recorder, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+        if isinstance(error, OSError) and error.errno in _CANNOT_WRITE:
+            raise StorageFailure(f"{run.path} cannot be written: {error.strerror}") from error
         raise
     finally:
         if log:
@@ -156,6 +286,21 @@ def train(
     if received:
         raise Interrupted(run, received[0])
     return run
+
+
+def _leave(run: RunDirectory, recorder: Recorder, state: str) -> None:
+    """Write what can still be written of a run that ends with an error."""
+    with suppress(OSError):
+        recorder.close()
+        run.update_manifest(state=state)
+
+
+def _choose_number_of_groups(groups: int | None, labels: list[int], device: str, existing: RunDirectory | None) -> int:
+    if groups is not None:
+        return groups
+    if existing and existing.manifest["seeds"] == labels:
+        return len(existing.manifest["groups"])  # so that the numbers stay the same to the last bit
+    return choose_groups(len(labels), device)
 
 
 def _tell_caller(recorder: Recorder, on_evaluation: OnEvaluation | None, stop_when: StopWhen | None) -> bool:
@@ -208,6 +353,12 @@ def _check(**counts: int) -> None:
     for name, count in counts.items():
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise InputError(f"{name} must be a whole number of at least 1, not {count!r}")
+
+
+def _check_not_negative(**counts: int) -> None:
+    for name, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+            raise InputError(f"{name} must be a whole number of 0 or more, not {count!r}")
 
 
 def _check_picklable(settings: Settings) -> None:

@@ -1,0 +1,238 @@
+"""Going on with a run, or beginning another from its checkpoint: what fits, what has changed, what is undone."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from csac.algorithms import ALGORITHMS
+from csac.record.run import GROWING_FILES, RunDirectory
+from csac.training.checkpoint import FOLDER, Checkpoint, Checkpoints, link, newest_sound, sound_at
+from csac.training.learner import misfit
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from csac.types import Algorithm, Spec
+
+# What a run cannot change: with any other value it would be another run.
+_FIXED = ("task", "environment_arguments", "algorithm", "hyperparameters", "seeds", "evaluation")
+
+
+class Point(NamedTuple):
+    """Where a run goes on: the step of its checkpoint (0 is its beginning), and who had failed by then."""
+
+    step: int
+    failures: dict[int, str]
+    complaints: list[str]  # what was wrong with newer checkpoints
+
+    def notes(self, before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+        """Return what the user should know of this continuation, a line each."""
+        lines = [f"warning: {complaint}; an earlier checkpoint is used" for complaint in self.complaints]
+        lines.append(f"going on from step {self.step:,}" if self.step else "no checkpoint yet: it begins anew")
+        if changes := _machine_changes(before, now):
+            lines.append(f"note: not the same to the last bit from here on, because {' and '.join(changes)}")
+        if inexact := before.get("inexact_seeds"):
+            seeds = ", ".join(map(str, inexact))
+            lines.append(f"note: this task cannot be saved in mid-episode: seeds {seeds} begin their episode anew")
+        return lines
+
+    def history_entry(self, before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+        """Return what the manifest remembers of this continuation."""
+        moment = datetime.now().astimezone().isoformat(timespec="seconds")
+        exact = not (_machine_changes(before, now) or before.get("inexact_seeds"))
+        previous = {name: before[name] for name in ("steps", "machine", "versions", "groups") if name in before}
+        return {
+            "resumed": moment,
+            "step": self.step,
+            "exact": exact,
+            "complaints": self.complaints,
+            "command": now["command"],
+            "previous": previous,
+        }
+
+
+def refuse_differences(run: RunDirectory, wanted: dict[str, Any], algorithm: Algorithm) -> None:
+    """Raise InputError, with what differs, where `wanted` is not a continuation of `run`."""
+    plain = run.manifest
+    differences = _differences({name: plain.get(name) for name in _FIXED}, {name: wanted[name] for name in _FIXED})
+    if differences:
+        raise InputError(f"{run.path} was trained otherwise: {'; '.join(differences)}. Choose another directory")
+    before, now = plain["steps"], wanted["steps"]
+    if now < before:
+        raise InputError(f"{run.path} is a run of {before:,} steps, which {now:,} would shorten: give at least as many")
+    if now > before and algorithm.has_schedule:
+        raise InputError(
+            f"{run.path} cannot go on beyond its {before:,} steps: its learning rate was planned for them (a schedule)"
+        )
+
+
+def roll_back(run: RunDirectory) -> Point:
+    """Bring a run's files back to its newest sound checkpoint, or to its beginning, and say where that is.
+
+    Raises:
+        InputError: rows are missing that the checkpoint counts on, or all its checkpoints are damaged.
+    """
+    folder = run.path / FOLDER
+    checkpoint, complaints = newest_sound(folder)
+    if checkpoint is None and complaints:
+        raise InputError(f"no checkpoint of {run.path} is sound: {'; '.join(complaints)}")
+    step = checkpoint.step if checkpoint else 0
+    run.cut_back(checkpoint.values["sizes"] if checkpoint else {})
+    for unfinished in [*run.path.glob(".*.*"), *run.path.glob("policy/*.tmp")]:
+        unfinished.unlink()
+    _restore_best_policies(run, checkpoint)
+    if folder.exists():
+        Checkpoints(folder, run.manifest.get("checkpoints", {}).get("keep", 0)).discard_after(step)
+    failures = checkpoint.values["failures"] if checkpoint else {}
+    return Point(step, {int(seed): reason for seed, reason in failures.items()}, complaints)
+
+
+def algorithm_of(manifest: dict[str, Any]) -> Algorithm:
+    """Return the algorithm of a run with its hyperparameters. Raises InputError where this csac does not know them."""
+    name = manifest["algorithm"]
+    if name not in ALGORITHMS:
+        raise InputError(f"the run's algorithm {name!r} is not known: choose a run of {' or '.join(ALGORITHMS)}")
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in manifest.get("hyperparameters", {}).items()}
+    unknown = values.keys() - {field.name for field in dataclasses.fields(ALGORITHMS[name])}
+    if unknown:
+        raise InputError(f"the run has hyperparameters that this csac does not know: {', '.join(sorted(unknown))}")
+    make: Any = ALGORITHMS[name]
+    return make(**values)
+
+
+def arguments_of(run: RunDirectory) -> dict[str, Any]:
+    """Return the arguments of `train` that a run was started with, as far as they belong to what it computes.
+
+    Raises:
+        InputError: the manifest does not have them, or its task is a Python function.
+    """
+    manifest = run.manifest
+    if manifest.get("task_is_callable"):
+        raise InputError(
+            f"the task of {run.path} is a Python function: call csac.train with it, this directory and resume=True"
+        )
+    try:
+        return {
+            "task": manifest["task"],
+            "seeds": len(manifest["seeds"]),
+            "first_seed": manifest["seeds"][0],
+            "evaluation_interval": manifest["evaluation"]["interval"],
+            "evaluation_episodes": manifest["evaluation"]["episodes"],
+            "environment_arguments": manifest["environment_arguments"],
+            "device": manifest["device"],
+            "checkpoint_interval": manifest["checkpoints"]["interval"],
+            "keep_checkpoints": manifest["checkpoints"]["keep"],
+        }
+    except (KeyError, IndexError, TypeError) as error:
+        raise InputError(f"{run.path / 'manifest.json'} does not say how to go on ({error!r})") from None
+
+
+class Source(NamedTuple):
+    """A checkpoint of a run that another run begins with."""
+
+    run: RunDirectory
+    checkpoint: Checkpoint
+
+    @classmethod
+    def find(cls, where: str | Path) -> Source:
+        """Return the checkpoint at `DIRECTORY` (its newest sound one) or `DIRECTORY@STEP`.
+
+        Raises:
+            InputError: no such run or checkpoint, or a damaged one.
+        """
+        name, at, step = str(where).rpartition("@")
+        if not at or Path(where).exists():
+            name, step = str(where), ""
+        run = RunDirectory.open(name)
+        if step and not step.replace("_", "").isdigit():
+            raise InputError(f"{where}: {step!r} is not a step; write DIRECTORY@STEP")
+        if step:
+            return cls(run, sound_at(run.path / FOLDER, int(step)))
+        checkpoint, complaints = newest_sound(run.path / FOLDER)
+        if checkpoint is None:
+            raise InputError("; ".join(complaints) or f"{run.path} has no checkpoint yet")
+        return cls(run, checkpoint)
+
+    def refuse_misfit(self, wanted: dict[str, Any], algorithm: Algorithm, spec: Spec) -> None:
+        """Raise InputError where the new run cannot begin with this checkpoint."""
+        before = self.run.manifest
+        differences = _differences({"algorithm": before["algorithm"]}, {"algorithm": wanted["algorithm"]})
+        missing = sorted(set(wanted["seeds"]) - set(before["seeds"]))
+        if missing:
+            differences.append(f"it has no seeds {', '.join(map(str, missing))}")
+        if not differences:
+            saved = self.checkpoint.seed(wanted["seeds"][0]).part("learner")
+            differences += filter(None, [misfit(algorithm, spec, wanted["steps"], saved)])
+        if differences:
+            raise InputError(f"{self.run.path} does not fit: {'; '.join(differences)}")
+        if wanted["steps"] <= self.checkpoint.step:
+            raise InputError(
+                f"steps counts from the beginning: give more than the {self.checkpoint.step:,} made already"
+            )
+        if algorithm.has_schedule and wanted["steps"] != before["steps"]:
+            raise InputError(
+                f"{self.run.path} was planned for {before['steps']:,} steps, and its learning rate with it "
+                "(a schedule): give as many"
+            )
+
+    def described(self, wanted: dict[str, Any]) -> dict[str, Any]:
+        """Return what the manifest says of where the new run began, and of what is different in it."""
+        before = {name: self.run.manifest.get(name) for name in _FIXED}
+        changes = _differences(before, {name: wanted[name] for name in _FIXED})
+        return {"directory": str(self.run.path), "step": self.checkpoint.step, "changes": changes}
+
+    def copy_to(self, run: RunDirectory, keep: int) -> None:
+        """Give a new run the tables up to the checkpoint, and the checkpoint."""
+        sizes = {name: size for name, size in self.checkpoint.values["sizes"].items() if name in GROWING_FILES}
+        for name, size in sizes.items():
+            with open(self.run.path / name, "rb") as source, open(run.path / name, "wb") as target:
+                target.write(source.read(size))
+        for name in self.checkpoint.files:
+            link(self.checkpoint.folder / name, run.path / FOLDER / name)
+        if (self.run.path / "policy" / "contract.json").exists():
+            (run.path / "policy").mkdir()
+            shutil.copyfile(self.run.path / "policy" / "contract.json", run.path / "policy" / "contract.json")
+        values = {**self.checkpoint.values, "sizes": sizes}
+        Checkpoints(run.path / FOLDER, keep).commit(self.checkpoint.step, self.checkpoint.files, values)
+
+
+def _restore_best_policies(run: RunDirectory, checkpoint: Checkpoint | None) -> None:
+    """Undo what later evaluations found best."""
+    for path in run.path.glob("policy/seed_*.best.safetensors"):
+        path.unlink()
+    for name in checkpoint.files if checkpoint else ():
+        if name.endswith(".best.safetensors"):
+            assert checkpoint
+            link(checkpoint.folder / name, run.path / "policy" / name.partition(".")[2])
+
+
+def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
+    """Return "name is X, not Y" for each value that differs, in nested dicts too."""
+    lines = []
+    for name in sorted(before.keys() | now.keys()):
+        old, new = _plain(before.get(name)), _plain(now.get(name))
+        if isinstance(old, dict) and isinstance(new, dict):
+            lines += _differences(old, new, f"{name}." if name == "evaluation" else "")
+        elif old != new:
+            lines.append(f"{prefix}{name} is {old!r}, not {new!r}")
+    return lines
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _machine_changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """Return what decides the last bits and is not what it was."""
+    pairs = {
+        "processor": (before.get("machine", {}).get("processor"), now["machine"]["processor"]),
+        "number of cores": (before.get("machine", {}).get("cores"), now["machine"]["cores"]),
+        "grouping of the seeds": (before.get("groups"), now["groups"]),
+        "device": (before.get("device"), now["device"]),
+    }
+    for package in ("jaxlib", "jax", "mujoco", "gymnasium", "numpy", "optax"):
+        pairs[package] = (before.get("versions", {}).get(package), now["versions"].get(package))
+    return [f"the {name} was {old} and is {new}" for name, (old, new) in pairs.items() if old != new]

@@ -1,0 +1,358 @@
+"""A run that was stopped and taken up again is the run that was not, bit for bit; what cannot go on is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import probes
+import pytest
+import trainer  # noqa: F401  (its cache of compiled programs)
+
+from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
+from csac.record.run import RunDirectory
+from csac.training import loop
+from csac.training.checkpoint import Checkpoints, newest_sound, steps_in
+from csac.training.groups import run_groups
+from csac.training.train import resume, train
+from csac.types import InputError
+
+SMALL: dict[str, Any] = {
+    "actor_hidden_sizes": (8, 8),
+    "critic_hidden_sizes": (8, 8),
+    "batch_size": 8,
+    "warmup_steps": 40,
+    "replay_size": 150,
+}
+ROLLOUT = PPO(rollout_steps=64, minibatches=4, epochs=2, hidden_sizes=(8, 8), learning_rate_schedule="constant")
+LEARNERS = [
+    CSAC(reference_period=30, **SMALL),
+    SAC(**SMALL),
+    TD3(**SMALL),
+    SD3(noise_samples=4, **SMALL),
+    ROLLOUT,
+]
+SHORT: dict[str, Any] = {"evaluation_interval": 100, "evaluation_episodes": 2, "tensorboard": False}
+
+
+def group(folder: Path, algorithm, seeds, steps: int, begin: int = 0, task: Any = "Hopper-v4") -> loop.Group:
+    return loop.Group(loop.Settings(algorithm, task, {}, steps, 1000, 1, folder, 0, begin), seeds)
+
+
+def advance(group: loop.Group, until: int) -> list[loop.Event]:
+    return [event for event in group.run(lambda: group.step == until) if not isinstance(event, loop.Ended)]
+
+
+def everything(group: loop.Group) -> list[np.ndarray]:
+    """What a group has learnt, remembers and does next."""
+    leaves = jax.tree.leaves(group.learner._carry)
+    return [np.asarray(leaf) for leaf in leaves] + [group._actions, group._observations, group.learner._waiting]
+
+
+@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda algorithm: algorithm.name)
+@pytest.mark.parametrize("seeds", [(3,), (0, 4)], ids=["alone", "together"])
+def test_a_group_goes_on_bit_for_bit(tmp_path, algorithm, seeds):
+    whole = group(tmp_path, algorithm, seeds, 400)
+    advance(whole, 90)
+    whole.save()  # transitions are written in two parts, and some of the first are overwritten in the ring of 150
+    advance(whole, 230)
+    checkpoints = Checkpoints(tmp_path, 2)
+    checkpoints.commit(230, whole.save().files, {})
+    after = advance(whole, 330)
+
+    again = group(tmp_path, algorithm, seeds, 400, begin=230)
+    assert advance(again, 330) == after
+    for ours, theirs in zip(everything(again), everything(whole), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_grown_run_equals_one_that_was_long_from_the_start(tmp_path):
+    """The replay of a short run is shorter; what was drawn from it does not depend on that."""
+    algorithm = replace(LEARNERS[0], replay_size=1000)
+    short = group(tmp_path, algorithm, (1,), 200)
+    advance(short, 200)
+    Checkpoints(tmp_path, 2).commit(200, short.save().files, {})
+    grown, long = group(tmp_path, algorithm, (1,), 300, begin=200), group(tmp_path / "long", algorithm, (1,), 300)
+    advance(grown, 299)
+    advance(long, 299)
+    for ours, theirs in zip(everything(grown), everything(long), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_seeds_may_be_grouped_otherwise(tmp_path):
+    together = group(tmp_path, LEARNERS[0], (0, 4), 300)
+    advance(together, 150)
+    Checkpoints(tmp_path, 2).commit(150, together.save().files, {})
+    alone = group(tmp_path, LEARNERS[0], (4,), 300, begin=150)
+    advance(together, 170)
+    advance(alone, 170)
+    ours = jax.tree.leaves(alone.learner._carry[0])
+    theirs = [leaf[1] for leaf in jax.tree.leaves(together.learner._carry[0])]
+    for our, their in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(our, their, rtol=1e-3, atol=1e-5)
+
+
+# Whole runs.
+
+FILES = ("evaluations.csv", "episodes.csv", "metrics.csv", "log.txt", "policy/seed_0.safetensors")
+
+
+def run(directory: Path, algorithm=LEARNERS[0], steps: int = 500, task: Any = "Hopper-v4", **settings: Any):
+    settings = {"checkpoint_interval": 120, **SHORT, **settings}
+    return train(algorithm, task, steps=steps, directory=directory, **settings)
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    """The files that an uninterrupted run would have too."""
+    files = [*FILES, *(path.relative_to(directory).as_posix() for path in directory.glob("policy/*"))]
+    return {name: (directory / name).read_bytes() for name in files if (directory / name).exists()}
+
+
+class Crash(Exception):
+    pass
+
+
+def crash_at(step: int):
+    def on_evaluation(evaluated: int, _: Any) -> None:
+        if evaluated >= step:
+            raise Crash
+
+    return on_evaluation
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "run"
+    run(path)
+    return contents(path)
+
+
+def test_a_crashed_run_goes_on_and_leaves_the_same_files(tmp_path, uninterrupted):
+    with pytest.raises(Crash):
+        run(tmp_path / "run", on_evaluation=crash_at(300))
+    assert len(contents(tmp_path / "run")["evaluations.csv"]) > 0
+    finished = resume(tmp_path / "run")
+    assert contents(tmp_path / "run") == uninterrupted
+    assert finished.manifest["state"] == "finished"
+    (entry,) = finished.manifest["history"]
+    assert (entry["step"], entry["exact"], entry["complaints"]) == (240, True, [])
+
+
+def test_the_same_call_again_with_resume_goes_on(tmp_path, uninterrupted):
+    for _ in range(2):
+        with pytest.raises(Crash):
+            run(tmp_path / "run", on_evaluation=crash_at(200), resume=True)
+    run(tmp_path / "run", resume=True)
+    assert contents(tmp_path / "run") == uninterrupted
+
+
+def test_a_run_that_crashed_before_its_first_checkpoint_begins_anew(tmp_path, uninterrupted):
+    with pytest.raises(Crash):
+        run(tmp_path / "run", on_evaluation=crash_at(100))
+    assert resume(tmp_path / "run").manifest["history"][0]["step"] == 0
+    assert contents(tmp_path / "run") == uninterrupted
+
+
+def test_more_steps_go_on_where_the_run_ended(tmp_path):
+    run(tmp_path / "run", steps=300)
+    before = (tmp_path / "run" / "evaluations.csv").read_bytes()
+    resume(tmp_path / "run", steps=500)
+    after = (tmp_path / "run" / "evaluations.csv").read_bytes()
+    assert after.startswith(before)
+    run(tmp_path / "long", steps=500)
+    assert after == (tmp_path / "long" / "evaluations.csv").read_bytes()
+
+
+def test_a_finished_run_stays_as_it_is(tmp_path):
+    run(tmp_path / "run", steps=200)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    resume(tmp_path / "run")
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_an_episode_that_cannot_be_saved_is_said(tmp_path):
+    with pytest.raises(Crash):
+        run(tmp_path / "run", task="Pendulum-v1", on_evaluation=crash_at(300))
+    finished = resume(tmp_path / "run")
+    assert finished.manifest["inexact_seeds"] == [0]
+    assert not finished.manifest["history"][0]["exact"]
+
+
+def test_a_failed_seed_stays_failed_and_the_others_go_on(tmp_path):
+    task = "probes:Failing-v0"
+    arguments = {"where": "step", "at": 130, "seeds": [probes_seed(0, episode) for episode in range(200)]}
+    with pytest.raises(Crash):
+        run(
+            tmp_path / "run",
+            task=task,
+            seeds=2,
+            environment_arguments=arguments,
+            on_evaluation=crash_at(300),
+        )
+    finished = resume(tmp_path / "run")
+    assert list(finished.manifest["failures"]) == ["0"]
+    assert finished.manifest["failures"]["0"].startswith("step 130: step raised")
+    evaluations = finished.evaluations
+    assert evaluations["step"][evaluations["seed"] == 1].max() == 500
+    assert evaluations["step"][evaluations["seed"] == 0].max() == 100
+
+
+def probes_seed(seed: int, episode: int) -> int:
+    from csac.training.environments import training_seed
+
+    return training_seed(seed, episode)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"algorithm": replace(LEARNERS[0], discount=0.5)}, "discount is 0.99, not 0.5"),
+        ({"algorithm": LEARNERS[1]}, "algorithm is 'csac', not 'sac'"),
+        ({"task": "Walker2d-v4"}, "task is 'Hopper-v4', not 'Walker2d-v4'"),
+        ({"seeds": 2}, r"seeds is \[0\], not \[0, 1\]"),
+        ({"evaluation_interval": 50}, "evaluation.interval is 100, not 50"),
+        ({"steps": 100}, "which 100 would shorten"),
+    ],
+)
+def test_another_run_is_no_continuation(tmp_path, change, message):
+    run(tmp_path / "run", steps=130)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=message):
+        run(tmp_path / "run", **{"steps": 130, "resume": True, **change})
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_schedule_keeps_a_run_from_growing(tmp_path):
+    scheduled = replace(ROLLOUT, learning_rate_schedule="linear")
+    run(tmp_path / "run", scheduled, steps=130)
+    with pytest.raises(InputError, match="a schedule"):
+        resume(tmp_path / "run", steps=260)
+    with pytest.raises(InputError, match="a schedule"):
+        run(tmp_path / "fork", scheduled, steps=260, start_from=tmp_path / "run")
+
+
+def test_two_processes_do_not_share_a_run(tmp_path):
+    run(tmp_path / "run", steps=130)
+    opened = RunDirectory.open(tmp_path / "run")
+    with opened.locked(), pytest.raises(InputError, match=r"in use by process \d+"):
+        resume(tmp_path / "run", steps=260)
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(tmp_path, uninterrupted):
+    with pytest.raises(Crash):
+        run(tmp_path / "run", on_evaluation=crash_at(400))
+    folder = tmp_path / "run" / "checkpoint"
+    assert steps_in(folder) == [240, 360]
+    victim = folder / "step_360.seed_0.safetensors"
+    content = bytearray(victim.read_bytes())
+    content[len(content) // 2] ^= 1
+    victim.write_bytes(content)
+    entry = resume(tmp_path / "run").manifest["history"][0]
+    assert entry["step"] == 240
+    assert "step_360.seed_0.safetensors has changed" in entry["complaints"][0]
+    assert contents(tmp_path / "run") == uninterrupted
+
+
+def test_a_run_without_a_sound_checkpoint_is_refused_and_kept(tmp_path):
+    run(tmp_path / "run", steps=130)
+    for path in (tmp_path / "run" / "checkpoint").glob("step_*.json"):
+        path.write_text("{}")
+    before = contents(tmp_path / "run")
+    with pytest.raises(InputError, match=r"no checkpoint of .*run is sound"):
+        resume(tmp_path / "run", steps=260)
+    assert contents(tmp_path / "run") == before
+
+
+def test_rows_that_someone_removed_are_missed(tmp_path):
+    run(tmp_path / "run", steps=130)
+    (tmp_path / "run" / "episodes.csv").write_text("seed,step,return,length\n")
+    with pytest.raises(InputError, match=r"episodes\.csv has lost rows"):
+        resume(tmp_path / "run", steps=260)
+
+
+def test_checkpoints_are_kept_as_asked(tmp_path):
+    run(tmp_path / "two")
+    run(tmp_path / "all", keep_checkpoints=0)
+    assert steps_in(tmp_path / "two" / "checkpoint") == [480, 500]
+    assert steps_in(tmp_path / "all" / "checkpoint") == [120, 240, 360, 480, 500]
+    # The ring of 150 transitions: what lies before step 330 is in no kept checkpoint of the first run.
+    firsts = [int(path.name.split(".")[1].split("-")[1]) for path in (tmp_path / "two").glob("checkpoint/replay/*")]
+    assert min(firsts) > 330
+    for step in (120, 500):
+        assert newest_sound(tmp_path / "all" / "checkpoint")[0] is not None
+        assert (tmp_path / "all" / "checkpoint" / f"step_{step}.json").exists()
+
+
+# Forks.
+
+
+def test_a_fork_without_a_change_is_the_same_run(tmp_path, uninterrupted):
+    run(tmp_path / "first", steps=500, keep_checkpoints=0)
+    forked = run(tmp_path / "second", steps=500, start_from=f"{tmp_path / 'first'}@240")
+    ours, theirs = contents(forked.path), uninterrupted
+    assert {name: ours[name] for name in theirs} == theirs
+    assert forked.manifest["forked_from"]["step"] == 240
+    assert forked.manifest["forked_from"]["changes"] == []
+
+
+def test_a_fork_may_change_hyperparameters_and_says_so(tmp_path):
+    run(tmp_path / "first", steps=300)
+    changed = replace(LEARNERS[0], entropy_weight=0.9)
+    forked = run(tmp_path / "second", changed, steps=400, start_from=tmp_path / "first")
+    assert forked.manifest["forked_from"]["changes"] == ["entropy_weight is 0.2, not 0.9"]
+    assert forked.manifest["forked_from"]["step"] == 300
+    rows, before = forked.evaluations, RunDirectory.open(tmp_path / "first").evaluations
+    np.testing.assert_array_equal(rows["return"][rows["step"] <= 300], before["return"])
+    assert rows["step"].max() == 400
+
+
+@pytest.mark.parametrize(
+    ("where", "change", "message"),
+    [
+        ("@120", {}, "no checkpoint of step 120; it has 240, 300"),
+        ("@soon", {}, "'soon' is not a step"),
+        ("x", {}, "does not exist"),
+        ("", {"algorithm": replace(LEARNERS[0], actor_hidden_sizes=(9, 9))}, r"actor.*is to be float32 \(11, 9\)"),
+        ("", {"algorithm": LEARNERS[1]}, "algorithm is 'csac', not 'sac'"),
+        ("", {"seeds": 2}, "has no seeds 1"),
+        ("", {"task": "Walker2d-v4"}, r"is to be float32 \(17, 8\)"),
+        ("", {"steps": 300}, "give more than the 300"),
+    ],
+)
+def test_a_fork_that_does_not_fit_is_refused(tmp_path, where, change, message):
+    run(tmp_path / "first", steps=300)
+    with pytest.raises(InputError, match=message):
+        run(tmp_path / "second", **{"steps": 400, "start_from": f"{tmp_path / 'first'}{where}", **change})
+    assert not (tmp_path / "second").exists()
+
+
+def test_a_run_of_a_function_goes_on_through_train(tmp_path):
+    with pytest.raises(Crash):
+        run(tmp_path / "run", task=probes.Endless, on_evaluation=crash_at(200))
+    with pytest.raises(InputError, match="a Python function"):
+        resume(tmp_path / "run")
+    assert run(tmp_path / "run", task=probes.Endless, resume=True).manifest["state"] == "finished"
+
+
+def test_a_manifest_that_lacks_something_is_refused(tmp_path):
+    run(tmp_path / "run", steps=130)
+    path = tmp_path / "run" / "manifest.json"
+    fields = json.loads(path.read_text())
+    del fields["evaluation"]
+    path.write_text(json.dumps(fields))
+    with pytest.raises(InputError, match="does not say how to go on"):
+        resume(tmp_path / "run", steps=260)
+
+
+def test_a_diverged_seed_names_its_first_bad_array_and_is_not_saved(tmp_path):
+    wild = replace(LEARNERS[0], critic_learning_rate=1e30, actor_learning_rate=1e30)
+    settings = loop.Settings(wild, "Hopper-v4", {}, 300, 1000, 1, tmp_path / "checkpoint", 50)
+    messages = [message for _, message in run_groups(settings, [[0]], lambda: False)]
+    (failed,) = [message for message in messages if isinstance(message, loop.Failed)]
+    assert "actor.layers[0].weight is not finite" in failed.reason
+    assert 40 <= failed.step <= 50
+    assert not [message for message in messages if isinstance(message, loop.Saved) and message.step >= failed.step]
