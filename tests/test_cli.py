@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import csac.training.train as training
-from csac.algorithms import ALGORITHMS, SAC
+from csac.algorithms import ALGORITHMS, CSAC, SAC
 from csac.arguments import peek
 from csac.cli import main
 from csac.deploy.policy import Contract, Policy
@@ -189,7 +189,7 @@ def test_train_passes_its_options_on(train_call):
     )
 
     assert call["task"] == "Hopper-v4"
-    assert call["algorithm"] == ALGORITHMS["csac"](warmup_steps=2000, actor_hidden_sizes=(8, 9))
+    assert call["algorithm"] == CSAC(warmup_steps=2000, actor_hidden_sizes=(8, 9))
     assert call["directory"] == Path("some/where")
     assert call["environment_arguments"] == {"ctrl_cost_weight": 0.5}
     assert call["command"].startswith("csac train Hopper-v4 --steps 1e5")
@@ -212,7 +212,7 @@ def test_train_passes_its_options_on(train_call):
 def test_train_without_options_uses_the_defaults(train_call):
     call = train_call("Hopper-v4")
 
-    assert call["algorithm"] == ALGORITHMS["csac"]()
+    assert call["algorithm"] == CSAC()
     assert (call["steps"], call["seeds"], call["groups"], call["directory"]) == (1_000_000, 1, None, None)
     assert call["preset"] is None
     assert (call["resume"], call["start_from"]) == (False, None)

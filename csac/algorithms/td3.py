@@ -72,8 +72,8 @@ class TD3:
     max_gradient_norm: float = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
-    update_interval: ClassVar[int] = 1
-    has_schedule: ClassVar[bool] = False
+    update_interval = 1
+    has_schedule = False
     name: ClassVar[str] = "td3"
 
     def __post_init__(self) -> None:
