@@ -44,7 +44,7 @@ class Statistics(NamedTuple):
         """Return the statistics of all values so far and of these [n, ...] (Chan, Golub, LeVeque 1979)."""
         count = self.count + len(values)
         shares = self.count / count, len(values) / count
-        # Differences to the old mean, so that what never varies has a variance of exactly zero, however large it is.
+        # Differences to the old mean, because they are small: little is rounded away where the mean itself is large.
         differences = jax.vmap(jnp.subtract, in_axes=(0, None))(values, self.mean)
         shift = jnp.mean(differences, axis=0)
         within = shares[0] * self.variance + shares[1] * jnp.var(differences, axis=0)
@@ -115,8 +115,6 @@ class PPO:
     normalisation_limit: float = 10.0
     """Bound on the magnitude of normalised observations and rewards."""
 
-    warmup_steps: ClassVar[int] = 0
-    updates_per_step: ClassVar[int] = 1
     name: ClassVar[str] = "ppo"
 
     def __post_init__(self) -> None:
@@ -126,6 +124,16 @@ class PPO:
                 f"minibatches must divide rollout_steps into equal parts: {self.rollout_steps} steps make no "
                 f"{self.minibatches} minibatches"
             )
+
+    @property
+    def warmup_steps(self) -> int:
+        """None: a policy can only learn from what it did itself."""
+        return 0
+
+    @property
+    def updates_per_step(self) -> int:
+        """One call of `update` for each rollout."""
+        return 1
 
     @property
     def update_interval(self) -> int:
