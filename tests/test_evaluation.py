@@ -11,6 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from csac.deploy.policy import Contract, Policy
+from csac.training import evaluation
 from csac.training.environments import EVALUATION_SEED, FRESH_EVALUATION_SEED, Environment, Task
 from csac.training.evaluation import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, evaluate
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
@@ -254,3 +255,9 @@ def test_reports_use_other_episodes_than_training():
     training = [episode.episode_return for episode in Evaluator(Lottery, first_seed=FRESH_EVALUATION_SEED).run(policy)]
     np.testing.assert_array_equal(evaluate(policy, Lottery, episodes=10), training)
     assert FRESH_EVALUATION_SEED - EVALUATION_SEED >= 1_000_000
+
+
+def test_an_episode_that_never_ends_is_broken_off(monkeypatch):
+    monkeypatch.setattr(evaluation, "LONGEST_EPISODE", 30)
+    episodes = Evaluator(lambda: probes.Endless(length=10**9), episodes=2).run(policy_for(probes.Endless))
+    assert [episode.length for episode in episodes] == [30, 30]

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from csac.training.environments import Parts, Task
 
 ROWS = 10  # of every batch that the policy sees: rounding depends on its shape
+LONGEST_EPISODE = 100_000  # steps; a task that never ends would never let training go on
 
 
 class EvaluationFailure(RuntimeError):
@@ -21,7 +22,10 @@ class EvaluationFailure(RuntimeError):
 
 
 class EvaluationEpisode(NamedTuple):
-    """One evaluation episode; `success` is the task's own verdict (1 or 0), or None where it gives none."""
+    """One evaluation episode; `success` is the task's own verdict (1 or 0), or None where it gives none.
+
+    An episode that reaches `LONGEST_EPISODE` steps is broken off there.
+    """
 
     episode: int
     episode_return: float
@@ -123,7 +127,7 @@ class _Episode:
             raise self._failure(error) from error
         self._return += reward
         self._length += 1
-        self.ended = terminated or truncated
+        self.ended = terminated or truncated or self._length >= LONGEST_EPISODE
         return observation
 
     def result(self) -> EvaluationEpisode:

@@ -11,7 +11,7 @@ import numpy as np
 from csac.deploy.policy import Contract, Policy
 from csac.training.checkpoint import Checkpoint, SeedFiles
 from csac.training.environments import SeedEnvironments
-from csac.training.evaluation import EvaluationFailure, Evaluator
+from csac.training.evaluation import LONGEST_EPISODE, EvaluationFailure, Evaluator
 from csac.training.learner import Learner
 from csac.training.snapshots import Snapshot
 
@@ -269,6 +269,8 @@ def _evaluate(
             }
             for episode in episodes
         ]
+    if any(row["length"] >= LONGEST_EPISODE for row in rows):
+        yield Noted(f"step {step}: evaluation episodes were broken off after {LONGEST_EPISODE:,} steps: do they end?")
     yield Evaluated(step, rows, policies)
 
 
