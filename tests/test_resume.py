@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,7 @@ def test_seeds_may_be_grouped_otherwise(tmp_path):
 
 # Whole runs.
 
+
 FILES = ("evaluations.csv", "episodes.csv", "metrics.csv", "log.txt", "policy/seed_0.safetensors")
 
 
@@ -129,6 +131,17 @@ def uninterrupted(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "run"
     run(path)
     return contents(path)
+
+
+@pytest.fixture(scope="module")
+def short_run(tmp_path_factory):
+    """A finished run of 130 steps, to be copied."""
+    return run(tmp_path_factory.mktemp("short") / "run", steps=130).path
+
+
+@pytest.fixture
+def finished(short_run, tmp_path):
+    return Path(shutil.copytree(short_run, tmp_path / "run"))
 
 
 def test_a_crashed_run_goes_on_and_leaves_the_same_files(tmp_path, uninterrupted):
@@ -167,10 +180,9 @@ def test_more_steps_go_on_where_the_run_ended(tmp_path):
     assert after == (tmp_path / "long" / "evaluations.csv").read_bytes()
 
 
-def test_a_finished_run_stays_as_it_is(tmp_path):
-    run(tmp_path / "run", steps=200)
+def test_a_finished_run_stays_as_it_is(tmp_path, finished):
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    resume(tmp_path / "run")
+    resume(finished)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
@@ -218,8 +230,7 @@ def probes_seed(seed: int, episode: int) -> int:
         ({"steps": 100}, "which 100 would shorten"),
     ],
 )
-def test_another_run_is_no_continuation(tmp_path, change, message):
-    run(tmp_path / "run", steps=130)
+def test_another_run_is_no_continuation(tmp_path, finished, change, message):
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match=message):
         run(tmp_path / "run", **{"steps": 130, "resume": True, **change})
@@ -235,8 +246,7 @@ def test_a_schedule_keeps_a_run_from_growing(tmp_path):
         run(tmp_path / "fork", scheduled, steps=260, start_from=tmp_path / "run")
 
 
-def test_two_processes_do_not_share_a_run(tmp_path):
-    run(tmp_path / "run", steps=130)
+def test_two_processes_do_not_share_a_run(tmp_path, finished):
     opened = RunDirectory.open(tmp_path / "run")
     with opened.locked(), pytest.raises(InputError, match=r"in use by process \d+"):
         resume(tmp_path / "run", steps=260)
@@ -257,8 +267,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(tmp_path, unin
     assert contents(tmp_path / "run") == uninterrupted
 
 
-def test_a_run_without_a_sound_checkpoint_is_refused_and_kept(tmp_path):
-    run(tmp_path / "run", steps=130)
+def test_a_run_without_a_sound_checkpoint_is_refused_and_kept(tmp_path, finished):
     for path in (tmp_path / "run" / "checkpoint").glob("step_*.json"):
         path.write_text("{}")
     before = contents(tmp_path / "run")
@@ -267,8 +276,7 @@ def test_a_run_without_a_sound_checkpoint_is_refused_and_kept(tmp_path):
     assert contents(tmp_path / "run") == before
 
 
-def test_rows_that_someone_removed_are_missed(tmp_path):
-    run(tmp_path / "run", steps=130)
+def test_rows_that_someone_removed_are_missed(tmp_path, finished):
     (tmp_path / "run" / "episodes.csv").write_text("seed,step,return,length\n")
     with pytest.raises(InputError, match=r"episodes\.csv has lost rows"):
         resume(tmp_path / "run", steps=260)
@@ -313,20 +321,19 @@ def test_a_fork_may_change_hyperparameters_and_says_so(tmp_path):
 @pytest.mark.parametrize(
     ("where", "change", "message"),
     [
-        ("@120", {}, "no checkpoint of step 120; it has 240, 300"),
+        ("@100", {}, "no checkpoint of step 100; it has 120, 130"),
         ("@soon", {}, "'soon' is not a step"),
         ("x", {}, "does not exist"),
         ("", {"algorithm": replace(LEARNERS[0], actor_hidden_sizes=(9, 9))}, r"actor.*is to be float32 \(11, 9\)"),
         ("", {"algorithm": LEARNERS[1]}, "algorithm is 'csac', not 'sac'"),
         ("", {"seeds": 2}, "has no seeds 1"),
         ("", {"task": "Walker2d-v4"}, r"is to be float32 \(17, 8\)"),
-        ("", {"steps": 300}, "give more than the 300"),
+        ("", {"steps": 130}, "give more than the 130"),
     ],
 )
-def test_a_fork_that_does_not_fit_is_refused(tmp_path, where, change, message):
-    run(tmp_path / "first", steps=300)
+def test_a_fork_that_does_not_fit_is_refused(tmp_path, short_run, where, change, message):
     with pytest.raises(InputError, match=message):
-        run(tmp_path / "second", **{"steps": 400, "start_from": f"{tmp_path / 'first'}{where}", **change})
+        run(tmp_path / "second", **{"steps": 400, "start_from": f"{short_run}{where}", **change})
     assert not (tmp_path / "second").exists()
 
 
@@ -338,8 +345,7 @@ def test_a_run_of_a_function_goes_on_through_train(tmp_path):
     assert run(tmp_path / "run", task=probes.Endless, resume=True).manifest["state"] == "finished"
 
 
-def test_a_manifest_that_lacks_something_is_refused(tmp_path):
-    run(tmp_path / "run", steps=130)
+def test_a_manifest_that_lacks_something_is_refused(tmp_path, finished):
     path = tmp_path / "run" / "manifest.json"
     fields = json.loads(path.read_text())
     del fields["evaluation"]
