@@ -331,6 +331,8 @@ def _inherited(source: dict[str, Any]) -> list[tuple[str, Any, Any]]:
         ("steps", int, source["steps"]),
         ("seeds", int, len(source["seeds"])),
         ("first_seed", int, source["seeds"][0]),
+        ("evaluation_interval", int, source["evaluation"]["interval"]),
+        ("evaluation_episodes", int, source["evaluation"]["episodes"]),
         ("env_kwargs", Annotated[str, arg(metavar="JSON")], json.dumps(source.get("environment_arguments", {}))),
     ]
 

@@ -17,7 +17,7 @@ import trainer  # noqa: F401  (its cache of compiled programs)
 from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
 from csac.record.run import RunDirectory
 from csac.training import loop
-from csac.training.checkpoint import Checkpoints, newest_sound, steps_in
+from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, steps_in
 from csac.training.groups import run_groups
 from csac.training.train import resume, train
 from csac.types import InputError
@@ -211,6 +211,9 @@ def test_a_failed_seed_stays_failed_and_the_others_go_on(tmp_path):
     evaluations = finished.evaluations
     assert evaluations["step"][evaluations["seed"] == 1].max() == 500
     assert evaluations["step"][evaluations["seed"] == 0].max() == 100
+    # The last checkpoint before the failure is kept, with the seed in it, beside the newest two.
+    assert steps_in(finished.path / "checkpoint") == [120, 480, 500]
+    assert Checkpoint.open(finished.path / "checkpoint", 120).seed(0).values["environment"]["alive"]
 
 
 def probes_seed(seed: int, episode: int) -> int:

@@ -25,7 +25,7 @@ from csac.training.snapshots import Snapshot
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
 SCHEMA_VERSION = 1
@@ -107,7 +107,7 @@ class Checkpoint:
                 raise Damaged(f"{path} is of schema {fields['schema_version']!r}, and this csac reads {SCHEMA_VERSION}")
             if checksum != _sha256(_encoded(fields)) or fields["step"] != step:
                 raise Damaged(f"{path} has changed since it was written")
-            return cls(folder, step, _checked_files(fields["files"]), fields["values"])
+            return cls(folder, step, _checked_files(fields["files"]), _checked_values(fields["values"]))
         except OSError as error:
             raise Damaged(f"{path} cannot be read: {error.strerror}") from error
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -153,14 +153,21 @@ class Checkpoints:
     Args:
         folder: where they are.
         keep: how many to keep; 0 keeps all.
+        pinned: the steps of others to keep.
     """
 
-    def __init__(self, folder: Path, keep: int) -> None:
-        self.folder, self.keep = folder, keep
+    def __init__(self, folder: Path, keep: int, pinned: Iterable[int] = ()) -> None:
+        self.folder, self.keep, self.pinned = folder, keep, set(pinned)
         self.newest: int | None = max(steps_in(folder), default=None)
+
+    def pin_newest(self) -> None:
+        """Keep the newest checkpoint for good: a seed failed after it, and its last sound state is there."""
+        if self.newest is not None:
+            self.pinned.add(self.newest)
 
     def commit(self, step: int, files: Files, values: dict[str, Any]) -> None:
         """Make a checkpoint of files that are written already, then remove what no checkpoint needs any more."""
+        values = {**values, "pinned": sorted(self.pinned)}
         fields = {"schema_version": SCHEMA_VERSION, "step": step, "files": files, "values": values}
         content = json.dumps({**fields, "sha256": _sha256(_encoded(fields))}, indent=1).encode()
         write_atomically(self.folder / f"step_{step}.json", content)
@@ -180,7 +187,7 @@ class Checkpoints:
         """Remove what no kept checkpoint needs; of later steps than `newest` other groups may have written already."""
         steps = steps_in(self.folder)
         needed: set[str] = set()
-        for step in steps[-self.keep :]:
+        for step in {*steps[-self.keep :], *self.pinned.intersection(steps)}:
             try:
                 needed |= {f"step_{step}.json", *Checkpoint.open(self.folder, step).files}
             except Damaged:
@@ -276,6 +283,16 @@ def _checked_files(files: Any) -> Files:
         if type(facts["bytes"]) is not int or not isinstance(facts["sha256"], str):
             raise TypeError(f"{name!r} has no size and checksum")
     return files
+
+
+def _checked_values(values: Any) -> dict[str, Any]:
+    values = {"sizes": {}, "failures": {}, "pinned": [], **values}
+    for name, kind in (("sizes", int), ("failures", str)):
+        if not all(type(value) is kind for value in values[name].values()):
+            raise TypeError(f"{name} are not of type {kind.__name__}")
+    if not all(type(step) is int for step in values["pinned"]) or not all(map(str.isdigit, values["failures"])):
+        raise TypeError("pinned steps or failed seeds are not numbers")
+    return values
 
 
 def _encoded(fields: dict[str, Any]) -> bytes:

@@ -146,6 +146,8 @@ class Recorder:
 
     def _note_failure(self, seed: int, step: int, reason: str, details: str) -> None:
         self.failures[seed], self._failed_at[seed] = f"step {step}: {reason}", step
+        if self.checkpoints:
+            self.checkpoints.pin_newest()
         self.run.log(f"seed {seed} stopped at step {step}: {reason}\n{details}".rstrip())
         self.run.update_manifest(failures=self.failures)
         if self.reporter:

@@ -27,6 +27,7 @@ class Point(NamedTuple):
     step: int
     failures: dict[int, str]
     complaints: list[str]  # what was wrong with newer checkpoints
+    pinned: list[int]  # steps of checkpoints to keep for good
 
     def notes(self, before: dict[str, Any], now: dict[str, Any]) -> list[str]:
         """Return what the user should know of this continuation, a line each."""
@@ -52,6 +53,9 @@ class Point(NamedTuple):
             "command": now["command"],
             "previous": previous,
         }
+
+
+BEGINNING = Point(0, {}, [], [])
 
 
 def refuse_differences(run: RunDirectory, wanted: dict[str, Any], algorithm: Algorithm) -> None:
@@ -84,10 +88,12 @@ def roll_back(run: RunDirectory) -> Point:
     for unfinished in [*run.path.glob(".*.*"), *run.path.glob("policy/*.tmp")]:
         unfinished.unlink()
     _restore_best_policies(run, checkpoint)
+    values = checkpoint.values if checkpoint else {"failures": {}, "pinned": []}
     if folder.exists():
-        Checkpoints(folder, run.manifest.get("checkpoints", {}).get("keep", 0)).discard_after(step)
-    failures = checkpoint.values["failures"] if checkpoint else {}
-    return Point(step, {int(seed): reason for seed, reason in failures.items()}, complaints)
+        keep = run.manifest.get("checkpoints", {}).get("keep", 0)
+        Checkpoints(folder, keep, values["pinned"]).discard_after(step)
+    failures = {int(seed): reason for seed, reason in values["failures"].items()}
+    return Point(step, failures, complaints, values["pinned"])
 
 
 def algorithm_of(manifest: dict[str, Any]) -> Algorithm:

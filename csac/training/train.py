@@ -27,7 +27,7 @@ from csac.training.groups import choose_groups, run_groups, split_seeds
 from csac.training.logs import TensorBoardLog
 from csac.training.loop import Settings
 from csac.training.recorder import Recorder
-from csac.training.resume import Source, algorithm_of, arguments_of, refuse_differences, roll_back
+from csac.training.resume import BEGINNING, Point, Source, algorithm_of, arguments_of, refuse_differences, roll_back
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def train(
             return _go_on(run, settings, manifest, notes, watchers)
     run = RunDirectory.create(path, manifest)
     with run.locked():
-        return _run(run, settings, notes, watchers, {})
+        return _run(run, settings, notes, watchers, BEGINNING)
 
 
 def resume(
@@ -239,22 +239,20 @@ def _go_on(
     }
     notes = [*notes, *point.notes(run.manifest, manifest)]
     run.update_manifest(**current, state="running", history=history, failures=point.failures, steps_done=point.step)
-    return _run(run, settings._replace(begin=point.step), notes, watchers, point.failures)
+    return _run(run, settings._replace(begin=point.step), notes, watchers, point)
 
 
-def _run(
-    run: RunDirectory, settings: Settings, notes: list[str], watchers: _Watchers, failures: dict[int, str]
-) -> RunDirectory:
+def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Watchers, point: Point) -> RunDirectory:
     """Train until the last step, a signal or a failure, and write down what happens."""
-    reporter, labels, begin = watchers.reporter, run.manifest["seeds"], settings.begin
+    reporter, labels, begin, failures = watchers.reporter, run.manifest["seeds"], point.step, point.failures
     groups = [group for group in run.manifest["groups"] if not set(group) <= set(failures)]
     if reporter:
         reporter.start(run.manifest["task"], run.manifest["algorithm"], labels, settings.steps, run.path, notes)
         reporter.go_on(begin, run.evaluations, failures)
     log = TensorBoardLog(run.path / "tensorboard", labels, begin) if watchers.tensorboard else None
-    checkpoints = (
-        Checkpoints(settings.checkpoints, run.manifest["checkpoints"]["keep"]) if settings.checkpoints else None
-    )
+    checkpoints = None
+    if settings.checkpoints:
+        checkpoints = Checkpoints(settings.checkpoints, run.manifest["checkpoints"]["keep"], point.pinned)
     recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures)
     received, told = [], False
     try:

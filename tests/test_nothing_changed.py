@@ -1,0 +1,97 @@
+"""A change that is not meant to alter learning alters no number of a fixed-seed run.
+
+`digests.json` holds what these runs gave on processors at hand; its keys say what the last bits depend on.
+After a change that is meant to alter numbers, and only then: python tests/test_nothing_changed.py
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trainer  # noqa: F401  (its cache of compiled programs)
+
+from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
+from csac.training.train import train
+
+DIGESTS = Path(__file__).with_name("digests.json")
+SMALL: dict[str, Any] = {
+    "actor_hidden_sizes": (32, 32),
+    "critic_hidden_sizes": (32, 32),
+    "batch_size": 32,
+    "warmup_steps": 100,
+}
+LEARNERS = {
+    "csac": CSAC(reference_period=50, **SMALL),
+    "csac, paper": CSAC(reference_policy="algorithm1", relative_entropy_estimator="sampled", **SMALL),
+    "sac": SAC(**SMALL),
+    "td3": TD3(**SMALL),
+    "sd3": SD3(noise_samples=5, **SMALL),
+    "ppo": PPO(rollout_steps=128, minibatches=4, hidden_sizes=(32, 32)),
+}
+TABLES = ("evaluations.csv", "episodes.csv", "metrics.csv")
+
+
+def digest(name: str, seeds: int, directory: Path) -> str:
+    """Train on Hopper and return a checksum of the tables."""
+    run = train(
+        LEARNERS[name],
+        "Hopper-v4",
+        steps=500,
+        seeds=seeds,
+        directory=directory,
+        evaluation_interval=250,
+        evaluation_episodes=2,
+        checkpoint_interval=0,
+        tensorboard=False,
+    )
+    return hashlib.sha256(b"".join((run.path / table).read_bytes() for table in TABLES)).hexdigest()[:16]
+
+
+def machine() -> str:
+    """What the last bits depend on, beside the group's size."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    facts = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    flags = [flag for flag in ("avx2", "fma", "avx512f", "avx512_bf16") if flag in facts.get("flags", "").split()]
+    model = " ".join(facts.get(name, "?") for name in ("vendor_id", "cpu family", "model"))
+    packages = ", ".join(f"{name} {version(name)}" for name in ("jaxlib", "mujoco", "gymnasium", "optax", "numpy"))
+    return f"{model}, {' '.join(flags)}; {packages}"
+
+
+@pytest.mark.parametrize("seeds", [1, 2], ids=["alone", "together"])
+@pytest.mark.parametrize("name", LEARNERS)
+def test_the_numbers_are_those_that_were_written_down(tmp_path, name, seeds):
+    known = json.loads(DIGESTS.read_text()).get(machine())
+    if known is None:
+        pytest.skip(f"nothing was written down on such a machine: {machine()}")
+    assert digest(name, seeds, tmp_path / "run") == known[f"{name}, {seeds}"]
+
+
+@pytest.mark.parametrize("name", ["csac", "ppo"])
+def test_two_runs_give_the_same_numbers_and_another_seed_others(tmp_path, name):
+    first = digest(name, 1, tmp_path / "first")
+    assert digest(name, 1, tmp_path / "second") == first
+    assert digest(name, 2, tmp_path / "other") != first
+
+
+def write_down() -> None:
+    """Add or replace what the runs give on this machine."""
+    with tempfile.TemporaryDirectory() as folder:
+        given = {
+            f"{name}, {seeds}": digest(name, seeds, Path(folder) / f"{name} {seeds}")
+            for name in LEARNERS
+            for seeds in (1, 2)
+        }
+    known = json.loads(DIGESTS.read_text()) if DIGESTS.exists() else {}
+    DIGESTS.write_text(json.dumps({**known, machine(): given}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    write_down()
+    sys.exit(0)
