@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,9 @@ from csac.algorithms import PPO
 from csac.algorithms.distributions import Gaussian
 from csac.algorithms.ppo import Sample, State, Statistics, explained_variance, policy_at
 from csac.types import InputError, Normaliser, Spec, Transition
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 SMALL = PPO(discount=0.5, rollout_steps=8, minibatches=2, epochs=2, hidden_sizes=(4,))
 SWITCHED_OFF = {"normalise_observations": False, "normalise_rewards": False, "normalise_advantages": False}
@@ -264,17 +267,19 @@ def test_densities_are_those_by_which_the_actions_were_drawn():
     np.testing.assert_allclose(samples.observation, normalised, rtol=1e-5)
 
 
-def test_every_epoch_takes_each_transition_once_in_an_order_of_its_own():
+def test_shuffling_keeps_each_transition_once_and_whole():
     ids = jnp.arange(8.0)
     samples = Sample(jnp.stack([ids, -ids], axis=1), ids[:, None], ids, ids, ids, ids)
-    epochs = compiled(jax.vmap(SMALL.shuffled, in_axes=(None, 0)))(samples, jax.random.split(jax.random.key(0), 5))
-    epochs = [jax.tree.map(lambda leaf: np.asarray(leaf[i]), epochs) for i in range(5)]  # noqa: B023
-    for epoch in epochs:
-        assert epoch.observation.shape == (2, 4, 2)
-        np.testing.assert_array_equal(np.sort(epoch.value.ravel()), ids)
-        for field in (epoch.observation[..., 0], -epoch.observation[..., 1], epoch.action[..., 0], epoch.target):
-            np.testing.assert_array_equal(field, epoch.value)
-    assert len({tuple(epoch.value.ravel().tolist()) for epoch in epochs}) == 5
+    shuffled = jax.tree.map(np.asarray, compiled(SMALL.shuffled)(samples, jax.random.key(0)))
+    assert shuffled.observation.shape == (2, 4, 2)
+    np.testing.assert_array_equal(np.sort(shuffled.value.ravel()), ids)
+    for field in (
+        shuffled.observation[..., 0],
+        -shuffled.observation[..., 1],
+        shuffled.action[..., 0],
+        shuffled.target,
+    ):
+        np.testing.assert_array_equal(field, shuffled.value)
 
 
 def test_the_gradient_is_clipped_by_the_norm_of_all_parameters_together():
@@ -349,7 +354,7 @@ def test_no_two_parts_of_the_first_state_share_a_buffer(first_state):
 
 
 class Slow:
-    """PPO with one minibatch in each epoch, for one hidden layer. All parameters are one vector."""
+    """PPO for one hidden layer. All parameters are one vector."""
 
     def __init__(self, algorithm: PPO, state: State, total_updates: int) -> None:
         self.algorithm, self.total_updates = algorithm, total_updates
@@ -381,7 +386,8 @@ class Slow:
         means, _, log_std = self.outputs(parameters, observations)
         return scipy.stats.norm.logpdf(actions, means, np.exp(log_std)).sum(axis=1)
 
-    def update(self, batch: Transition, step: int) -> None:
+    def update(self, batch: Transition, step: int, minibatches: Iterable[np.ndarray]) -> None:
+        """Learn from the parts of the rollout that have these indices, one after the other."""
         algorithm = self.algorithm
         old_log_probs = self.log_probs(self.parameters, self.normalised(batch.observation), batch.action)
         self.observations.append(batch.observation)
@@ -401,21 +407,21 @@ class Slow:
             trace = 0.0 if ended[t] else algorithm.discount * algorithm.trace_decay * advantage
             advantages[t] = advantage = rewards[t] + algorithm.discount * follows - old_values[t] + trace
         targets = advantages + old_values
-        scaled = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
 
-        def loss(parameters: np.ndarray) -> float:
-            ratios = np.exp(self.log_probs(parameters, observations, batch.action) - old_log_probs)
-            _, values, log_std = self.outputs(parameters, observations)
+        def loss(parameters: np.ndarray, part: np.ndarray) -> float:
+            scaled = (advantages[part] - advantages[part].mean()) / (advantages[part].std() + 1e-8)
+            ratios = np.exp(self.log_probs(parameters, observations[part], batch.action[part]) - old_log_probs[part])
+            _, values, log_std = self.outputs(parameters, observations[part])
             low, high = 1 - algorithm.clip_range, 1 + algorithm.clip_range
             gains = np.minimum(ratios * scaled, np.clip(ratios, low, high) * scaled)
-            clipped = old_values + np.clip(values - old_values, -algorithm.clip_range, algorithm.clip_range)
-            errors = np.maximum((values - targets) ** 2, (clipped - targets) ** 2)
+            moves = np.clip(values - old_values[part], -algorithm.clip_range, algorithm.clip_range)
+            errors = np.maximum((values - targets[part]) ** 2, (old_values[part] + moves - targets[part]) ** 2)
             entropy = scipy.stats.norm.entropy(0, np.exp(log_std)).sum()
             weights = algorithm.value_loss_weight, algorithm.entropy_weight
             return -gains.mean() + weights[0] * errors.mean() / 2 - weights[1] * entropy
 
-        for _ in range(algorithm.epochs):
-            self.descend(loss, algorithm.learning_rate * (1 - step / self.total_updates))
+        for part in minibatches:
+            self.descend(partial(loss, part=part), algorithm.learning_rate * (1 - step / self.total_updates))
 
     def descend(self, loss, learning_rate: float) -> None:
         small = 1e-6 * np.eye(self.parameters.size)
@@ -434,8 +440,8 @@ def test_an_update_agrees_with_a_slow_one():
     algorithm = replace(
         SMALL,
         rollout_steps=16,
-        minibatches=1,
-        epochs=4,
+        minibatches=2,
+        epochs=2,
         learning_rate=0.3,
         clip_range=0.05,
         entropy_weight=0.1,
@@ -445,11 +451,15 @@ def test_an_update_agrees_with_a_slow_one():
     state = begin(SMALL)._replace(total_updates=jnp.float32(5))
     first = state.parameters.actor.layers[0].weight
     slow = Slow(algorithm, state, 5)
+    indices: Any = jnp.arange(16)  # in place of samples
+    order_of = compiled(jax.vmap(partial(algorithm.shuffled, indices)))
     for step in range(3):
         batch = rollout(np.sin(np.arange(16) * (step + 1)), terminated=[4 + step], truncated=[11])
         batch = batch._replace(observation=batch.observation * (step + 1) - step)
-        state, metrics = update(algorithm, state, batch, step)
-        slow.update(batch, step)
+        orders = order_of(jax.random.split(jax.random.key(step), algorithm.epochs))
+        assert not np.array_equal(orders[0], orders[1])
+        state, metrics = update(algorithm, state, batch, step, seed=step)
+        slow.update(batch, step, [part for epoch in np.asarray(orders) for part in epoch])
         assert metrics["clip_fraction"] > 0
         ours = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(state.parameters)])
         np.testing.assert_allclose(ours, slow.parameters, atol=1e-5)
