@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,8 +57,16 @@ def everything(group: loop.Group) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda algorithm: algorithm.name)
-@pytest.mark.parametrize("seeds", [(3,), (0, 4)], ids=["alone", "together"])
-def test_a_group_goes_on_bit_for_bit(tmp_path, algorithm, seeds):
+def test_a_group_goes_on_bit_for_bit(tmp_path, algorithm):
+    check_that_a_group_goes_on(tmp_path, algorithm, (3,))
+
+
+@pytest.mark.parametrize("algorithm", [LEARNERS[0], ROLLOUT], ids=lambda algorithm: algorithm.name)
+def test_a_group_of_two_goes_on_bit_for_bit(tmp_path, algorithm):
+    check_that_a_group_goes_on(tmp_path, algorithm, (0, 4))
+
+
+def check_that_a_group_goes_on(tmp_path: Path, algorithm, seeds: tuple[int, ...]) -> None:
     whole = group(tmp_path, algorithm, seeds, 400)
     advance(whole, 90)
     whole.save()  # transitions are written in two parts, and some of the first are overwritten in the ring of 150
@@ -160,6 +170,29 @@ def test_the_same_call_again_with_resume_goes_on(tmp_path, uninterrupted):
         with pytest.raises(Crash):
             run(tmp_path / "run", on_evaluation=crash_at(200), resume=True)
     run(tmp_path / "run", resume=True)
+    assert contents(tmp_path / "run") == uninterrupted
+
+
+def test_a_run_that_crashed_after_its_last_checkpoint_is_finished(tmp_path, uninterrupted, monkeypatch):
+    def crash(*_: Any) -> None:
+        raise Crash
+
+    with monkeypatch.context() as patched:
+        patched.setattr("csac.training.train._finish", crash)
+        with pytest.raises(Crash):
+            run(tmp_path / "run")
+    assert steps_in(tmp_path / "run" / "checkpoint") == [480, 500]
+    assert resume(tmp_path / "run").manifest["state"] == "finished"
+    assert contents(tmp_path / "run") == uninterrupted
+    assert (tmp_path / "run" / "curve.png").exists()
+
+
+def test_a_signal_that_comes_too_late_stops_nothing(tmp_path, uninterrupted):
+    def send(step: int, _: Any) -> None:
+        if step == 500:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    assert run(tmp_path / "run", on_evaluation=send).manifest["state"] == "finished"
     assert contents(tmp_path / "run") == uninterrupted
 
 

@@ -29,6 +29,9 @@ _PR_SET_PDEATHSIG = 1
 GROUPS_PER_CORE = 4
 
 
+# Steps that one group may be ahead of another: all can be saved at one step without a long wait.
+LONGEST_LEAD = 1_000
+
 # A checkpoint is made at least this often, whatever the interval in steps.
 SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
@@ -207,7 +210,7 @@ class _Scheduler:
     def _receive(self, index: int, worker: _Worker) -> Message:
         try:
             message: Message = worker.connection.recv()
-        except (EOFError, ConnectionResetError):
+        except (EOFError, OSError):  # the latter where it died in the middle of a message
             return self._died(index, worker)
         if isinstance(message, Progress):
             worker.step = message.step
@@ -251,7 +254,9 @@ class _Scheduler:
         """Choose the next step that every group passes as the one to be saved at, and to stop at if that is asked."""
         self.timer.reset()
         living = [worker for worker in self.workers if not worker.over]
-        if not self.settings.checkpoints or any(worker.step == worker.begin for worker in living):
+        if any(worker.step == self.settings.steps for worker in self.workers):
+            self.target = self.settings.steps  # one has made all its steps, and the others are close behind
+        elif not self.settings.checkpoints or any(worker.step == worker.begin for worker in living):
             self.target = -1  # a group that is still starting would keep the others waiting
         else:
             self.target = max(self._end_of_turn(worker) for worker in living)
@@ -270,8 +275,10 @@ class _Scheduler:
             worker.cores = None
 
     def _hand_out(self) -> None:
+        """Give free cores to those who are furthest behind, and to nobody who is too far ahead of the last."""
         self.waiting.sort(key=lambda worker: worker.step, reverse=True)
-        while self.free and self.waiting:
+        last = min((worker.step for worker in self.workers if not worker.over), default=0)
+        while self.free and self.waiting and self.waiting[-1].step <= last + LONGEST_LEAD:
             worker = self.waiting.pop()
             worker.cores = self.free.pop(0)
             worker.tell(worker.cores)

@@ -85,11 +85,16 @@ class Recorder:
             case GroupCrashed():
                 self._crashed(group, message)
             case GroupRestarted(reason, step):
+                self._forget_saved(group)
                 self._note(f"{_seeds(self.groups[group])}: {reason}; started again from step {step:,}")
             case Noted(text):
                 self._note(text)
             case NotSaved(error):
                 raise error
+
+    def is_complete(self, steps: int) -> bool:
+        """Return whether every seed has made so many steps, or has failed."""
+        return all(step >= steps or seed in self.failures for seed, step in self._steps.items())
 
     def close(self) -> None:
         """Write what still waits."""
@@ -128,8 +133,14 @@ class Recorder:
             files = {name: facts for part in self._saved.pop(event.step).values() for name, facts in part.items()}
             failures = {seed: text for seed, text in self.failures.items() if self._failed_at[seed] <= event.step}
             values = {"sizes": self.run.sync(), "failures": failures, "groups": self.groups}
-            self.checkpoints.commit(event.step, files, values)
+            # Said before, so that no checkpoint is ever taken for exact that is not.
             self.run.update_manifest(steps_done=event.step, inexact_seeds=sorted(self.inexact))
+            self.checkpoints.commit(event.step, files, values)
+
+    def _forget_saved(self, group: int) -> None:
+        """Wait for a restarted group to save again: the checkpoint that it begins with must stay until then."""
+        for part in self._saved.values():
+            part.pop(group, None)
 
     def _failed(self, event: Failed) -> None:
         if event.seed in self.failures:

@@ -228,11 +228,11 @@ def _go_on(
     run: RunDirectory, settings: Settings, manifest: dict[str, Any], notes: list[str], watchers: _Watchers
 ) -> RunDirectory:
     """Go on with a run from its newest sound checkpoint."""
-    point = roll_back(run)
-    if point.step >= settings.steps:
+    if run.manifest["state"] in ("finished", "failed") and run.manifest["steps_done"] >= settings.steps:
         if watchers.reporter:
             watchers.reporter.note(f"{run.path} has made its {settings.steps:,} steps already; more: --steps")
         return run
+    point = roll_back(run)
     history = [*run.manifest["history"], point.history_entry(run.manifest, manifest)]
     current = {
         name: manifest[name] for name in ("machine", "versions", "groups", "steps", "process", "device", "checkpoints")
@@ -268,11 +268,12 @@ def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Wat
                 if _tell_caller(recorder, watchers.on_evaluation, watchers.stop_when):
                     stop.set()
         recorder.close()
-        _finish(run, recorder, "interrupted" if received else "failed" if recorder.failures else "finished")
+        stopped = bool(received) and not recorder.is_complete(settings.steps)  # a signal may come too late
+        _finish(run, recorder, "interrupted" if stopped else "failed" if recorder.failures else "finished")
         if reporter:
             reporter.finish(run)
     except BaseException as error:
-        _leave(run, recorder, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+        _leave(run, recorder)
         if isinstance(error, OSError) and error.errno in _CANNOT_WRITE:
             raise StorageFailure(f"{run.path} cannot be written: {error.strerror}") from error
         raise
@@ -281,16 +282,16 @@ def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Wat
             log.close()
         if reporter:
             reporter.close()
-    if received:
+    if stopped:
         raise Interrupted(run, received[0])
     return run
 
 
-def _leave(run: RunDirectory, recorder: Recorder, state: str) -> None:
-    """Write what can still be written of a run that ends with an error."""
+def _leave(run: RunDirectory, recorder: Recorder) -> None:
+    """Write what can still be written of a run that an error ends; it can go on from its last checkpoint."""
     with suppress(OSError):
         recorder.close()
-        run.update_manifest(state=state)
+        run.update_manifest(state="interrupted")
 
 
 def _choose_number_of_groups(groups: int | None, labels: list[int], device: str, existing: RunDirectory | None) -> int:
