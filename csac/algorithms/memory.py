@@ -67,7 +67,7 @@ def row_width(spec: Spec) -> int:
 
 def pack(transition: Transition) -> np.ndarray:
     """Return transitions of several seeds, NumPy arrays [seed, ...], as rows [seed, width], fields in their order."""
-    fields = [np.reshape(field, (len(field), -1)) for field in transition]
+    fields = [field.reshape(len(field), -1) for field in transition]
     return np.concatenate(fields, axis=1, dtype=np.float32, casting="unsafe")
 
 

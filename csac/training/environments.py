@@ -284,6 +284,11 @@ class SeedEnvironments:
         return True
 
     @property
+    def is_any_alive(self) -> bool:
+        """Whether a seed still steps, or its failure is yet to be reported."""
+        return bool(self._running or self._failures)
+
+    @property
     def observations(self) -> np.ndarray:
         """What to act on next: [seed, observation]."""
         return self._observation
