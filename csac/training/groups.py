@@ -230,7 +230,10 @@ class _Scheduler:
         worker.kill()
         self._take_cores(worker)
         reason = _cause_of_death(worker.process.exitcode)
-        if index in self.restarted or self.stopping or not self.checkpoints:
+        if self.stopping and self.checkpoints and index not in self.restarted:
+            worker.over = True  # and no failure: the run goes on from the last step at which all were saved
+            return Ended(worker.step, {})
+        if index in self.restarted or not self.checkpoints:
             worker.over = True
             again = "for the second time, " if index in self.restarted else ""
             return GroupCrashed(again + reason, "")

@@ -57,6 +57,7 @@ class Recorder:
         self.inexact: set[int] = set()
         self.evaluated: list[tuple[int, dict[int, float]]] = []  # since the caller last emptied it
         self._passed = [begin] * len(groups)
+        self._written = begin  # every row up to this step is in the tables, and none after it
         self._received: list[dict[Table, int]] = [dict.fromkeys(get_args(Table), begin) for _ in groups]
         self._steps = dict.fromkeys((seed for group in groups for seed in group), begin)
         self._pending: dict[Table, list[dict[str, Any]]] = defaultdict(list)
@@ -81,11 +82,12 @@ class Recorder:
                 self._progress(group, step)
                 self._save(policies)
                 self._passed[group] = OVER
+                self._commit_whole()
                 self._flush()
             case GroupCrashed():
                 self._crashed(group, message)
             case GroupRestarted(reason, step):
-                self._forget_saved(group)
+                self._go_back(group, step)
                 self._note(f"{_seeds(self.groups[group])}: {reason}; started again from step {step:,}")
             case Noted(text):
                 self._note(text)
@@ -128,17 +130,38 @@ class Recorder:
                 files[name] = facts_of(self.checkpoints.folder / name)
         self.inexact.update(event.inexact)
         self._saved[event.step][group] = files
-        if all(group in self._saved[event.step] for group in range(len(self.groups)) if self._passed[group] < OVER):
-            self._flush()
-            files = {name: facts for part in self._saved.pop(event.step).values() for name, facts in part.items()}
-            failures = {seed: text for seed, text in self.failures.items() if self._failed_at[seed] <= event.step}
-            values = {"sizes": self.run.sync(), "failures": failures, "groups": self.groups}
-            # Said before, so that no checkpoint is ever taken for exact that is not.
-            self.run.update_manifest(steps_done=event.step, inexact_seeds=sorted(self.inexact))
-            self.checkpoints.commit(event.step, files, values)
+        self._commit_whole()
 
-    def _forget_saved(self, group: int) -> None:
-        """Wait for a restarted group to save again: the checkpoint that it begins with must stay until then."""
+    def _commit_whole(self) -> None:
+        """Commit what every group has saved that had not failed by then."""
+        for step in sorted(self._saved):
+            needed = {group for group in range(len(self.groups)) if not self._had_failed(group, step)}
+            is_whole = self._saved[step] and needed <= self._saved[step].keys()
+            if is_whole and self._written <= step:  # else the tables have rows already that are not part of it
+                self._commit(step)
+
+    def _had_failed(self, group: int, step: int) -> bool:
+        return all(seed in self.failures and self._failed_at[seed] <= step for seed in self.groups[group])
+
+    def _commit(self, step: int) -> None:
+        assert self.checkpoints
+        self._flush(step)
+        files = {name: facts for part in self._saved[step].values() for name, facts in part.items()}
+        failures = {seed: text for seed, text in self.failures.items() if self._failed_at[seed] <= step}
+        values = {"sizes": self.run.sync(), "failures": failures, "groups": self.groups}
+        # Said before, so that no checkpoint is ever taken for exact that is not.
+        self.run.update_manifest(steps_done=step, inexact_seeds=sorted(self.inexact))
+        self.checkpoints.commit(step, files, values)
+        for earlier in [other for other in self._saved if other <= step]:
+            del self._saved[earlier]
+
+    def _go_back(self, group: int, step: int) -> None:
+        """Wait for a group that was started again at `step`.
+
+        It will pass the steps of checkpoints again and save: until then the one that it began with must stay, and no
+        row of a later step may reach the tables.
+        """
+        self._passed[group] = step
         for part in self._saved.values():
             part.pop(group, None)
 
@@ -153,6 +176,7 @@ class Recorder:
         for seed in self.groups[group]:
             self._note_failure(seed, self._steps[seed], event.reason, event.details)
         self._passed[group] = OVER
+        self._commit_whole()
         self._flush()
 
     def _note_failure(self, seed: int, step: int, reason: str, details: str) -> None:
@@ -187,9 +211,10 @@ class Recorder:
     def _policy_file(self, seed: int, kind: str = "") -> Path:
         return self.run.path / "policy" / f"seed_{seed}{kind}.safetensors"
 
-    def _flush(self) -> None:
-        """Write the rows that no group can precede any more."""
-        limit = min(self._passed)
+    def _flush(self, until: int = OVER) -> None:
+        """Write the rows that no group can precede any more, as far as step `until`."""
+        limit = min(until, *self._passed)
+        self._written = max(limit, self._written)
         for table in get_args(Table):
             waiting = self._pending[table]
             ready = [row for row in waiting if row["step"] <= limit]
