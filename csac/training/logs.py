@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict, deque
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -25,16 +28,15 @@ class TensorBoardLog:
     `rollout/ep_rew_mean` and `rollout/ep_len_mean` are means over the last 100 training episodes, `eval/mean_reward`,
     `eval/mean_ep_length` and `eval/success_rate` over one evaluation's episodes; `time/fps` is environment steps per
     second of this seed since the log was made, for a run that goes on from step `begin` since then.
+
+    Whatever writes raises OSError where the disk is full.
     """
 
     def __init__(
         self, path: Path, seeds: Sequence[int], begin: int = 0, clock: Callable[[], float] = time.monotonic
     ) -> None:
         purge = begin + 1 if begin else None  # what a run wrote after the step that it goes on from
-        self._writers = {
-            seed: SummaryWriter(str(path / f"seed_{seed}"), flush_secs=FLUSH_SECONDS, purge_step=purge)
-            for seed in seeds
-        }
+        self._files = {seed: _EventFile(path / f"seed_{seed}", purge) for seed in seeds}
         self._begin = begin
         self._recent: dict[int, deque[tuple[float, int]]] = {seed: deque(maxlen=EPISODES_AVERAGED) for seed in seeds}
         self._clock, self._began = clock, clock()
@@ -70,12 +72,45 @@ class TensorBoardLog:
 
     def close(self) -> None:
         """Write what still waits and close the files. May be called again."""
-        for writer in self._writers.values():
-            writer.close()
+        for file in self._files.values():
+            file.close()
 
     def _write(self, seed: int, step: int, values: Mapping[str, Any]) -> None:
         for tag, value in values.items():
-            self._writers[seed].add_scalar(tag, float(value), step)
+            self._files[seed].add(Event(step=step, summary=Summary(value=[_value(tag, value)])))
+
+
+class _EventFile:
+    """One seed's file.
+
+    Not tensorboardX's own writer: its thread dies of a full disk, and whoever adds to its queue then waits for ever.
+    """
+
+    def __init__(self, folder: Path, purge_step: int | None) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._events: EventsWriter | None = EventsWriter(str(folder / "events"))
+        self._flushed = time.monotonic()
+        if purge_step is not None:
+            self.add(Event(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
+
+    def add(self, event: Event) -> None:
+        assert self._events
+        event.wall_time = time.time()
+        self._events.write_event(event)
+        if time.monotonic() - self._flushed >= FLUSH_SECONDS:
+            self._events.flush()
+            self._flushed = time.monotonic()
+
+    def close(self) -> None:
+        """Close the file; what cannot be written is left out, since nothing depends on it."""
+        events, self._events = self._events, None
+        if events:
+            with suppress(OSError):
+                events.close()
+
+
+def _value(tag: str, value: float) -> Summary.Value:
+    return Summary.Value(tag=tag, simple_value=float(value))
 
 
 def _grouped(rows: Sequence[Row]) -> dict[tuple[int, int], list[Row]]:
