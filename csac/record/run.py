@@ -7,7 +7,7 @@ import os
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import numpy as np
 
@@ -145,7 +145,7 @@ class RunDirectory:
 
         Raises InputError where another process holds it.
         """
-        with open(self.path / LOCK, "a+") as file:
+        with self._open_lock() as file:
             if fcntl:
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -157,6 +157,12 @@ class RunDirectory:
             file.write(f"{os.getpid()}\n")
             file.flush()
             yield
+
+    def _open_lock(self) -> TextIO:
+        try:
+            return open(self.path / LOCK, "a+")
+        except OSError as error:
+            raise InputError(f"cannot write to {self.path}: {error.strerror}; check its permissions") from None
 
     def _table(self, name: Table) -> Path:
         return self.path / f"{name}.csv"
@@ -209,23 +215,39 @@ def _claim(path: Path, manifest: dict[str, Any]) -> None:
     """Make `path` a run, or raise and leave it as it was."""
     _refuse_occupied(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    claimed = False
     try:
         path.mkdir(parents=True, exist_ok=True)
         # Of two processes that found the same empty directory, only one gets past this line.
-        (path / MANIFEST).touch(exist_ok=False)
-        claimed = True
-        write_atomically(path / MANIFEST, _encode(manifest))
+        _create_atomically(path / MANIFEST, _encode(manifest))
     except FileExistsError:
         _refuse_occupied(path)
         raise
     except BaseException:
-        if claimed:
-            (path / MANIFEST).unlink(missing_ok=True)
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()
         raise
+
+
+def _create_atomically(path: Path, data: bytes) -> None:
+    """As `write_atomically`, but raise FileExistsError where the name is taken."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        write_atomically(aside, data)
+        try:
+            os.link(aside, path)
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without links
+            path.touch(exist_ok=False)
+            os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def _is_left_over(path: Path) -> bool:
+    """Whether this is what a process leaves that is killed while it creates a run."""
+    return path.name.startswith((f".{MANIFEST}.", f"..{MANIFEST}."))
 
 
 def _refuse_occupied(path: Path) -> None:
@@ -233,7 +255,7 @@ def _refuse_occupied(path: Path) -> None:
         raise InputError(f"{path} already holds a run; resume it, or choose another directory")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path} is a file; choose another directory")
-    if path.exists() and any(path.iterdir()):
+    if path.exists() and not all(_is_left_over(entry) for entry in path.iterdir()):
         raise InputError(f"{path} is not empty and holds no run; choose a new or an empty directory")
 
 
