@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import re
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -25,16 +26,21 @@ from csac.training.snapshots import Snapshot
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
 SCHEMA_VERSION = 1
 FOLDER = "checkpoint"
 
+_NUMBER = r"[0-9]{1,15}"
+_FILE_NAME = re.compile(
+    rf"(step_{_NUMBER}\.seed_{_NUMBER}(\.best)?|replay/seed_{_NUMBER}\.{_NUMBER}-{_NUMBER})\.safetensors"
+)
+
 Files = dict[str, dict[str, Any]]  # name below the folder -> {"bytes": size, "sha256": checksum}
 
 
-class Damaged(Exception):
+class Damaged(InputError):
     """A checkpoint's file is missing, cut off or changed. The message names it."""
 
 
@@ -64,7 +70,8 @@ class SeedFiles:
         Raises:
             OSError: the disk is full, or the folder is gone.
         """
-        (self.folder / "replay").mkdir(parents=True, exist_ok=True)
+        for folder in (self.folder, self.folder / "replay"):  # not their parents: a run that was deleted stays so
+            folder.mkdir(exist_ok=True)
         self._write_new_rows(memory)
         name = f"step_{step}.seed_{self.seed}.safetensors"
         content = safetensors.numpy.save(
@@ -198,6 +205,18 @@ class Checkpoints:
                 path.unlink(missing_ok=True)
 
 
+@contextmanager
+def taken_back(checkpoint: Checkpoint) -> Iterator[None]:
+    """Raise Damaged where a checkpoint whose checksums are right does not hold what csac saves."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        where = checkpoint.folder / f"step_{checkpoint.step}.json"
+        raise Damaged(f"{where} is not what csac writes ({type(error).__name__}: {error})") from error
+
+
 def steps_in(folder: Path) -> list[int]:
     """Return the steps that a folder has checkpoints of, in order, sound or not."""
     names = (re.fullmatch(r"step_(\d+)\.json", path.name) for path in folder.glob("step_*.json"))
@@ -278,7 +297,7 @@ def _shards(files: Mapping[str, Any], seed: int) -> list[tuple[int, int, str]]:
 
 def _checked_files(files: Any) -> Files:
     for name, facts in files.items():
-        if not re.fullmatch(r"(step_\d+\.seed_\d+(\.best)?|replay/seed_\d+\.\d+-\d+)\.safetensors", name):
+        if not _FILE_NAME.fullmatch(name):
             raise ValueError(f"{name!r} is no file of a checkpoint")
         if type(facts["bytes"]) is not int or not isinstance(facts["sha256"], str):
             raise TypeError(f"{name!r} has no size and checksum")

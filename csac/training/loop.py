@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from csac.deploy.policy import Contract, Policy
-from csac.training.checkpoint import Checkpoint, SeedFiles
+from csac.training.checkpoint import Checkpoint, SeedFiles, taken_back
 from csac.training.environments import SeedEnvironments
 from csac.training.evaluation import LONGEST_EPISODE, EvaluationFailure, Evaluator
 from csac.training.learner import Learner
@@ -134,8 +134,10 @@ class Group:
             *self.environments.contract_parts,
         )
         self._files: list[SeedFiles] = []
-        if settings.begin:
-            self._go_on()
+        if settings.checkpoints and settings.begin:
+            checkpoint = Checkpoint.open(settings.checkpoints, settings.begin)
+            with taken_back(checkpoint):
+                self._go_on(checkpoint)
         else:
             self._observations = self.environments.reset()
             self._actions = self.learner.next_actions(self._observations, 0)
@@ -224,10 +226,8 @@ class Group:
                 reason = f"{bad} is not finite: learning has diverged (a lower learning rate may help)"
                 yield Failed(self.seeds[index], self.step, reason, "", None)
 
-    def _go_on(self) -> None:
-        """Take everything back that `save` wrote at the step to begin from."""
-        assert self.settings.checkpoints
-        checkpoint = Checkpoint.open(self.settings.checkpoints, self.settings.begin)
+    def _go_on(self, checkpoint: Checkpoint) -> None:
+        """Take everything back that `save` wrote."""
         actions = np.zeros((len(self.seeds), self.environments.spec.action_size), np.float32)
         learnt, anew = [], []
         for index, seed in enumerate(self.seeds):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.algorithms import ALGORITHMS
 from csac.record.run import GROWING_FILES, RunDirectory
-from csac.training.checkpoint import FOLDER, Checkpoint, Checkpoints, link, newest_sound, sound_at
+from csac.training.checkpoint import FOLDER, Checkpoint, Checkpoints, link, newest_sound, sound_at, taken_back
 from csac.training.learner import misfit
 from csac.types import InputError
 
@@ -83,6 +83,8 @@ def roll_back(run: RunDirectory) -> Point:
     checkpoint, complaints = newest_sound(folder)
     if checkpoint is None and complaints:
         raise InputError(f"no checkpoint of {run.path} is sound: {'; '.join(complaints)}")
+    if checkpoint is None and "forked_from" in run.manifest:
+        raise InputError(f"{run.path} was stopped before it had its first checkpoint: remove it and train --from again")
     step = checkpoint.step if checkpoint else 0
     run.cut_back(checkpoint.values["sizes"] if checkpoint else {})
     for unfinished in [*run.path.glob(".*.*"), *run.path.glob("policy/*.tmp")]:
@@ -170,8 +172,9 @@ class Source(NamedTuple):
         if missing:
             differences.append(f"it has no seeds {', '.join(map(str, missing))}")
         if not differences:
-            saved = self.checkpoint.seed(wanted["seeds"][0]).part("learner")
-            differences += filter(None, [misfit(algorithm, spec, wanted["steps"], saved)])
+            with taken_back(self.checkpoint):
+                saved = self.checkpoint.seed(wanted["seeds"][0]).part("learner")
+                differences += filter(None, [misfit(algorithm, spec, wanted["steps"], saved)])
         if differences:
             raise InputError(f"{self.run.path} does not fit: {'; '.join(differences)}")
         if wanted["steps"] <= self.checkpoint.step:
