@@ -168,17 +168,17 @@ def train(
     watchers = _Watchers(reporter, tensorboard, on_evaluation, stop_when)
     if existing:
         refuse_differences(existing, manifest, algorithm)
-        with existing.locked():
+        with existing.locked(), _storage_failures_told(existing):
             return _go_on(existing, settings, manifest, notes, watchers)
     if start_from is not None:
         source = Source.find(start_from)
         source.refuse_misfit(manifest, algorithm, spec)
         run = RunDirectory.create(path, {**manifest, "forked_from": source.described(manifest)})
-        with run.locked():
+        with run.locked(), _storage_failures_told(run):
             source.copy_to(run, keep_checkpoints)
             return _go_on(run, settings, manifest, notes, watchers)
     run = RunDirectory.create(path, manifest)
-    with run.locked():
+    with run.locked(), _storage_failures_told(run):
         return _run(run, settings, notes, watchers, BEGINNING)
 
 
@@ -272,10 +272,8 @@ def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Wat
         _finish(run, recorder, "interrupted" if stopped else "failed" if recorder.failures else "finished")
         if reporter:
             reporter.finish(run)
-    except BaseException as error:
+    except BaseException:
         _leave(run, recorder)
-        if isinstance(error, OSError) and error.errno in _CANNOT_WRITE:
-            raise StorageFailure(f"{run.path} cannot be written: {error.strerror}") from error
         raise
     finally:
         if log:
@@ -285,6 +283,17 @@ def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Wat
     if stopped:
         raise Interrupted(run, received[0])
     return run
+
+
+@contextmanager
+def _storage_failures_told(run: RunDirectory) -> Iterator[None]:
+    """Raise StorageFailure where the run can no longer be written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _CANNOT_WRITE:
+            raise StorageFailure(f"{run.path} cannot be written: {error.strerror}") from error
+        raise
 
 
 def _leave(run: RunDirectory, recorder: Recorder) -> None:
