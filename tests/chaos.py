@@ -305,7 +305,8 @@ class Chaos:
         checkpoint, complaints = newest_sound(run / FOLDER)
         step = checkpoint.step if checkpoint else 0
         lost = lost_rows(run, self.whole)
-        return Kill(number, plan.kind, reached(run), process.returncode, step, plan.by, len(complaints), lost, orphans)
+        by = plan.by if (run / "manifest.json").exists() else "train"  # it may have died before there was a run
+        return Kill(number, plan.kind, reached(run), process.returncode, step, by, len(complaints), lost, orphans)
 
 
 def _wait_for_moment(plan: Plan, process: subprocess.Popen[str], run: Path, target: float) -> bool:

@@ -586,6 +586,14 @@ def test_a_fork_killed_before_it_had_its_checkpoint_does_not_begin_from_nothing(
         resume(tmp_path / "fork")
 
 
+def test_a_fork_that_wants_no_checkpoints_begins_with_one_all_the_same(tmp_path):
+    first = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "first", **SHORT)
+    plain = {**SHORT, "steps": 500, "checkpoint_interval": 0}
+    fork = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "fork", start_from=first.path, **plain)
+    resume(first.path, steps=500)
+    assert tables(fork.path) == tables(first.path)
+
+
 def test_a_stranger_s_checkpoint_is_refused_in_one_line(tmp_path):
     """Its checksums are right, and what it holds is not what csac saves."""
     first = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "first", **SHORT)

@@ -134,7 +134,8 @@ class Group:
             *self.environments.contract_parts,
         )
         self._files: list[SeedFiles] = []
-        if settings.checkpoints and settings.begin:
+        if settings.begin:
+            assert settings.checkpoints
             checkpoint = Checkpoint.open(settings.checkpoints, settings.begin)
             with taken_back(checkpoint):
                 self._go_on(checkpoint)

@@ -239,7 +239,8 @@ def _go_on(
     }
     notes = [*notes, *point.notes(run.manifest, manifest)]
     run.update_manifest(**current, state="running", history=history, failures=point.failures, steps_done=point.step)
-    return _run(run, settings._replace(begin=point.step), notes, watchers, point)
+    folder = (run.path / FOLDER).absolute() if point.step else settings.checkpoints  # needed, if only to be read
+    return _run(run, settings._replace(begin=point.step, checkpoints=folder), notes, watchers, point)
 
 
 def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Watchers, point: Point) -> RunDirectory:
