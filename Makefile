@@ -18,7 +18,7 @@ define require_python
 @test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
 endef
 
-.PHONY: help setup train test check lock clean peers bench
+.PHONY: help setup train test chaos check lock clean peers bench
 
 help:  ## List the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
@@ -31,6 +31,9 @@ train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=2 S
 
 test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
 	.venv/bin/pytest $(ARGS)
+
+chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave, 20 minutes: make chaos ARGS='--kills 12'
+	.venv/bin/python tests/chaos.py --out results/reliability $(ARGS)
 
 check: $(SETUP)  ## Check format, lint, types and the direction of imports
 	.venv/bin/ruff format --check --exclude '*.md' .

@@ -27,6 +27,7 @@ from csac.algorithms import CSAC
 from csac.deploy.policy import Contract, Policy
 from csac.record.run import RunDirectory
 from csac.training.checkpoint import Checkpoint, Checkpoints, Damaged, Ring, SeedFiles, newest_sound, steps_in
+from csac.training.environments import SeedEnvironments
 from csac.training.groups import GroupCrashed, GroupRestarted
 from csac.training.logs import TensorBoardLog
 from csac.training.loop import Ended, Progress, Rows, Saved
@@ -425,6 +426,29 @@ def test_a_group_that_merely_stopped_makes_no_checkpoint_whole(recorder):
     saves(recorder, 0, 300)
     recorder.handle(1, Ended(0, {}))
     assert not steps_in(recorder.run.path / "checkpoint")
+
+
+# What the documentation shows.
+
+
+def test_the_environment_of_the_documentation_can_be_saved(tmp_path):
+    text = (Path(__file__).parents[1] / "docs" / "reliability.md").read_text()
+    shown: dict[str, Any] = {}
+    exec(text.split("```python\n")[1].split("```")[0], shown)
+    first, second = (SeedEnvironments(shown["Walk"], None, [3]) for _ in range(2))
+    first.reset()
+    action = np.full((1, 1), 0.5, np.float32)
+    for _ in range(70):  # into the second episode
+        first.step(action)
+    saved = first.save(0)
+    assert second.take_back(0, Snapshot(saved.arrays, json.loads(json.dumps(saved.values))))
+    for _ in range(40):  # into the third
+        ours, theirs = second.step(action), first.step(action)
+        assert (ours.next_observation, ours.reward, ours.episodes) == (
+            theirs.next_observation,
+            theirs.reward,
+            theirs.episodes,
+        )
 
 
 # A disk that is full, a directory that is gone. The run is small; evaluation at 100, 200, ...
