@@ -26,7 +26,16 @@ from csac import cli
 from csac.algorithms import CSAC
 from csac.deploy.policy import Contract, Policy
 from csac.record.run import RunDirectory
-from csac.training.checkpoint import Checkpoint, Checkpoints, Damaged, Ring, SeedFiles, newest_sound, steps_in
+from csac.training.checkpoint import (
+    Checkpoint,
+    Checkpoints,
+    Damaged,
+    Ring,
+    SeedFiles,
+    newest_sound,
+    remove_unfinished,
+    steps_in,
+)
 from csac.training.environments import SeedEnvironments
 from csac.training.groups import GroupCrashed, GroupRestarted
 from csac.training.logs import TensorBoardLog
@@ -629,3 +638,12 @@ def test_a_stranger_s_checkpoint_is_refused_in_one_line(tmp_path):
         train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "fork", start_from=first.path, **{**SHORT, "steps": 500})
     with pytest.raises(InputError, match=r"step_400\.json is not what csac writes"):
         resume(first.path, steps=500)
+
+
+def test_what_a_dead_process_left_unfinished_is_removed_and_nothing_else(tmp_path):
+    (tmp_path / "replay").mkdir()
+    for name in (".step_3.seed_0.safetensors.77", "replay/.seed_0.0-3.safetensors.77", ".step_3.json.78", "step_3.json"):
+        (tmp_path / name).touch()
+    remove_unfinished(tmp_path, 77)
+    left = sorted(path.name for path in tmp_path.rglob("*") if path.is_file())
+    assert left == [".step_3.json.78", "step_3.json"]

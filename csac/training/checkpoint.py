@@ -223,6 +223,12 @@ def steps_in(folder: Path) -> list[int]:
     return sorted(int(match[1]) for match in names if match)
 
 
+def remove_unfinished(folder: Path, process: int | None) -> None:
+    """Remove what a process that is no more was writing when it died."""
+    for path in folder.glob(f"**/.*.{process}"):
+        path.unlink(missing_ok=True)
+
+
 def _step_of(name: str) -> int:
     """Return the step that a file of a checkpoint, or of transitions, was written at."""
     match = re.match(r"step_(\d+)\.|seed_\d+\.\d+-(\d+)\.", name)

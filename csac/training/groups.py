@@ -15,6 +15,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+from csac.training.checkpoint import remove_unfinished
 from csac.training.loop import Ended, Event, Group, Progress, Saved, Settings, is_boundary
 from csac.types import InputError
 
@@ -229,6 +230,8 @@ class _Scheduler:
         """Let another process go on from the newest checkpoint, once."""
         worker.kill()
         self._take_cores(worker)
+        if self.settings.checkpoints:
+            remove_unfinished(self.settings.checkpoints, worker.process.pid)
         reason = _cause_of_death(worker.process.exitcode)
         if self.stopping and self.checkpoints and index not in self.restarted:
             worker.over = True  # and no failure: the run goes on from the last step at which all were saved
