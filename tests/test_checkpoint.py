@@ -642,7 +642,12 @@ def test_a_stranger_s_checkpoint_is_refused_in_one_line(tmp_path):
 
 def test_what_a_dead_process_left_unfinished_is_removed_and_nothing_else(tmp_path):
     (tmp_path / "replay").mkdir()
-    for name in (".step_3.seed_0.safetensors.77", "replay/.seed_0.0-3.safetensors.77", ".step_3.json.78", "step_3.json"):
+    for name in (
+        ".step_3.seed_0.safetensors.77",
+        "replay/.seed_0.0-3.safetensors.77",
+        ".step_3.json.78",
+        "step_3.json",
+    ):
         (tmp_path / name).touch()
     remove_unfinished(tmp_path, 77)
     left = sorted(path.name for path in tmp_path.rglob("*") if path.is_file())
