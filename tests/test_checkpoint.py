@@ -37,9 +37,9 @@ from csac.training.checkpoint import (
     steps_in,
 )
 from csac.training.environments import SeedEnvironments
-from csac.training.groups import GroupCrashed, GroupRestarted
+from csac.training.groups import GroupCrashed, GroupRestarted, _Scheduler
 from csac.training.logs import TensorBoardLog
-from csac.training.loop import Ended, Progress, Rows, Saved
+from csac.training.loop import Ended, Failed, Progress, Rows, Saved, Settings
 from csac.training.recorder import Recorder
 from csac.training.snapshots import Snapshot
 from csac.training.train import resume, train
@@ -431,6 +431,39 @@ def test_the_last_checkpoint_comes_though_the_slower_group_crashed(recorder):
     assert list(Checkpoint.open(place, 900).values["failures"]) == ["1"]
 
 
+def test_the_last_checkpoint_comes_though_every_seed_of_the_slower_group_failed(recorder):
+    for group in (0, 1):
+        saves(recorder, group, 300)
+    saves(recorder, 0, 600)
+    recorder.handle(1, Failed(1, 450, "a reward is NaN", "", None))
+    recorder.handle(1, Ended(450, {}))
+    assert steps_in(recorder.run.path / "checkpoint") == [300, 600]
+
+
+class DeadWorker:
+    """A worker that was killed in the middle of a message."""
+
+    def __init__(self) -> None:
+        self.connection = self.process = self
+        self.exitcode, self.pid, self.step, self.cores, self.over = -9, 4711, 250, None, False
+
+    def recv(self) -> None:
+        raise OSError("got end of file during message")
+
+    def kill(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("stopping", "before", "kind"), [(True, set(), Ended), (True, {0}, GroupCrashed)])
+def test_a_worker_that_dies_while_a_run_stops_is_no_failure_unless_it_died_before(tmp_path, stopping, before, kind):
+    scheduler: Any = object.__new__(_Scheduler)
+    scheduler.stopping, scheduler.restarted, scheduler.checkpoints = stopping, before, Checkpoints(tmp_path, 2)
+    scheduler.settings = Settings(CSAC(), "Hopper-v4", {}, 900, 100, 1, tmp_path)
+    worker: Any = DeadWorker()
+    assert type(scheduler._receive(0, worker)) is kind
+    assert worker.over
+
+
 def test_a_group_that_merely_stopped_makes_no_checkpoint_whole(recorder):
     saves(recorder, 0, 300)
     recorder.handle(1, Ended(0, {}))
@@ -551,12 +584,14 @@ def test_a_run_that_is_removed_ends_and_stays_removed(tmp_path, capsys):
     assert not path.exists()
 
 
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_full_disk_keeps_nobody_waiting_for_tensorboard(tmp_path):
     log = TensorBoardLog(tmp_path, [0])
     row = {"seed": 0, "step": 1, "return": 1.0, "length": 5}
     with no_file_larger_than(10_000), pytest.raises(OSError, match="File too large"):
         consume(log.episodes([row]) for _ in range(2000))
-    log.close()
+    with no_file_larger_than(10_000):
+        log.close()
 
 
 def consume(items: Iterable[Any]) -> None:
