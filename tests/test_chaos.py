@@ -18,7 +18,8 @@ from chaos import RESTARTED, TRAIN, TWO_PROCESSES, differences, reached, start, 
 
 from csac.training.checkpoint import FOLDER, steps_in
 
-SHORTER = ["--steps", "800", "--evaluation-interval", "200"]
+# A hundred updates at each step, so that a run takes seconds and is still on its way when its kill comes.
+SHORTER = ["--steps", "800", "--evaluation-interval", "200", "--updates-per-step", "100"]
 ALONE = [*TRAIN, *SHORTER]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 
