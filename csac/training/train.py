@@ -391,7 +391,9 @@ def _choose_device(device: str) -> None:
         except Exception as error:  # which one depends on what is missing, and on JAX's version
             jax.config.update("jax_platforms", before)
             raise InputError("no GPU that JAX can use: install csac[cuda], or choose the cpu") from error
-    os.environ["JAX_PLATFORMS"] = platform_name  # for the workers
+    # Every dispatch is waited for at once: handing it to another thread would only cost the hand-over.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    os.environ |= {"JAX_PLATFORMS": platform_name, "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0"}  # for the workers
 
 
 def _memory_note(algorithm: Algorithm, spec: Spec, steps: int, seeds: int, processes: int) -> str:
