@@ -20,7 +20,7 @@ RESERVED = frozenset({"seed", "step", "episode", "return", "length", "success"})
 RESERVED_TAGS = frozenset({"mean_reward", "mean_ep_length", "success_rate"})
 
 _CONTEXT = 2  # waypoints that the policy sees: the one it flies to and the next
-_EYE = np.array([0.0, 0.0, 0.7])  # metres above the drone
+_EYE = np.array([0.0, 0.0, 0.5])  # metres above the drone
 
 
 class Adapter(NamedTuple):
@@ -78,7 +78,7 @@ def chase(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
             # A new waypoint turns the camera by and by; a new episode, at once.
             direction = wanted if drone.step_count == 0 else 0.9 * direction + 0.1 * wanted
         level = direction * np.array([1.0, 1.0, 0.3])
-        eye = position - 1.6 * level + _EYE
+        eye = position - 1.2 * level + _EYE
         eye[2] = max(eye[2], 0.1)
         client = drone.env
         view = client.computeViewMatrix(eye.tolist(), (position + level).tolist(), [0.0, 0.0, 1.0])
@@ -98,7 +98,7 @@ _PYFLYT = Adapter("PyFlyt.gym_envs")
 _PANDA = Adapter(
     "panda_gym",
     has_memory=True,
-    picture_arguments={"render_target_position": (-0.25, 0.0, 0.15), "render_distance": 1.2, "render_pitch": -25},
+    picture_arguments={"render_target_position": (-0.25, 0.0, 0.25), "render_distance": 1.3, "render_pitch": -25},
     pictures_per_second=10,
 )
 
