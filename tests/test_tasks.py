@@ -228,16 +228,10 @@ c.fflush(None)
 
 def test_silence_is_for_pybullet_alone(tmp_path):
     ended = run_python(CHATTER, tmp_path)
+    # C, Python and threads have buffers of their own, so only the order within each is theirs.
+    assert ended.stdout == "before\n\x1b[2Kprogressno chatter\nwithin\nargv[0]=after\nraised ours\n"
+    assert ended.stderr == "Version = ours: argv\n"
     assert ended.returncode == 0
-    lines = ended.stdout.splitlines()
-    assert lines[0] == "before"
-    assert sorted(lines[1:4]) == sorted(["no chatter", "\x1b[2Kprogresswithin", "raised ours"]) or "no chatter" in lines
-    assert "argv[0]=after" in lines
-    for told in ("no chatter", "\x1b[2Kprogress", "within", "raised ours"):
-        assert told in ended.stdout
-    for chatter in ("build time", "background", "\x1b[A", "numActive", "stopping"):
-        assert chatter not in ended.stdout
-    assert ended.stderr in ("", "Version = ours: argv\n")
 
 
 def test_silence_survives_a_closed_output(tmp_path):

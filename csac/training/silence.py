@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# What PyBullet prints, and with what PyFlyt's Aviary clears it from a terminal. Words that others may print as well
-# count at the beginning of a line alone; the others may follow what a display has left without a newline.
+# What PyBullet prints, the second half with a window alone, and with what PyFlyt's Aviary clears it from a terminal. It
+# need not begin a line: what a display has left may stand before it.
 _CHATTER = re.compile(
     rb"(?:pybullet build time: [^\n]*|arg[cv](?:\[\d+\])? ?=[^\n]*|\x1b\[A *\x1b\[A|b3(?:Printf|Warning|Error)[^\n]*"
-    rb"|^(?:creating|starting|started|stopping|destroy|main) (?:threads?|semaphore)[^\n]*|^startThreads[^\n]*"
-    rb"|^(?:GL_\w+|Version|Vendor|Renderer|ven|pthread_getconcurrency\(\)) ?= ?[^\n]*|^numActiveThreads = \d+"
-    rb"|^MotionThreadFunc: [^\n]*|^Thread with taskId [^\n]*|^Thread TERMINATED|^semaphore destroyed)\r?\n",
-    re.MULTILINE,
+    rb"|startThreads creating [^\n]*|start(?:ed|ing) thread \d+[^\n]*|numActiveThreads = \d+|stopping threads"
+    rb"|GL_[A-Z_]+=[^\n]*|MotionThreadFunc: [^\n]*|Thread with taskId [^\n]*|Thread TERMINATED)\r?\n"
 )
 
 _lock = threading.RLock()  # the descriptors belong to the whole process
