@@ -14,29 +14,38 @@ from csac.deploy.policy import load
 from csac.record.run import RunDirectory
 from csac.training.environments import FRESH_EVALUATION_SEED, Environment
 from csac.training.evaluation import EvaluationEpisode, Evaluator
+from csac.training.perturb import lasting, perturbations_of, values_at
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator
+    from collections.abc import Callable, Generator, Iterable, Iterator
+
+    from csac.training.perturb import Perturbation
 
 DEFAULT_FRAMES_PER_SECOND = 30
 
 
 def evaluate_run(
-    directory: str | Path, seed: int | None = None, episodes: int = 10, deterministic: bool = True
+    directory: str | Path,
+    seed: int | None = None,
+    episodes: int = 10,
+    deterministic: bool = True,
+    perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> Iterator[tuple[int, list[EvaluationEpisode]]]:
     """Yield (seed, episodes) for the last policy of each seed of a run, or of the one asked for.
 
-    The episodes are the same for every seed, and none that training or its evaluations have seen.
+    The episodes are the same for every seed, and none that training or its evaluations have seen. The task is the one
+    that the run began with, but for these `perturbations`, which last from beginning to end.
 
     Raises:
-        InputError: no run there, no such seed, a damaged file, or a task that can no longer be made.
+        InputError: no run there, no such seed, a damaged file, or a task that can no longer be made or perturbed so.
         EvaluationFailure: an environment raised, or gave what is not finite.
     """
     run = _open(directory)
     evaluator = Evaluator(
         run.manifest["task"], run.manifest.get("environment_arguments"), episodes, FRESH_EVALUATION_SEED
     )
+    evaluator.perturb(values_at(lasting(perturbations), 0))
     try:
         for label in _seeds_with_policies(run) if seed is None else [seed]:
             yield label, evaluator.run(load(directory, label), deterministic)
@@ -44,18 +53,34 @@ def evaluate_run(
         evaluator.close()
 
 
+def told_perturbations(
+    directory: str | Path, perturbations: str | Perturbation | Iterable[str | Perturbation]
+) -> list[str]:
+    """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
+    given = lasting(perturbations)
+    trained = perturbations_of(RunDirectory.open(directory).manifest.get("perturbations", []))
+    if given:
+        return [f"perturbed: {', '.join(item.label for item in given)}"]
+    return [f"not perturbed, unlike its training ({', '.join(map(str, trained))}): see --perturb"] if trained else []
+
+
 def play(
-    directory: str | Path, seed: int | None = None, episodes: int = 1, video: str | Path | None = None
+    directory: str | Path,
+    seed: int | None = None,
+    episodes: int = 1,
+    video: str | Path | None = None,
+    perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> Iterator[EvaluationEpisode]:
     """Yield the episodes that a run's policy plays, in a window or, with `video`, into an .mp4 file.
 
     Without `seed` it is the seed with the best last evaluations. The video is there once the last episode was yielded.
+    `perturbations` are as in `evaluate_run`.
 
     Raises:
         InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
         EnvironmentFailure: the environment raised, or gave what is not finite.
     """
-    run = _open(directory)
+    run, perturbed = _open(directory), values_at(lasting(perturbations), 0)
     if episodes < 1:
         raise InputError(f"{episodes} episodes: play at least one")
     policy = load(directory, seed)
@@ -65,8 +90,9 @@ def play(
         _check_video(Path(video))
         _draw_off_screen()
     environment = _drawn_environment(run, "human" if video is None else "rgb_array")
-    _follow(environment)
     try:
+        environment.perturb(perturbed)
+        _follow(environment)
         with _recording(environment, video) as record:
             for number in range(episodes):
                 observation = environment.reset(FRESH_EVALUATION_SEED + number)

@@ -26,13 +26,24 @@ from csac.training.environments import Environment, Task
 from csac.training.groups import choose_groups, run_groups, split_seeds
 from csac.training.logs import TensorBoardLog
 from csac.training.loop import Settings
+from csac.training.perturb import by_step, perturbations_of, refuse_late
 from csac.training.recorder import Recorder
-from csac.training.resume import BEGINNING, Point, Source, algorithm_of, arguments_of, refuse_differences, roll_back
+from csac.training.resume import (
+    BEGINNING,
+    Point,
+    Source,
+    algorithm_of,
+    arguments_of,
+    refuse_differences,
+    roll_back,
+    with_past,
+)
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
+    from csac.training.perturb import Perturbation
     from csac.training.progress import Reporter
     from csac.types import Algorithm, Spec
 
@@ -75,6 +86,7 @@ def train(
     evaluation_interval: int = 5_000,
     evaluation_episodes: int = 10,
     environment_arguments: dict[str, Any] | None = None,
+    perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
     device: str = "cpu",
     checkpoint_interval: int = 50_000,
     keep_checkpoints: int = 2,
@@ -101,6 +113,8 @@ def train(
         evaluation_interval: environment steps between evaluations; there is one at the last step as well.
         evaluation_episodes: episodes of each evaluation.
         environment_arguments: keyword arguments for the environment.
+        perturbations: changes of the task, in training and evaluations, such as `("friction=1.5@300000",)`: see
+            `Perturbation`. What a run begins with (`start_from`) keeps what had happened to it.
         device: "cpu" or "gpu".
         checkpoint_interval: environment steps between checkpoints; there is one every ten minutes, at the last step and
             when a signal stops the run as well. 0 makes none.
@@ -125,13 +139,17 @@ def train(
         first_seed=first_seed, checkpoint_interval=checkpoint_interval, keep_checkpoints=keep_checkpoints
     )
     _choose_device(device)
-    environment = Environment(task, environment_arguments)
-    spec, task_name = environment.spec, environment.task_name
-    environment.close()
+    with closing(Environment(task, environment_arguments)) as environment:
+        spec, task_name = environment.spec, environment.task_name
+        path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
+        existing = RunDirectory.open(path) if resume and is_run(path) else None
+        source = Source.find(start_from) if start_from is not None and not existing else None
+        perturbations = with_past(perturbations_of(perturbations), existing, source)
+        refuse_late(perturbations, steps)
+        for item in perturbations:
+            environment.perturb({item.kind: item.value})
 
-    path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
     labels = list(range(first_seed, first_seed + seeds))
-    existing = RunDirectory.open(path) if resume and is_run(path) else None
     parts = split_seeds(labels, _choose_number_of_groups(groups, labels, device, existing))
     settings = Settings(
         algorithm,
@@ -142,6 +160,7 @@ def train(
         evaluation_episodes,
         (path / FOLDER).absolute() if checkpoint_interval else None,
         checkpoint_interval,
+        perturbations=perturbations,
     )
     if len(parts) > 1:
         _check_picklable(settings)
@@ -150,6 +169,7 @@ def train(
         "task": task_name,
         "task_is_callable": not isinstance(task, str),
         "environment_arguments": environment_arguments,
+        "perturbations": [str(item) for item in perturbations],
         "algorithm": algorithm.name,
         "hyperparameters": dataclasses.asdict(algorithm),  # pyright: ignore[reportArgumentType]
         "preset": preset,
@@ -170,8 +190,7 @@ def train(
         refuse_differences(existing, manifest, algorithm)
         with existing.locked(), _storage_failures_told(existing):
             return _go_on(existing, settings, manifest, notes, watchers)
-    if start_from is not None:
-        source = Source.find(start_from)
+    if source:
         source.refuse_misfit(manifest, algorithm, spec)
         run = RunDirectory.create(path, {**manifest, "forked_from": source.described(manifest)})
         with run.locked(), _storage_failures_told(run):
@@ -254,7 +273,7 @@ def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Wat
     checkpoints = None
     if settings.checkpoints:
         checkpoints = Checkpoints(settings.checkpoints, run.manifest["checkpoints"]["keep"], point.pinned)
-    recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures)
+    recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures, by_step(settings.perturbations))
     received, told = [], False
     try:
         with (
@@ -327,7 +346,9 @@ def _finish(run: RunDirectory, recorder: Recorder, state: str) -> None:
     rows = run.evaluations
     if len(rows):
         name, task = run.manifest["algorithm"].upper(), run.manifest["task"]
-        learning_curve([(name, rows)], run.path / "curve.png", title=task)
+        perturbed = by_step(perturbations_of(run.manifest.get("perturbations", [])))
+        marks = [(step, text) for step, text in perturbed if step <= rows["step"].max()]
+        learning_curve([(name, rows)], run.path / "curve.png", title=task, marks=marks)
     run.update_manifest(state=state, failures=recorder.failures)
 
 
