@@ -12,6 +12,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+REGAINED = 0.9  # of the return before a perturbation: the policy is back
 FEWEST_SEEDS = 5  # a bootstrap over fewer has too few distinct resamples to say anything
 
 
@@ -123,7 +124,7 @@ class Recovery(NamedTuple):
     """The largest fall from the highest return so far, over the whole curve, before the perturbation and after it."""
 
 
-def recovery(rows: np.ndarray, step: int, until: int | None = None, share: float = 0.9) -> dict[int, Recovery]:
+def recovery(rows: np.ndarray, step: int, until: int | None = None) -> dict[int, Recovery]:
     """Return each seed's `Recovery` from a perturbation after `step`, of the rows of evaluations.csv until `until`.
 
     An evaluation at `step` itself still counts as before. Of a negative return before, -100, 90 % are -110: `before`
@@ -135,13 +136,13 @@ def recovery(rows: np.ndarray, step: int, until: int | None = None, share: float
     wanted = steps <= (steps.max(initial=0) if until is None else until)
     there = ~np.isnan(returns) & wanted
     return {
-        int(seed): _recovery(steps[known], line[known], step, share)
+        int(seed): _recovery(steps[known], line[known], step)
         for seed, line, known in zip(seeds, returns, there, strict=True)
         if known.any()
     }
 
 
-def _recovery(steps: np.ndarray, returns: np.ndarray, step: int, share: float) -> Recovery:
+def _recovery(steps: np.ndarray, returns: np.ndarray, step: int) -> Recovery:
     is_after = steps > step
     final, drawdown = returns[-3:].mean(), (np.maximum.accumulate(returns) - returns).max()
     if is_after.all() or not is_after.any():
@@ -151,7 +152,7 @@ def _recovery(steps: np.ndarray, returns: np.ndarray, step: int, share: float) -
     drop = max(before - after.min(), 0.0)
     shortfall = np.maximum(before - after, 0.0)
     area = np.trapezoid([0.0, *shortfall], [step, *steps])
-    time = _time_to_regain(steps - step, after, before - (1 - share) * abs(before))
+    time = _time_to_regain(steps - step, after, (REGAINED if before >= 0 else 2 - REGAINED) * before)
     return Recovery(*map(float, (before, drop, _divide(drop, abs(before)), time, area, final, drawdown)))
 
 
