@@ -163,7 +163,9 @@ class Physics:
         self._mujoco: Any = sys.modules.get("mujoco")  # a task that it simulates has imported it
         self._model: Any = getattr(environment.unwrapped, "model", None)
         if self._mujoco is None or not isinstance(self._model, self._mujoco.MjModel):
-            raise InputError(f"{task_name} is no MuJoCo task: it can have {' and '.join(NOISES)}, not {PHYSICS[0]}")
+            raise InputError(
+                f"{task_name} is no MuJoCo task: {', '.join(PHYSICS)} cannot be changed, and {' and '.join(NOISES)} can"
+            )
         self._task_name = task_name
         self._original = copy.copy(self._model)
         self._factors = dict.fromkeys(PHYSICS, 1.0)
