@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -756,3 +758,29 @@ def test_a_fork_is_not_perturbed_in_its_past(tmp_path, plain):
     with pytest.raises(InputError, match="friction=2@199 lies before step 200, where this run begins"):
         run(tmp_path / "run", start_from=f"{plain.path}@200", perturbations="friction=2@199", **LONG)
     assert list(tmp_path.iterdir()) == []
+
+
+# The script that compares several runs.
+
+
+def test_several_runs_are_told_side_by_side(tmp_path, monkeypatch, capsys):
+    returns = {"a": [[100, 100, 40, 95], [100, 100, 100, 100]], "b": [[100, 100, 40, 40], [100, 100, 50, 60]]}
+    for name, seeds in returns.items():
+        rows = [
+            f"{seed},{10 * (t + 1)},0,{value},5," for seed, line in enumerate(seeds) for t, value in enumerate(line)
+        ]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["seed,step,episode,return,length,success", *rows, ""]))
+    script = Path(__file__).parents[1] / "results" / "recovery.py"
+    files = [f"{name.upper()}={tmp_path / name}.csv" for name in returns]
+    out = tmp_path / "picture.png"
+    monkeypatch.setattr(sys, "argv", [str(script), "--step", "20", "--out", str(out), *files])
+    runpy.run_path(str(script), run_name="__main__")
+    assert capsys.readouterr().out.splitlines()[2:] == [
+        "| A | 0 | 100 | 60 | 60% | 20 | 625 | 78.33 | 60 |",
+        "| A | 1 | 100 | 0 | 0% | 0 | 0 | 100 | 0 |",
+        "| **A** | mean ± std | 100 ± 0 | 30 ± 42.43 | 30% ± 42% | 10 ± 14.14 | 312 ± 442 | 89.17 ± 15.32 | 30 ± 42.43 |",
+        "| B | 0 | 100 | 60 | 60% | never | 900 | 60 | 60 |",
+        "| B | 1 | 100 | 50 | 50% | never | 700 | 70 | 50 |",
+        "| **B** | mean ± std | 100 ± 0 | 55 ± 7.07 | 55% ± 7% | never | 800 ± 141 | 65 ± 7.07 | 55 ± 7.07 |",
+    ]
+    assert out.stat().st_size > 10_000

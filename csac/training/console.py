@@ -109,7 +109,9 @@ def recovery_tables(run: RunDirectory) -> list[Table]:
         until = perturbed[index + 1][0] if index + 1 < len(perturbed) else None
         recoveries = recovery(rows, step, until)
         if any(np.isfinite(seed.drop) for seed in recoveries.values()):
-            title = f"{text} after step {step:,}" + (f", until {until:,}" if until else "")
+            title = f"{text} after step {step:,}" + (
+                f", until {until:,}" if until and until < rows["step"].max() else ""
+            )
             tables.append(_recovery_table(title, recoveries, run.manifest["failures"]))
     return tables
 
