@@ -10,9 +10,10 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 
+import psutil
 import pytest
 from chaos import RESTARTED, TRAIN, TWO_PROCESSES, differences, reached, start, strike, workers_of
 
@@ -107,18 +108,27 @@ def test_a_worker_that_is_killed_is_replaced_and_a_second_time_named(tmp_path, c
     """Two seeds in two processes; seed 0's is killed once, so seed 0 is as alone, and seed 1's is killed twice."""
     csac = Csac(tmp_path, cache, [*ALONE, *TWO_PROCESSES])
     csac.until("step 200 of 800")
-    first, second = workers_of(csac.process)
+    first, second = workers_of(csac.process)  # in the order of their start
     strike("worker", csac.process, first)
     csac.until(f"seed 0: its process was killed by SIGKILL (out of memory?); {RESTARTED}")
+    replacement = newcomer(csac, {first, second})
     strike("worker", csac.process, second)
     csac.until(f"seed 1: its process was killed by SIGKILL (out of memory?); {RESTARTED}")
-    strike("worker", csac.process, workers_of(csac.process)[-1])  # in the order of their start: the one of seed 1
+    strike("worker", csac.process, newcomer(csac, {first, second, replacement}))
     assert csac.end() == 3
     failures = json.loads((csac.run / "manifest.json").read_text())["failures"]
     assert list(failures) == ["1"]
     assert "for the second time, its process was killed by SIGKILL" in failures["1"]
     assert rows_of(csac.run, seed=0) == rows_of(whole, seed=0)
     assert reached(csac.run) == 800
+
+
+def newcomer(csac: Csac, known: Set[psutil.Process]) -> psutil.Process:
+    """Return the worker that is not among the known ones, once it can be told from its parent."""
+    while csac.process.poll() is None:
+        if fresh := [worker for worker in workers_of(csac.process) if worker not in known]:
+            return fresh[0]
+    raise AssertionError(f"ended before a worker was replaced:\n{''.join(csac.lines)}")
 
 
 def rows_of(run: Path, seed: int) -> dict[str, list[str]]:
