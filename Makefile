@@ -47,7 +47,7 @@ bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS))  ## Measure speed beside the pee
 	.venv/bin/python benchmarks/speed.py --out benchmarks $(ARGS)
 
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml
-	$(UV) pip compile pyproject.toml --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
+	$(UV) pip compile pyproject.toml --extra robots --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
 		--no-emit-index-url --no-annotate --no-header --quiet --output-file requirements.lock
 
 clean:  ## Remove .venv, .tools and caches; runs stay

@@ -71,6 +71,8 @@ class Train:
         None
     )
     """Begin with a copy of that run's checkpoint; what is not given here is as it was there."""
+    events: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: the task's own)")] = None
+    """More names in the info of an evaluation episode's last step: each becomes a column and a curve of its own."""
     env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
     """Keyword arguments for the environment, as a JSON object."""
     device: Literal["cpu", "gpu"] = "cpu"
@@ -107,6 +109,8 @@ class Evaluate:
     """Label of the seed to test."""
     episodes: int = 10
     """Episodes per seed, the same for each."""
+    processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
+    """Processes that share the episodes; the numbers are the same with any number of them."""
     stochastic: FlagCreatePairsOff[bool] = False
     """Draw actions from the policy instead of taking its most likely one."""
 
@@ -208,6 +212,7 @@ def _train(arguments: list[str]) -> int:
             keep_checkpoints=options.keep_checkpoints,
             resume=options.resume,
             start_from=options.start_from,
+            events=None if options.events is None else options.events.split(","),
             preset=preset,
             reporter=Reporter(),
             command=shlex.join(["csac", "train", *arguments]),
@@ -251,18 +256,33 @@ def _source(where: str | None) -> dict[str, Any] | None:
 
 def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
-    from csac.training.console import evaluation_table, make_console
+    from csac.training.console import case_table, evaluation_table, make_console, silent_events
     from csac.training.evaluation import EvaluationFailure
     from csac.training.play import evaluate_run
+    from csac.training.progress import told_progress
 
     console = make_console()
     results = {}
     try:
-        with _waiting(console, "evaluating"):
-            results.update(evaluate_run(options.run, options.seed, options.episodes, not options.stochastic))
+        with _waiting(console, "evaluating") as status:
+            progress = told_progress(status, "evaluating", "episodes") if status else None
+            results.update(
+                evaluate_run(
+                    options.run,
+                    options.seed,
+                    options.episodes,
+                    not options.stochastic,
+                    processes=options.processes,
+                    on_progress=progress,
+                )
+            )
     except EvaluationFailure as error:
         return _complain(error, 1)
     console.print(evaluation_table(results))
+    if (cases := case_table(results)) is not None:
+        console.print(cases)
+    for name in silent_events(results):
+        _say(f"note: no episode's last info holds a number called {name!r}")
     return 0
 
 

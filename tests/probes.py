@@ -5,6 +5,9 @@ Each is also registered, so that `probes:ConstantReward-v0` names it wherever th
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
 from collections.abc import Collection
 from typing import Any, Literal
 
@@ -146,6 +149,45 @@ class NonFinite(Endless):
         return np.array([self.value], np.float32), reward, terminated, truncated, info
 
 
+class Cases(Endless):
+    """Ends after three steps and says in `info` how: drawn from the reset seed, in one dict that it gives every time.
+
+    `crashed` is a NumPy boolean, `stops` a count up to 4, `phase` no number. With `tell` the process is told as well.
+    """
+
+    def __init__(self, tell: bool = False) -> None:
+        super().__init__(length=3)
+        self.tell, self.info = tell, {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        observation, _ = super().reset(seed=seed, options=options)
+        self.info = {"crashed": np.bool_(False), "stops": 0, "phase": "flying", "is_success": False}
+        if self.tell:
+            self.info |= {"process": os.getpid(), "has_jax": "jax" in sys.modules}
+        return observation, self.info
+
+    def step(self, action: np.ndarray) -> Result:
+        observation, reward, terminated, truncated, _ = super().step(action)
+        if truncated:
+            self.info["crashed"] = np.bool_(self.np_random.random() < 0.5)
+            self.info["stops"] = int(self.np_random.integers(5))
+            self.info["is_success"] = not self.info["crashed"]
+        return observation, reward, terminated, truncated, self.info
+
+
+class Deadly(Endless):
+    """Kills its process in an episode reset with `seed`."""
+
+    def __init__(self, seed: int = 0) -> None:
+        super().__init__(length=3)
+        self.seed = seed
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        if seed == self.seed:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().reset(seed=seed, options=options)
+
+
 class IdEncoded(gymnasium.Env):
     """Says in each observation where it comes from: [reset seed mod 65536, episode of its life, step, last action].
 
@@ -183,6 +225,8 @@ for name in (
     "Endless",
     "Failing",
     "NonFinite",
+    "Cases",
+    "Deadly",
     "IdEncoded",
 ):
     if f"{name}-v0" not in gymnasium.registry:

@@ -37,6 +37,16 @@ def evaluation_matrix(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
     return steps, seeds, _divide(total, episodes)
 
 
+def last_means(rows: np.ndarray, column: str) -> dict[int, float]:
+    """Return each seed's mean of one column over the episodes of its own last evaluation, empty cells left out."""
+    means = {}
+    for seed in np.unique(rows["seed"]).tolist():
+        own = rows[rows["seed"] == seed]
+        values = own[column][own["step"] == own["step"].max()]
+        means[seed] = float(values[~np.isnan(values)].mean()) if not np.isnan(values).all() else np.nan
+    return means
+
+
 def mean_and_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
     """Mean over seeds and its t-interval, `mean ± t(n - 1) · s / √n`, for `values` [seed, ...].
 

@@ -16,7 +16,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from csac.record.statistics import evaluation_matrix, last_evaluations, mean_and_interval
+from csac.record.statistics import evaluation_matrix, last_evaluations, last_means, mean_and_interval
+from csac.record.tables import COLUMNS
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from csac.training.evaluation import EvaluationEpisode
 
 STATE_STYLES = {"running": "cyan", "finished": "green", "failed": "red", "interrupted": "yellow", "killed": "red"}
+ROLLOUTS = 1_000  # that the cases of `csac evaluate` are counted in, as in the paper
+MOST_COLUMNS = 5  # of seeds in that table; of more, only the mean and the deviation
 WIDTH_ELSEWHERE = 200  # characters where there is no terminal: lines stay whole for grep
 
 
@@ -121,6 +124,71 @@ def evaluation_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Tabl
     return table
 
 
+def events_table(rows: np.ndarray) -> Table | None:
+    """Return what the last evaluations say beside returns: success and each event, as means per episode.
+
+    One row each: the mean over the seeds and, where there are several, their standard deviation and range. None where
+    the task says nothing.
+    """
+    names = [name for name in rows.dtype.names or () if name == "success" or name not in COLUMNS["evaluations"]]
+    means = {name: np.array(list(last_means(rows, name).values())) for name in names}
+    means = {name: values for name, values in means.items() if name != "success" or not np.isnan(values).all()}
+    if not means:
+        return None
+    several = len(np.unique(rows["seed"])) > 1
+    table = _table("per episode, last evaluation", "mean", *["± std", "min", "max"] * several)
+    table.columns[0].justify = "left"
+    for name, values in means.items():
+        known = values[~np.isnan(values)]
+        cells = [f"{known.mean():.3f}" if len(known) else ""]
+        if several:
+            cells += [f"{known.std(ddof=1):.3f}"] if len(known) > 1 else [""]
+            cells += [f"{known.min():.3f}", f"{known.max():.3f}"] if len(known) else ["", ""]
+        table.add_row(Text(name), *cells)
+    return table
+
+
+def case_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Table | None:
+    """Return the paper's case table: how often success and each event came in 1,000 rollouts, one column per seed.
+
+    What is a count in itself, such as waypoints reached, is a mean per rollout instead. Where there are several seeds,
+    the last columns are the mean over them and their standard deviation. None where the task says nothing.
+    """
+    episodes = [episode for result in results.values() for episode in result]
+    rows: dict[str, list[list[float | None]]]
+    rows = {"success": [[_as_bool(episode.success) for episode in result] for result in results.values()]}
+    rows = {} if all(episode.success is None for episode in episodes) else rows
+    for name in episodes[0].events if episodes else ():
+        rows[name] = [[episode.events.get(name) for episode in result] for result in results.values()]
+    if not rows:
+        return None
+    per_seed = len(episodes) // len(results)
+    scaled = "" if per_seed == ROLLOUTS else f" (from {per_seed:,} of each seed)"
+    shown = len(results) <= MOST_COLUMNS
+    headings = [f"seed {seed}" for seed in results] if shown else []
+    table = _table(f"per {ROLLOUTS:,} rollouts{scaled}", *headings, *["mean", "± std"] * (len(results) > 1))
+    table.columns[0].justify = "left"
+    for name, by_seed in rows.items():
+        told = [[value for value in values if value is not None] for values in by_seed]
+        is_case = all(isinstance(value, bool) for values in told for value in values)
+        scale, digits = (ROLLOUTS, 1) if is_case else (1, 3)
+        values = np.array([scale * np.mean(value) if value else np.nan for value in told])
+        known = values[~np.isnan(values)]
+        cells = [_cell(value, digits) for value in values] if shown else []
+        if len(results) > 1:
+            cells.append(_cell(known.mean() if len(known) else np.nan, digits))
+            cells.append(_cell(known.std(ddof=1) if len(known) > 1 else np.nan, digits))
+        table.add_row(Text(name if is_case else f"{name} (mean)"), *cells)
+    return table
+
+
+def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[str]:
+    """Return the events that no episode has held."""
+    episodes = [episode for result in results.values() for episode in result]
+    names = episodes[0].events if episodes else ()
+    return [name for name in names if all(episode.events.get(name) is None for episode in episodes)]
+
+
 def runs_table(runs: Sequence[RunDirectory]) -> Table:
     """Return one row per run: what was trained, how far it is, its last return (mean over its seeds), where it is."""
     table = _table("task", "algorithm", "seeds", "steps", "state", "last return", "directory")
@@ -147,6 +215,14 @@ def _over_seeds(values: np.ndarray, largest: float) -> Iterable[tuple[str, list[
     mean, _, high = mean_and_interval(values)
     for label, row in (("mean", mean), ("± std", values.std(axis=0, ddof=1)), ("± 95 %", high - mean)):
         yield label, [number(value, largest) for value in row]
+
+
+def _as_bool(success: float | None) -> bool | None:
+    return None if success is None else bool(success)
+
+
+def _cell(value: float, digits: int) -> str:
+    return "" if np.isnan(value) else f"{value:,.{digits}f}"
 
 
 def _state(run: RunDirectory) -> str:

@@ -6,10 +6,11 @@ import difflib
 import importlib
 import logging
 import math
+import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -17,6 +18,8 @@ import numpy as np
 from gymnasium import spaces
 
 from csac.deploy.policy import ActionBounds
+from csac.training import tasks
+from csac.training.silence import quietly
 from csac.training.snapshots import Snapshot, restore, snapshot
 from csac.types import InputError, Spec
 
@@ -71,12 +74,13 @@ class Environment:
             arguments["render_mode"] = render_mode
         self.raw = _make(task, arguments)
         self.task_name = _task_name(task, self.raw)
+        self._quietly = quietly if tasks.is_pybullet(self.raw) else nullcontext
         try:
             _check_render_mode(self.raw, render_mode)
             parts = _observation_parts(self.raw.observation_space)
             self.contract_parts = ContractParts(parts, *_action_parts(self.raw.action_space))
         except InputError as error:
-            self.raw.close()
+            self.close()
             raise InputError(f"{self.task_name}: {error}") from None
         self.spec = Spec(_size(parts), math.prod(self.contract_parts.action_shape))
         self.bounds = ActionBounds(self.contract_parts.action_low, self.contract_parts.action_high)
@@ -91,7 +95,8 @@ class Environment:
             EnvironmentFailure: the environment raised, or the observation is not finite or misshapen.
         """
         try:
-            observation, _ = self.raw.reset(seed=seed)
+            with self._quietly():
+                observation, _ = self.raw.reset(seed=seed)
         except Exception as error:
             raise EnvironmentFailure(f"reset raised {_one_line(error)}") from error
         try:
@@ -110,13 +115,15 @@ class Environment:
     def step_environment_scale(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply an action of the environment's own shape and scale; returns the same as `step`.
 
+        `info` is a copy: PyFlyt gives the same dict at every step of an episode.
+
         Raises:
             EnvironmentFailure: the environment raised, or action, observation or reward is not finite or misshapen.
         """
         action = _part(action, self._action_shape, "action").reshape(self._action_shape)
         try:
             observation, reward, terminated, truncated, info = self.raw.step(action)
-            terminated, truncated = bool(terminated), bool(truncated)
+            terminated, truncated, info = bool(terminated), bool(truncated), dict(info)
         except Exception as error:
             raise EnvironmentFailure(f"step raised {_one_line(error)}") from error
         return self._flatten(observation), _scalar(reward), terminated, truncated, info
@@ -139,7 +146,8 @@ class Environment:
 
     def close(self) -> None:
         """Close the Gymnasium environment."""
-        self.raw.close()
+        with self._quietly():
+            self.raw.close()
 
     def _flatten(self, observation: Any) -> np.ndarray:
         """Copy the observation, since environments may reuse their array."""
@@ -318,15 +326,19 @@ class SeedEnvironments:
 
 def _make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
     name = task if isinstance(task, str) else _name_of(task) or "the task"
+    adapter = tasks.adapter_of(task)
     _silence_mujoco()
-    with _gymnasium_silenced():
+    with _gymnasium_silenced(), quietly() if adapter or "pybullet" in sys.modules else nullcontext():
         registered = _registered(task) if isinstance(task, str) else None
         try:
             if registered is not None:
                 environment = gymnasium.make(registered, disable_env_checker=True, **arguments)
+                environment = adapter.wrap(environment) if adapter and adapter.wrap else environment
             else:
                 environment = task(**arguments)  # pyright: ignore[reportCallIssue]
         except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
+            if adapter:
+                raise InputError(tasks.missing(name, error)) from error
             raise InputError(f"{name} needs a package that is not installed: {_message(error)}") from error
         except Exception as error:
             given = f" with the arguments {arguments}" if arguments else ""
@@ -344,9 +356,10 @@ def _registered(task: str) -> str:
             importlib.import_module(module)
         except Exception as error:
             raise InputError(f"{task}: the module {module} cannot be imported: {_one_line(error)}") from error
+    tasks.register(name)
     if name in gymnasium.registry and not _is_gone(gymnasium.registry[name]):
         return name
-    known = sorted(id for id, spec in gymnasium.registry.items() if not _is_gone(spec))
+    known = sorted({*tasks.ADAPTERS, *(id for id, spec in gymnasium.registry.items() if not _is_gone(spec))})
     family = name.rpartition("-v")[0] or name
     versions = [id for id in known if id.rpartition("-v")[0] == family]
     lower = {id.lower(): id for id in known}

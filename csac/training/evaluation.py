@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from csac.deploy.policy import Policy
 from csac.training.environments import EVALUATION_SEED, FRESH_EVALUATION_SEED, Environment, EnvironmentFailure
+from csac.training.tasks import adapter_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
     from csac.training.environments import Parts, Task
+
+    OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
 
 ROWS = 10  # of every batch that the policy sees: rounding depends on its shape
 LONGEST_EPISODE = 100_000  # steps; a task that never ends would never let training go on
@@ -24,20 +30,31 @@ class EvaluationFailure(RuntimeError):
 class EvaluationEpisode(NamedTuple):
     """One evaluation episode; `success` is the task's own verdict (1 or 0), or None where it gives none.
 
-    An episode that reaches `LONGEST_EPISODE` steps is broken off there.
+    `events` are what the last step's `info` holds under the names asked for: a bool, a number, or None where it holds
+    neither. An episode that reaches `LONGEST_EPISODE` steps is broken off there.
     """
 
     episode: int
     episode_return: float
     length: int
     success: float | None
+    events: Mapping[str, float | None] = MappingProxyType({})
 
 
 class Evaluator:
     """Evaluates policies on a task, always on the same episodes: episode j is reset with `first_seed + j`.
 
     Episodes run side by side in batches of one fixed shape, so that an episode's numbers depend neither on when the
-    others end nor on how many there are. The environments are made at the first `run` and kept.
+    others end nor on how many there are. The environments are made at the first `run` and kept, but for tasks whose
+    resets do not forget what was before: they are made anew for each batch. `info_names` are the names of all numbers
+    that the last steps of episodes have held in `info` so far.
+
+    Args:
+        task: as `Environment`'s.
+        environment_arguments: keyword arguments for the environment.
+        episodes: how many.
+        first_seed: what episode 0 is reset with.
+        events: names in the last step's `info` to keep of each episode.
 
     Raises:
         InputError: fewer than one episode.
@@ -49,11 +66,15 @@ class Evaluator:
         environment_arguments: dict[str, Any] | None = None,
         episodes: int = 10,
         first_seed: int = EVALUATION_SEED,
+        events: Sequence[str] = (),
     ) -> None:
         _check_episodes(episodes)
         self._task, self._environment_arguments = task, environment_arguments
-        self._episodes, self._first_seed = episodes, first_seed
+        self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
         self._environments: list[Environment] = []
+        adapter = adapter_of(task)
+        self._has_memory = adapter is not None and adapter.has_memory
+        self.info_names: set[str] = set()
 
     def run(self, policy: Policy, deterministic: bool = True) -> list[EvaluationEpisode]:
         """Return the episodes in order; stochastic actions draw from a generator of the episode's own seed.
@@ -62,13 +83,38 @@ class Evaluator:
             InputError: the policy was trained on other observations or actions, or the task cannot be made.
             EvaluationFailure: an environment raised, or gave what is not a finite number.
         """
+        return self.run_all([policy], deterministic)[0]
+
+    def run_all(
+        self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
+    ) -> list[list[EvaluationEpisode]]:
+        """Return the episodes of each policy, as `run`; `on_progress(episodes done, of how many)` is called at times.
+
+        Raises:
+            InputError, EvaluationFailure: as `run`.
+        """
+        finished: list[list[EvaluationEpisode]] = [[] for _ in policies]
+        for index, first in self.batches(len(policies)):
+            finished[index] += self.run_batch(policies[index], first, deterministic)
+            if on_progress:
+                on_progress(sum(map(len, finished)), len(policies) * self.episodes)
+        return finished
+
+    def batches(self, policies: int) -> list[tuple[int, int]]:
+        """Return (which policy, number of its first episode) of every batch, in order."""
+        return [(index, first) for index in range(policies) for first in range(0, self.episodes, ROWS)]
+
+    def run_batch(self, policy: Policy, first: int, deterministic: bool = True) -> list[EvaluationEpisode]:
+        """Return the episodes of the batch that begins with number `first`.
+
+        Raises:
+            InputError, EvaluationFailure: as `run`.
+        """
+        if self._has_memory:
+            self.close()
         self._make_environments()
         _check_contract(policy, self._environments[0])
-        finished: list[EvaluationEpisode] = []
-        for first in range(0, self._episodes, ROWS):
-            episodes = range(first, min(first + ROWS, self._episodes))
-            finished += self._run_batch(policy, episodes, deterministic)
-        return finished
+        return self._run_batch(policy, range(first, min(first + ROWS, self.episodes)), deterministic)
 
     def close(self) -> None:
         """Close the environments; another `run` makes new ones."""
@@ -77,7 +123,7 @@ class Evaluator:
         self._environments = []
 
     def _make_environments(self) -> None:
-        while len(self._environments) < min(ROWS, self._episodes):
+        while len(self._environments) < min(ROWS, self.episodes):
             self._environments.append(Environment(self._task, self._environment_arguments))
 
     def _run_batch(self, policy: Policy, numbers: range, deterministic: bool) -> list[EvaluationEpisode]:
@@ -99,7 +145,9 @@ class Evaluator:
             for row, episode in running:
                 observations[row] = episode.step(actions[row])
             running = [(row, episode) for row, episode in running if not episode.ended]
-        return [episode.result() for episode in episodes]
+        for episode in episodes:
+            self.info_names |= {name for name, value in episode.last_info.items() if _number(value) is not None}
+        return [episode.result(self._events) for episode in episodes]
 
 
 class _Episode:
@@ -110,7 +158,7 @@ class _Episode:
         self.generator = np.random.default_rng(seed)
         self.ended = False
         self._return, self._length = 0.0, 0
-        self._last_info: dict[str, Any] = {}
+        self.last_info: dict[str, Any] = {}
 
     def start(self) -> np.ndarray:
         try:
@@ -120,9 +168,7 @@ class _Episode:
 
     def step(self, action: np.ndarray) -> np.ndarray:
         try:
-            observation, reward, terminated, truncated, self._last_info = self.environment.step_environment_scale(
-                action
-            )
+            observation, reward, terminated, truncated, self.last_info = self.environment.step_environment_scale(action)
         except EnvironmentFailure as error:
             raise self._failure(error) from error
         self._return += reward
@@ -130,8 +176,9 @@ class _Episode:
         self.ended = terminated or truncated or self._length >= LONGEST_EPISODE
         return observation
 
-    def result(self) -> EvaluationEpisode:
-        return EvaluationEpisode(self._number, self._return, self._length, _success(self._last_info))
+    def result(self, events: Sequence[str] = ()) -> EvaluationEpisode:
+        said = {name: _number(self.last_info.get(name)) for name in events}
+        return EvaluationEpisode(self._number, self._return, self._length, _success(self.last_info), said)
 
     def _failure(self, error: EnvironmentFailure) -> EvaluationFailure:
         place = f"evaluation episode {self._number}, reset with seed {self._seed}, at step {self._length}"
@@ -202,6 +249,19 @@ def _check_contract(policy: Policy, environment: Environment) -> None:
 
 def _told(parts: Parts) -> str:
     return ", ".join(str(shape) if key is None else f"{key} {shape}" for key, shape in parts)
+
+
+def _number(value: Any) -> bool | float | None:
+    """Return a boolean or a finite number out of `info` as Python's own, and None for anything else."""
+    if value is None or isinstance(value, str | bytes):
+        return None
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        return None
+    if array.size != 1 or array.dtype.kind not in "buif" or not np.isfinite(array).all():
+        return None
+    return array.item()
 
 
 def _success(info: dict[str, Any]) -> float | None:

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
 import os
-import signal
-import sys
 import time
 import traceback
-from contextlib import contextmanager
 from itertools import count
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from csac.training.checkpoint import remove_unfinished
 from csac.training.loop import Ended, Event, Group, Progress, Saved, Settings, is_boundary
+from csac.training.processes import cause_of_death, die_with_parent, usable_cores, worker_surroundings
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
 
     from csac.training.checkpoint import Checkpoints
-
-_PR_SET_PDEATHSIG = 1
 
 # More processes than this for each core only cost memory: the seeds of a larger run share processes.
 GROUPS_PER_CORE = 4
@@ -60,13 +54,6 @@ class NotSaved(NamedTuple):
 
 
 Message = Event | GroupCrashed | GroupRestarted | NotSaved
-
-
-def usable_cores() -> list[int]:
-    """Return the processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
 
 
 def split_seeds(seeds: Sequence[int], groups: int) -> list[list[int]]:
@@ -152,7 +139,7 @@ class _Worker:
         self.begin = self.step = self.saved = settings.begin
         self.seeds, self.over = seeds, False
         self.cores: list[int] | None = None
-        with _worker_surroundings():
+        with worker_surroundings():
             self.process.start()
         theirs.close()
 
@@ -232,7 +219,7 @@ class _Scheduler:
         self._take_cores(worker)
         if self.settings.checkpoints:
             remove_unfinished(self.settings.checkpoints, worker.process.pid)
-        reason = _cause_of_death(worker.process.exitcode)
+        reason = cause_of_death(worker.process.exitcode)
         if self.stopping and self.checkpoints and index not in self.restarted:
             worker.over = True  # and no failure: the run goes on from the last step at which all were saved
             return Ended(worker.step, {})
@@ -292,7 +279,7 @@ class _Scheduler:
 
 def _work(connection: Connection, settings: Settings, seeds: list[int]) -> None:
     """Train one group in a process of its own, one turn at a time."""
-    _die_with_parent()
+    die_with_parent()
     turns = _Turns(connection)
     try:
         turns.take(None)
@@ -342,36 +329,3 @@ def _move_to(cores: list[int]) -> None:
     if hasattr(os, "sched_setaffinity"):
         for thread in os.listdir("/proc/self/task"):
             os.sched_setaffinity(int(thread), cores)
-
-
-def _die_with_parent() -> None:
-    """Ask Linux to kill this process with its parent, so that nobody writes into a run that another has taken over."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-@contextmanager
-def _worker_surroundings() -> Iterator[None]:
-    """What a worker inherits: products on one thread, since NumPy there only evaluates, and no signals.
-
-    A Ctrl-C reaches every process of the terminal; the parent alone decides what it means.
-    """
-    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    resource_tracker.ensure_running()  # starts at the first spawn otherwise, and would let the signals through again
-    os.environ.update(dict.fromkeys(names, "1"))
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
-def _cause_of_death(exit_code: int | None) -> str:
-    if exit_code is not None and exit_code < 0:
-        name = signal.Signals(-exit_code).name
-        hint = " (out of memory?)" if name == "SIGKILL" else ""
-        return f"its process was killed by {name}{hint}"
-    return f"its process ended with exit code {exit_code}"

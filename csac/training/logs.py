@@ -12,6 +12,8 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
+from csac.record.tables import COLUMNS
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
@@ -26,8 +28,9 @@ class TensorBoardLog:
     """Writes the rows of a run's tables to `path/seed_<k>` as well, each group of rows at its own steps.
 
     `rollout/ep_rew_mean` and `rollout/ep_len_mean` are means over the last 100 training episodes, `eval/mean_reward`,
-    `eval/mean_ep_length` and `eval/success_rate` over one evaluation's episodes; `time/fps` is environment steps per
-    second of this seed since the log was made, for a run that goes on from step `begin` since then.
+    `eval/mean_ep_length`, `eval/success_rate` and `eval/<event>` over one evaluation's episodes; `time/fps` is
+    environment steps per second of this seed since the log was made, for a run that goes on from step `begin` since
+    then.
 
     Whatever writes raises OSError where the disk is full.
     """
@@ -65,9 +68,10 @@ class TensorBoardLog:
                 "eval/mean_reward": np.mean([row["return"] for row in episodes]),
                 "eval/mean_ep_length": np.mean([row["length"] for row in episodes]),
             }
-            successes = [row["success"] for row in episodes if row.get("success") is not None]
-            if successes:
-                values["eval/success_rate"] = np.mean(successes)
+            for name in ("success", *(name for name in episodes[0] if name not in COLUMNS["evaluations"])):
+                told = [row[name] for row in episodes if row.get(name) is not None]
+                if told:
+                    values["eval/success_rate" if name == "success" else f"eval/{name}"] = np.mean(told)
             self._write(seed, step, values)
 
     def close(self) -> None:

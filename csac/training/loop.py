@@ -32,7 +32,7 @@ class Settings(NamedTuple):
     """What a group needs to know to train its seeds; picklable, so that a group can be another process.
 
     `checkpoints` is the folder of the run's checkpoints, None where there are to be none; `begin` is the step of the
-    checkpoint there to go on from, 0 to begin anew.
+    checkpoint there to go on from, 0 to begin anew. `events` are names in the last `info` of an evaluation episode.
     """
 
     algorithm: Algorithm
@@ -44,6 +44,7 @@ class Settings(NamedTuple):
     checkpoints: Path | None = None
     checkpoint_interval: int = 0
     begin: int = 0
+    events: tuple[str, ...] = ()
 
 
 class Rows(NamedTuple):
@@ -54,11 +55,15 @@ class Rows(NamedTuple):
 
 
 class Evaluated(NamedTuple):
-    """Every living seed of the group was evaluated at this step; `policies` are those evaluated."""
+    """Every living seed of the group was evaluated at this step; `policies` are those evaluated.
+
+    `info_names` are the names of numbers that the episodes held in their last `info`.
+    """
 
     step: int
     rows: list[dict[str, Any]]
     policies: dict[int, Policy]
+    info_names: frozenset[str] = frozenset()
 
 
 class Failed(NamedTuple):
@@ -124,7 +129,9 @@ class Group:
     def __init__(self, settings: Settings, seeds: Sequence[int]) -> None:
         self.settings, self.seeds, self.step = settings, list(seeds), settings.begin
         self.environments = SeedEnvironments(settings.task, settings.environment_arguments, seeds)
-        self.evaluator = Evaluator(settings.task, settings.environment_arguments, settings.evaluation_episodes)
+        self.evaluator = Evaluator(
+            settings.task, settings.environment_arguments, settings.evaluation_episodes, events=settings.events
+        )
         self.learner = Learner(settings.algorithm, self.environments.spec, seeds, settings.steps)
         self._contract = Contract(
             self.environments.task_name,
@@ -269,12 +276,13 @@ def _evaluate(
                 "return": episode.episode_return,
                 "length": episode.length,
                 "success": episode.success,
+                **episode.events,
             }
             for episode in episodes
         ]
     if any(row["length"] >= LONGEST_EPISODE for row in rows):
         yield Noted(f"step {step}: evaluation episodes were broken off after {LONGEST_EPISODE:,} steps: do they end?")
-    yield Evaluated(step, rows, policies)
+    yield Evaluated(step, rows, policies, frozenset(evaluator.info_names))
 
 
 def _episode_row(seed: int, step: int, episode: Any) -> dict[str, Any]:

@@ -14,34 +14,53 @@ from csac.deploy.policy import load
 from csac.record.run import RunDirectory
 from csac.training.environments import FRESH_EVALUATION_SEED, Environment
 from csac.training.evaluation import EvaluationEpisode, Evaluator
+from csac.training.pool import EvaluationPool, choose_processes
+from csac.training.tasks import adapter_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
 
+    from csac.training.evaluation import OnProgress
+
 DEFAULT_FRAMES_PER_SECOND = 30
+SECONDS_ON_SCREEN = 1.0  # that an episode has at least: its last picture stays for as long as it takes
 
 
 def evaluate_run(
-    directory: str | Path, seed: int | None = None, episodes: int = 10, deterministic: bool = True
+    directory: str | Path,
+    seed: int | None = None,
+    episodes: int = 10,
+    deterministic: bool = True,
+    processes: int | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Iterator[tuple[int, list[EvaluationEpisode]]]:
     """Yield (seed, episodes) for the last policy of each seed of a run, or of the one asked for.
 
-    The episodes are the same for every seed, and none that training or its evaluations have seen.
+    The episodes are the same for every seed, and none that training or its evaluations have seen. They are shared by
+    `processes`, by default as many as pay; 1 is this one. Whatever their number, the results are the same.
+    `on_progress(episodes done, of how many)` is called after each batch of episodes.
 
     Raises:
         InputError: no run there, no such seed, a damaged file, or a task that can no longer be made.
-        EvaluationFailure: an environment raised, or gave what is not finite.
+        EvaluationFailure: an environment raised, or gave what is not finite; or a process died.
     """
     run = _open(directory)
     evaluator = Evaluator(
-        run.manifest["task"], run.manifest.get("environment_arguments"), episodes, FRESH_EVALUATION_SEED
+        run.manifest["task"],
+        run.manifest.get("environment_arguments"),
+        episodes,
+        FRESH_EVALUATION_SEED,
+        run.manifest.get("events", ()),
     )
+    labels = _seeds_with_policies(run) if seed is None else [seed]
+    policies = [load(directory, label) for label in labels]
+    processes = choose_processes(evaluator, len(policies)) if processes is None else processes
+    workers = evaluator if processes == 1 else EvaluationPool(evaluator, processes)
     try:
-        for label in _seeds_with_policies(run) if seed is None else [seed]:
-            yield label, evaluator.run(load(directory, label), deterministic)
+        yield from zip(labels, workers.run_all(policies, deterministic, on_progress), strict=True)
     finally:
-        evaluator.close()
+        workers.close()
 
 
 def play(
@@ -66,8 +85,15 @@ def play(
         _draw_off_screen()
     environment = _drawn_environment(run, "human" if video is None else "rgb_array")
     _follow(environment)
+    adapter = adapter_of(run.manifest["task"])
+    picture = adapter.camera(environment.raw) if adapter and adapter.camera else environment.raw.render
+    frames_per_second = round(
+        (adapter and adapter.pictures_per_second)
+        or environment.raw.metadata.get("render_fps")
+        or DEFAULT_FRAMES_PER_SECOND
+    )
     try:
-        with _recording(environment, video) as record:
+        with _recording(environment, picture, frames_per_second, video) as record:
             for number in range(episodes):
                 observation = environment.reset(FRESH_EVALUATION_SEED + number)
                 episode_return, length, ended = 0.0, 0, False
@@ -77,6 +103,8 @@ def play(
                     observation, reward, terminated, truncated, _ = environment.step(action)
                     episode_return, length, ended = episode_return + reward, length + 1, terminated or truncated
                     record()
+                for _ in range(length + 1, round(SECONDS_ON_SCREEN * frames_per_second)):
+                    record(again=True)
                 yield EvaluationEpisode(number, episode_return, length, None)
     finally:
         environment.close()
@@ -127,7 +155,10 @@ def _check_video(path: Path) -> None:
 
 
 def _drawn_environment(run: RunDirectory, render_mode: str) -> Environment:
-    task, arguments = run.manifest["task"], run.manifest.get("environment_arguments")
+    task, arguments = run.manifest["task"], run.manifest.get("environment_arguments") or {}
+    adapter = adapter_of(task)
+    if adapter and render_mode == "rgb_array":
+        arguments = {**adapter.picture_arguments, **arguments}
     try:
         return Environment(task, arguments, render_mode)
     except InputError as error:
@@ -143,19 +174,26 @@ def _cannot_be_drawn(task: str, error: Exception) -> InputError:
 
 
 @contextmanager
-def _recording(environment: Environment, video: str | Path | None) -> Iterator[Callable[[], None]]:
-    """Yield a function that adds the present picture to the video, which gets its name once it is whole."""
+def _recording(
+    environment: Environment, picture: Callable[[], Any], frames_per_second: int, video: str | Path | None
+) -> Iterator[Callable[..., None]]:
+    """Yield a function that adds the present picture to the video, or the last one again.
+
+    The video gets its name once it is whole.
+    """
     if video is None:
-        yield lambda: None
+        yield lambda again=False: None
         return
     path = Path(video)
     aside = path.with_name(f".{os.getpid()}.{path.name}")
     writer: list[Generator[None, Any, None]] = []
+    frame = np.zeros((0, 0, 3), np.uint8)
 
-    def record() -> None:
-        frame = _frame(environment)
+    def record(again: bool = False) -> None:
+        nonlocal frame
+        frame = frame if again else _frame(environment, picture)
         if not writer:
-            writer.append(_open_video(aside, frame.shape, environment))
+            writer.append(_open_video(aside, frame.shape, frames_per_second))
         writer[0].send(frame)
 
     try:
@@ -172,22 +210,21 @@ def _recording(environment: Environment, video: str | Path | None) -> Iterator[C
         aside.unlink(missing_ok=True)
 
 
-def _frame(environment: Environment) -> np.ndarray:
+def _frame(environment: Environment, picture: Callable[[], Any]) -> np.ndarray:
     """Return the present picture, uint8 [height, width, 3]."""
     try:
-        frame = environment.raw.render()
+        frame = picture()
     except Exception as error:
         raise _cannot_be_drawn(environment.task_name, error) from error
-    picture = np.asarray(frame)
-    if picture.ndim != 3 or picture.shape[2] < 3:
+    pixels = np.asarray(frame)
+    if pixels.ndim != 3 or pixels.shape[2] < 3:
         raise InputError(f"{environment.task_name} draws no pictures, so there is no video of it")
-    return np.ascontiguousarray(picture[:, :, :3], dtype=np.uint8)
+    return np.ascontiguousarray(pixels[:, :, :3], dtype=np.uint8)
 
 
-def _open_video(path: Path, shape: tuple[int, ...], environment: Environment) -> Generator[None, Any, None]:
+def _open_video(path: Path, shape: tuple[int, ...], frames_per_second: int) -> Generator[None, Any, None]:
     import imageio_ffmpeg
 
-    frames_per_second = environment.raw.metadata.get("render_fps") or DEFAULT_FRAMES_PER_SECOND
     writer = imageio_ffmpeg.write_frames(
         str(path), (shape[1], shape[0]), fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
     )

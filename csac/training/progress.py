@@ -15,13 +15,14 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from csac.training.console import duration, make_console, number, program, results_table, short
+from csac.training.console import duration, events_table, make_console, number, program, results_table, short
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from rich.console import Console, RenderableType
+    from rich.status import Status
 
     from csac.record.run import RunDirectory
 
@@ -114,6 +115,8 @@ class Reporter:
         evaluations = run.evaluations
         if len(evaluations):
             self._print(results_table(run))
+            if (events := events_table(evaluations)) is not None:
+                self._print(events)
         else:
             self._print(Text("no evaluations yet"))
         for seed, reason in run.manifest["failures"].items():
@@ -223,6 +226,22 @@ class Speed:
             return None
         (begin, first), (end, last) = self._samples[0], self._samples[-1]
         return (last - first) / (end - begin) if end > begin and last > first else None
+
+
+def told_progress(
+    status: Status, doing: str, unit: str, clock: Callable[[], float] = time.monotonic
+) -> Callable[[int, int], None]:
+    """Return what shows in a status line how much is done, of how much, and the time that the rest will take."""
+    speed = Speed(clock)
+    speed.add(0)
+
+    def tell(done: int, total: int) -> None:
+        speed.add(done)
+        pace = speed.per_second()
+        left = f", {duration((total - done) / pace)} left" if pace and done < total else ""
+        status.update(f"{doing}: {done:,} of {total:,} {unit}{left}")
+
+    return tell
 
 
 def sparkline(values: Sequence[float] | np.ndarray, low: float, high: float, width: int) -> str:

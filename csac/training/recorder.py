@@ -63,6 +63,9 @@ class Recorder:
         self._pending: dict[Table, list[dict[str, Any]]] = defaultdict(list)
         self._saved: dict[int, dict[int, Files]] = defaultdict(dict)  # step -> group -> its files
         self._best = _best_means(run.evaluations)
+        # Told once, after the first evaluation of the run.
+        self._unheard = set() if len(run.evaluations) else set(run.manifest.get("events", ()))
+        self._info_names: set[str] = set()
 
     def handle(self, group: int, message: Message) -> None:
         """Take one message of one group."""
@@ -113,6 +116,7 @@ class Recorder:
 
     def _evaluated(self, group: int, event: Evaluated) -> None:
         self._take(group, "evaluations", event.rows)
+        self._info_names |= event.info_names
         self._save(event.policies)
         for seed, value in _mean_returns(event.rows).items():
             if value > self._best.get(seed, -np.inf):
@@ -237,6 +241,15 @@ class Recorder:
             self.run.update_manifest(steps_done=step)
             if self.reporter:
                 self.reporter.evaluated(step, returns)
+            self._tell_unheard(rows)
+
+    def _tell_unheard(self, rows: list[dict[str, Any]]) -> None:
+        """Say which events no evaluation episode has held, and what there is instead."""
+        held = {name for row in rows for name in self._unheard if row.get(name) is not None}
+        for name in sorted(self._unheard - held):
+            there = ", ".join(sorted(self._info_names)) or "nothing"
+            self._note(f"note: no episode's last info holds a number called {name!r} so far; it holds {there}")
+        self._unheard = set()
 
 
 def _best_means(evaluations: np.ndarray) -> dict[int, float]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from csac.types import Algorithm, Spec
 
 # What a run cannot change: with any other value it would be another run.
-_FIXED = ("task", "environment_arguments", "algorithm", "hyperparameters", "seeds", "evaluation")
+_FIXED = ("task", "environment_arguments", "algorithm", "hyperparameters", "seeds", "evaluation", "events")
 
 
 class Point(NamedTuple):
@@ -60,7 +60,7 @@ BEGINNING = Point(0, {}, [], [])
 
 def refuse_differences(run: RunDirectory, wanted: dict[str, Any], algorithm: Algorithm) -> None:
     """Raise InputError, with what differs, where `wanted` is not a continuation of `run`."""
-    plain = run.manifest
+    plain = {"events": [], **run.manifest}  # which manifests of older runs do not have
     differences = _differences({name: plain.get(name) for name in _FIXED}, {name: wanted[name] for name in _FIXED})
     if differences:
         raise InputError(f"{run.path} was trained otherwise: {'; '.join(differences)}. Choose another directory")
@@ -166,8 +166,9 @@ class Source(NamedTuple):
 
     def refuse_misfit(self, wanted: dict[str, Any], algorithm: Algorithm, spec: Spec) -> None:
         """Raise InputError where the new run cannot begin with this checkpoint."""
-        before = self.run.manifest
-        differences = _differences({"algorithm": before["algorithm"]}, {"algorithm": wanted["algorithm"]})
+        before = {"events": [], **self.run.manifest}
+        names = ("algorithm", "events")  # of whose tables the new run's are a continuation
+        differences = _differences({name: before[name] for name in names}, {name: wanted[name] for name in names})
         missing = sorted(set(wanted["seeds"]) - set(before["seeds"]))
         if missing:
             differences.append(f"it has no seeds {', '.join(map(str, missing))}")
@@ -189,7 +190,7 @@ class Source(NamedTuple):
 
     def described(self, wanted: dict[str, Any]) -> dict[str, Any]:
         """Return what the manifest says of where the new run began, and of what is different in it."""
-        before = {name: self.run.manifest.get(name) for name in _FIXED}
+        before = {name: {"events": [], **self.run.manifest}.get(name) for name in _FIXED}
         changes = _differences(before, {name: wanted[name] for name in _FIXED})
         return {"directory": str(self.run.path), "step": self.checkpoint.step, "changes": changes}
 

@@ -28,10 +28,11 @@ from csac.training.logs import TensorBoardLog
 from csac.training.loop import Settings
 from csac.training.recorder import Recorder
 from csac.training.resume import BEGINNING, Point, Source, algorithm_of, arguments_of, refuse_differences, roll_back
+from csac.training.tasks import adapter_of, check_events, events_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from csac.training.progress import Reporter
     from csac.types import Algorithm, Spec
@@ -80,6 +81,7 @@ def train(
     keep_checkpoints: int = 2,
     resume: bool = False,
     start_from: str | Path | None = None,
+    events: Sequence[str] | None = None,
     preset: str | None = None,
     tensorboard: bool = True,
     reporter: Reporter | None = None,
@@ -107,6 +109,9 @@ def train(
         keep_checkpoints: how many of the newest checkpoints to keep; 0 keeps all.
         resume: go on with the run in `directory`, where there is one, from its newest checkpoint.
         start_from: `DIRECTORY` or `DIRECTORY@STEP` of a run: begin with a copy of its checkpoint of that step.
+        events: names in the `info` of an evaluation episode's last step (booleans or numbers): each becomes a column of
+            evaluations.csv, beside those that the task has by itself. None keeps those of the run that this one goes on
+            from or begins with.
         preset: the name of the preset that the hyperparameters came from, for the manifest.
         tensorboard: whether to write TensorBoard files.
         reporter: where progress is shown; None is silent.
@@ -124,6 +129,7 @@ def train(
     _check_not_negative(
         first_seed=first_seed, checkpoint_interval=checkpoint_interval, keep_checkpoints=keep_checkpoints
     )
+    check_events(events or ())
     _choose_device(device)
     environment = Environment(task, environment_arguments)
     spec, task_name = environment.spec, environment.task_name
@@ -132,6 +138,9 @@ def train(
     path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
     labels = list(range(first_seed, first_seed + seeds))
     existing = RunDirectory.open(path) if resume and is_run(path) else None
+    source = Source.find(start_from) if start_from is not None and not existing else None
+    before = existing or (source.run if source else None)
+    names = events_of(task, events or ()) if events is not None or not before else before.manifest.get("events", ())
     parts = split_seeds(labels, _choose_number_of_groups(groups, labels, device, existing))
     settings = Settings(
         algorithm,
@@ -142,6 +151,7 @@ def train(
         evaluation_episodes,
         (path / FOLDER).absolute() if checkpoint_interval else None,
         checkpoint_interval,
+        events=tuple(names),
     )
     if len(parts) > 1:
         _check_picklable(settings)
@@ -157,10 +167,11 @@ def train(
         "groups": parts,
         "steps": steps,
         "evaluation": {"interval": evaluation_interval, "episodes": evaluation_episodes},
+        "events": list(names),
         "checkpoints": {"interval": checkpoint_interval, "keep": keep_checkpoints},
         "device": device,
         "machine": {"processor": _processor(), "cores": os.cpu_count(), "host": platform.node()},
-        "versions": _versions(),
+        "versions": _versions(task),
         "commit": _commit(),
         "command": command,
         "process": os.getpid(),
@@ -170,8 +181,7 @@ def train(
         refuse_differences(existing, manifest, algorithm)
         with existing.locked(), _storage_failures_told(existing):
             return _go_on(existing, settings, manifest, notes, watchers)
-    if start_from is not None:
-        source = Source.find(start_from)
+    if source:
         source.refuse_misfit(manifest, algorithm, spec)
         run = RunDirectory.create(path, {**manifest, "forked_from": source.described(manifest)})
         with run.locked(), _storage_failures_told(run):
@@ -422,9 +432,10 @@ def _warmup_note(algorithm: Algorithm, steps: int) -> list[str]:
     ]
 
 
-def _versions() -> dict[str, str]:
+def _versions(task: Task) -> dict[str, str]:
+    robots = ("pybullet", "PyFlyt", "panda-gym") if adapter_of(task) else ()
     versions = {"csac": __version__, "python": platform.python_version()}
-    for package in ("jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco"):
+    for package in ("jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco", *robots):
         try:
             versions[package] = version(package)
         except PackageNotFoundError:

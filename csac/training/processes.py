@@ -1,0 +1,57 @@
+"""Processes beside this one: what they inherit, that they die with it, and how it is told that one has died. No JAX."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_PR_SET_PDEATHSIG = 1
+
+
+def usable_cores() -> list[int]:
+    """Return the processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
+def die_with_parent() -> None:
+    """Ask Linux to kill this process with its parent, so that nobody writes into a run that another has taken over."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+@contextmanager
+def worker_surroundings() -> Iterator[None]:
+    """What a worker inherits: products on one thread, since NumPy there only evaluates, and no signals.
+
+    A Ctrl-C reaches every process of the terminal; the parent alone decides what it means.
+    """
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    resource_tracker.ensure_running()  # starts at the first spawn otherwise, and would let the signals through again
+    os.environ.update(dict.fromkeys(names, "1"))
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def cause_of_death(exit_code: int | None) -> str:
+    """Return how a process ended, as the end of a sentence."""
+    if exit_code is not None and exit_code < 0:
+        name = signal.Signals(-exit_code).name
+        hint = " (out of memory?)" if name == "SIGKILL" else ""
+        return f"its process was killed by {name}{hint}"
+    return f"its process ended with exit code {exit_code}"
