@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from csac.arguments import json_object, nearest, parse, peek
 from csac.presets import PRESETS, hyperparameters
@@ -75,6 +75,10 @@ class Train:
     """More names in the info of an evaluation episode's last step: each becomes a column and a curve of its own."""
     env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
     """Keyword arguments for the environment, as a JSON object."""
+    perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE[@STEP]")] = ()
+    """Change the task after STEP environment steps, as friction=1.5@300000 does: factors on friction, gravity, mass or
+    gain of a MuJoCo task, standard deviations of observation_noise or action_noise. With --from, none leaves out what
+    that run had planned."""
     device: Literal["cpu", "gpu"] = "cpu"
     """Where the networks learn."""
     groups: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
@@ -113,6 +117,8 @@ class Evaluate:
     """Processes that share the episodes; the numbers are the same with any number of them."""
     stochastic: FlagCreatePairsOff[bool] = False
     """Draw actions from the policy instead of taking its most likely one."""
+    perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
+    """Change the task, as friction=2 does; the kinds are those of csac train."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,8 @@ class Play:
     """How many episodes."""
     video: Annotated[Path | None, arg(metavar="OUT.mp4", help_behavior_hint="(default: a window)")] = None
     """Write this file instead of opening a window; needs no display."""
+    perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
+    """Change the task, as friction=2 does; the kinds are those of csac train."""
 
 
 @dataclass(frozen=True)
@@ -207,6 +215,7 @@ def _train(arguments: list[str]) -> int:
             evaluation_interval=options.evaluation_interval,
             evaluation_episodes=options.evaluation_episodes,
             environment_arguments=json_object("--env-kwargs", options.env_kwargs),
+            perturbations=_perturbations(options.perturb, source),
             device=options.device,
             checkpoint_interval=options.checkpoint_interval,
             keep_checkpoints=options.keep_checkpoints,
@@ -254,14 +263,24 @@ def _source(where: str | None) -> dict[str, Any] | None:
     return Source.find(where).run.manifest
 
 
+def _perturbations(given: tuple[str, ...], source: dict[str, Any] | None) -> tuple[str, ...]:
+    """Return what a run is to be perturbed by: without a word of it, what the run had planned that it begins with."""
+    if "none" in given:
+        if len(given) > 1:
+            raise InputError("--perturb none leaves everything out: give it alone")
+        return ()
+    return given or tuple((source or {}).get("perturbations", ()))
+
+
 def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
     from csac.training.console import case_table, evaluation_table, make_console, silent_events
     from csac.training.evaluation import EvaluationFailure
-    from csac.training.play import evaluate_run
+    from csac.training.play import evaluate_run, told_perturbations
     from csac.training.progress import told_progress
 
     console = make_console()
+    told = told_perturbations(options.run, options.perturb)
     results = {}
     try:
         with _waiting(console, "evaluating") as status:
@@ -272,12 +291,15 @@ def _evaluate(arguments: list[str]) -> int:
                     options.seed,
                     options.episodes,
                     not options.stochastic,
+                    options.perturb,
                     processes=options.processes,
                     on_progress=progress,
                 )
             )
     except EvaluationFailure as error:
         return _complain(error, 1)
+    for line in told:
+        console.print(line, soft_wrap=True)
     console.print(evaluation_table(results))
     if (cases := case_table(results)) is not None:
         console.print(cases)
@@ -290,12 +312,14 @@ def _play(arguments: list[str]) -> int:
     options = parse(Play, arguments, "csac play")
     from csac.training.console import make_console
     from csac.training.environments import EnvironmentFailure
-    from csac.training.play import play
+    from csac.training.play import play, told_perturbations
 
     console = make_console()
+    for line in told_perturbations(options.run, options.perturb):
+        console.print(line, soft_wrap=True)
     try:
         with _waiting(console, "playing"):
-            for episode in play(options.run, options.seed, options.episodes, options.video):
+            for episode in play(options.run, options.seed, options.episodes, options.video, options.perturb):
                 text = f"return {episode.episode_return:,.2f} in {episode.length:,} steps"
                 console.print(f"episode {episode.episode}: {text}")
     except EnvironmentFailure as error:

@@ -47,12 +47,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="LABEL=CSV")
     parser.add_argument("--title", default="")
+    parser.add_argument("--mark", action="append", default=[], metavar="STEP=TEXT", help="draw a line at a step")
     parser.add_argument("--until", type=int, help="leave out evaluations after this step")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     pairs = [argument.partition("=")[::2] for argument in arguments.runs]
     runs = [(label, up_to(read_rows(path), arguments.until)) for label, path in pairs]
-    learning_curve(runs, arguments.out, title=arguments.title)
+    marks = [(int(step), text) for step, _, text in (mark.partition("=") for mark in arguments.mark)]
+    learning_curve(runs, arguments.out, title=arguments.title, marks=marks)
     print(table(runs))
 
 

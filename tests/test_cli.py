@@ -18,6 +18,8 @@ from csac.arguments import peek
 from csac.cli import main
 from csac.deploy.policy import Contract, Policy
 from csac.record.run import RunDirectory
+from csac.training.checkpoint import Checkpoint
+from csac.training.resume import Source
 from csac.types import Layer, PolicyNetwork, PolicyParameters
 
 TESTS = Path(__file__).parent
@@ -142,6 +144,22 @@ def words(text):
         ("train X --discount 1.5", "discount must be at least 0 and less than 1, not 1.5 (csac train --help)"),
         ("train Qxyz-v0", "no task is called Qxyz-v0: write module:Id for one that a module registers"),
         ("train probes:Endless-v0 --seeds 0", "seeds must be a whole number of at least 1, not 0"),
+        ("train Hopper-v4 --perturb", "--perturb needs a value (csac train --help)"),
+        (
+            "train Hopper-v4 --perturb frction=2",
+            "no perturbation is called 'frction': did you mean friction? there are friction, gravity, mass, gain, "
+            "observation_noise, action_noise",
+        ),
+        (
+            "train Hopper-v4 --steps 100 --perturb gain=2@100",
+            "gain=2@100 would change nothing: the run ends at step 100; give an earlier step",
+        ),
+        (
+            "train probes:Endless-v0 --perturb mass=2",
+            "probes:Endless-v0 is no MuJoCo task: friction, gravity, mass, gain cannot be changed, and "
+            "observation_noise and action_noise can",
+        ),
+        ("train X --perturb none --perturb mass=2", "--perturb none leaves everything out: give it alone"),
         ("evaluate", "DIR is missing (csac evaluate --help)"),
         ("evaluate nowhere", "nowhere does not exist; give a run directory ('csac runs' lists them)"),
         (
@@ -185,6 +203,7 @@ def test_train_passes_its_options_on(train_call):
         "Hopper-v4 --steps 1e5 --seeds 3 --first-seed 7 --directory some/where --device gpu --groups 2 "
         "--evaluation-interval 1_000 --evaluation-episodes 4 --checkpoint-interval 5e3 --keep-checkpoints 0 --resume "
         "--warmup-steps 2e3 --actor-hidden-sizes 8 9 "
+        "--perturb friction=1.5@5e4 --perturb=action-noise=0.1 "
         """--env-kwargs '{"ctrl_cost_weight": 0.5}'"""
     )
 
@@ -192,6 +211,7 @@ def test_train_passes_its_options_on(train_call):
     assert call["algorithm"] == CSAC(warmup_steps=2000, actor_hidden_sizes=(8, 9))
     assert call["directory"] == Path("some/where")
     assert call["environment_arguments"] == {"ctrl_cost_weight": 0.5}
+    assert call["perturbations"] == ("friction=1.5@5e4", "action-noise=0.1")
     assert call["command"].startswith("csac train Hopper-v4 --steps 1e5")
     assert call["command"].endswith("""--env-kwargs '{"ctrl_cost_weight": 0.5}'""")
     numbers = {name: call[name] for name in call if isinstance(call[name], int)}
@@ -215,8 +235,29 @@ def test_train_without_options_uses_the_defaults(train_call):
     assert call["algorithm"] == CSAC()
     assert (call["steps"], call["seeds"], call["groups"], call["directory"]) == (1_000_000, 1, None, None)
     assert call["preset"] is None
-    assert (call["resume"], call["start_from"]) == (False, None)
+    assert (call["resume"], call["start_from"], call["perturbations"]) == (False, None, ())
     assert (call["checkpoint_interval"], call["keep_checkpoints"]) == (50_000, 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "perturbations"),
+    [
+        ("", ("friction=2@60",)),
+        ("--perturb mass=2@70", ("mass=2@70",)),
+        ("--perturb none", ()),
+    ],
+)
+def test_a_fork_is_perturbed_as_its_source_unless_told_otherwise(train_call, monkeypatch, options, perturbations):
+    source = make_run("source", "Hopper-v4", 11, [-1.0] * 3, [1.0] * 3)
+    source.update_manifest(
+        perturbations=["friction=2@60"], evaluation={"interval": 10, "episodes": 1}, environment_arguments={}
+    )
+    monkeypatch.setattr(Source, "find", lambda where: Source(source, Checkpoint(Path("none"), 50, {}, {})))
+
+    call = train_call(f"Hopper-v4 --from source@50 {options}")
+
+    assert call["perturbations"] == perturbations
+    assert call["start_from"] == "source@50"
 
 
 @pytest.mark.parametrize("name", sorted(ALGORITHMS))
@@ -297,7 +338,10 @@ def test_the_help_shows_what_a_preset_sets(capsys, monkeypatch):
 
 @pytest.mark.parametrize(
     ("command", "options"),
-    [("evaluate", ["--seed", "--episodes", "--stochastic"]), ("play", ["--seed", "--episodes", "--video"])],
+    [
+        ("evaluate", ["--seed", "--episodes", "--stochastic", "--perturb KIND=VALUE"]),
+        ("play", ["--seed", "--episodes", "--video", "--perturb KIND=VALUE"]),
+    ],
 )
 def test_the_other_commands_have_help(capsys, command, options):
     assert csac(f"{command} --help") == 0
@@ -347,6 +391,42 @@ def test_evaluate_reads_what_train_wrote(trained, capsys):
         "mean 10.00",
         "± 95 % 0.00",
     ]
+
+
+def test_evaluate_says_what_was_perturbed(trained, capsys):
+    perturb = "--perturb observation-noise=0.1 --perturb action_noise=0.2"
+    assert csac(f"evaluate {trained[1]} --seed 1 --episodes 1 {perturb}") == 0
+
+    assert words(capsys.readouterr().out) == [
+        "perturbed: observation noise 0.1, action noise 0.2",
+        "seed mean return ± std min max length",
+        "1 10.00 0.00 10.00 10.00 10.0",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("perturb", "complaint"),
+    [
+        ("action_noise=0.2@7", "action_noise=0.2@7: nothing is learnt here, so it holds from the beginning: leave out"),
+        ("friction=2", "probes:Endless-v0 is no MuJoCo task: friction, gravity, mass, gain cannot be changed"),
+    ],
+)
+def test_evaluate_refuses_what_it_cannot_perturb(trained, capsys, perturb, complaint):
+    assert csac(f"evaluate {trained[1]} --perturb {perturb}") == 2
+
+    output = capsys.readouterr()
+    assert output.err.startswith(f"csac: {complaint}")
+    assert (output.err.count("\n"), output.out) == (1, "")
+
+
+def test_a_test_without_the_perturbations_of_the_training_says_so(capsys):
+    run = make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+    run.update_manifest(perturbations=["action_noise=0.1@50"])
+
+    assert csac("evaluate run --seed 0 --episodes 1") == 0
+
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first == "not perturbed, unlike its training (action_noise=0.1@50): see --perturb"
 
 
 def test_evaluate_takes_one_seed(trained, capsys):
@@ -467,6 +547,17 @@ def test_play_writes_a_video(capsys):
     pictures = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 34 * 48)
     assert np.rint(pictures.mean(axis=1) / 40).tolist() == [0, 1, 2, 3, 4, 5] * 2
     assert [path.name for path in Path("new").iterdir()] == ["film.mp4"]
+
+
+def test_play_plays_the_perturbed_task(capsys):
+    make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+
+    assert csac("play run --video film.mp4 --perturb friction=2") == 2
+
+    output = capsys.readouterr()
+    assert output.out == "perturbed: friction x 2\n"
+    assert output.err.startswith("csac: Pictures-v0 is no MuJoCo task")
+    assert not Path("film.mp4").exists()
 
 
 def test_play_without_a_display_points_at_video(monkeypatch, capsys):

@@ -5,7 +5,16 @@ import pytest
 from rich.console import Console
 
 from csac.record.run import RunDirectory
-from csac.training.console import duration, evaluation_table, make_console, number, results_table, runs_table, short
+from csac.training.console import (
+    duration,
+    evaluation_table,
+    make_console,
+    number,
+    recovery_tables,
+    results_table,
+    runs_table,
+    short,
+)
 from csac.training.evaluation import EvaluationEpisode
 from csac.training.progress import Reporter, Speed, sparkline
 
@@ -251,6 +260,43 @@ def test_results_of_one_seed_have_no_spread(tmp_path):
     run = make_run(tmp_path / "run", [[1.0, 2.0]])
 
     assert len(text_of(results_table(run))) == 2
+
+
+def test_a_perturbed_run_shows_what_it_cost(tmp_path):
+    run = make_run(tmp_path / "run", [[100.0, 100.0, 40.0, 95.0, 95.0], [200.0, 200.0, 100.0, 150.0, 100.0]])
+    run.update_manifest(perturbations=["gravity=2", "friction=1.5@20", "mass=2@40", "gain=2@900"])
+    first, second = (text_of(table) for table in recovery_tables(run))
+    assert first == [
+        "friction x 1.5 after step 20, until 40",
+        "seed before drop relative steps to 90 % area lost final worst fall",
+        "0 100.0 60.0 60% 20 625 78.3 60.0",
+        "1 200.0 100.0 50% never 1.25k 150.0 100.0",
+        "mean 150.0 80.0 55% 1 of 2 938 114.2 80.0",
+        "± std 70.7 28.3 7% 442 50.7 28.3",
+    ]
+    assert second[0] == "mass x 2 after step 40"
+    assert second[2].startswith("0 78.3 0.0 0% 0 0 76.7")
+
+
+def test_a_perturbed_run_ends_with_its_table(plain, clock, tmp_path):
+    run = make_run(tmp_path / "run", [[100.0, 40.0, 95.0]])
+    run.update_manifest(perturbations=["friction=1.5@10"])
+    reporter = Reporter(plain, clock)
+    reporter.start("Hopper-v4", "csac", [0], 1000, run.path)
+    reporter.finish(run)
+    assert any("friction x 1.5 after step 10" in line for line in lines(plain))
+
+
+def test_a_failed_seed_is_shown_and_not_in_the_mean_of_what_it_cost(tmp_path):
+    run = make_run(tmp_path / "run", [[10.0, 5.0, 9.0], [20.0, 10.0, 18.0], [30.0, 1.0]], failures=["2"])
+    run.update_manifest(perturbations=["friction=1.5@10"])
+    (table,) = (text_of(table) for table in recovery_tables(run))
+    assert [line.split()[0] for line in table[2:]] == ["0", "1", "2", "mean", "±"]
+    assert table[5].split()[:5] == ["mean", "15.00", "7.50", "50%", "20"]
+
+
+def test_a_run_that_was_not_perturbed_shows_no_such_table(tmp_path):
+    assert recovery_tables(make_run(tmp_path / "run", [[1.0, 2.0]])) == []
 
 
 def test_evaluations_are_summed_up_per_seed():

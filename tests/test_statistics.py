@@ -8,6 +8,7 @@ from csac.record.statistics import (
     last_evaluations,
     maximum_average_return,
     mean_and_interval,
+    recovery,
     stratified_bootstrap_interval,
 )
 from csac.types import InputError
@@ -117,3 +118,80 @@ def test_the_last_evaluations_are_each_seeds_own():
     assert last_evaluations(rows) == {0: 3.0, 5: 7.0}
     assert last_evaluations(rows, points=1) == {0: 4.0, 5: 6.0}
     assert last_evaluations(rows_of()) == {}
+
+
+def curve(*returns, seed=0):
+    """One seed's evaluations at 100, 200, ..."""
+    return [(seed, 100 * (number + 1), value) for number, value in enumerate(returns)]
+
+
+def test_recovery_worked_by_hand():
+    """A perturbation after step 400; 90 % of the return before are 90.
+
+    before = (90 + 100 + 110) / 3 = 100; lowest 40, so the drop is 60; it is below 90 at 500 and 600 and back at 700;
+    losses 0 60 20 5 0 at 400, 500, ...: area = 100 (30 + 40 + 12.5 + 2.5) = 8500; final = (80 + 95 + 120) / 3;
+    the largest fall from the highest so far is from 110 to 40.
+    """
+    rows = rows_of(*curve(50.0, 90.0, 100.0, 110.0, 40.0, 80.0, 95.0, 120.0))
+    (one,) = recovery(rows, 400).values()
+    assert one._asdict() == pytest.approx(
+        {
+            "before": 100.0,
+            "drop": 60.0,
+            "relative_drop": 0.6,
+            "steps_to_regain": 300.0,
+            "area_lost": 8500.0,
+            "final": 295 / 3,
+            "worst_drawdown": 70.0,
+        }
+    )
+
+
+def test_a_return_that_never_drops_loses_nothing():
+    one = recovery(rows_of(*curve(90.0, 100.0, 110.0, 101.0, 100.0)), 300)[0]
+    assert (one.before, one.drop, one.relative_drop, one.steps_to_regain, one.area_lost) == (100, 0, 0, 0, 0)
+    assert one.worst_drawdown == 10.0
+
+
+def test_a_drop_to_nine_tenths_is_none_to_regain():
+    one = recovery(rows_of(*curve(100.0, 100.0, 90.0, 95.0)), 200)[0]
+    assert (one.drop, one.steps_to_regain) == (10.0, 0.0)
+    assert one.area_lost == 100 * (5 + 7.5)
+
+
+def test_a_late_fall_is_regained_late_and_one_that_lasts_never():
+    assert recovery(rows_of(*curve(100.0, 95.0, 99.0, 80.0, 89.9, 90.0, 0.0)), 100)[0].steps_to_regain == 500.0
+    assert recovery(rows_of(*curve(100.0, 50.0, 89.0)), 100)[0].steps_to_regain == np.inf
+
+
+def test_the_recovery_of_negative_returns():
+    """Of -100, 90 % are -110; the drop is a share of 100."""
+    one = recovery(rows_of(*curve(-100.0, -150.0, -111.0, -110.0)), 100)[0]
+    assert (one.drop, one.relative_drop, one.steps_to_regain) == (50.0, 0.5, 300.0)
+    assert one.area_lost == pytest.approx(100 * (25 + 30.5 + 10.5))
+    assert np.isnan(recovery(rows_of(*curve(0.0, -1.0)), 100)[0].relative_drop)
+
+
+def test_recovery_begins_between_evaluations():
+    """After step 150: no loss there, 20 at 200 and 10 at 300: 50 / 2 * 20 + 100 * 15."""
+    one = recovery(rows_of(*curve(100.0, 80.0, 90.0)), 150)[0]
+    assert (one.before, one.area_lost, one.steps_to_regain) == (100.0, 2000.0, 150.0)
+
+
+def test_recovery_with_too_few_evaluations():
+    rows = rows_of(*curve(4.0, 2.0))
+    nothing_before, nothing_after = recovery(rows, 50)[0], recovery(rows, 200)[0]
+    np.testing.assert_array_equal(nothing_before, [np.nan] * 5 + [3.0, 2.0])
+    np.testing.assert_array_equal(nothing_after, [3.0] + [np.nan] * 4 + [3.0, 2.0])
+    assert recovery(rows, 100)[0].before == 4.0
+    assert recovery(rows_of(), 100) == {}
+
+
+def test_recovery_is_each_seeds_own_and_ends_where_it_is_told():
+    rows = rows_of(*curve(10.0, 5.0, 9.0, 1.0), *curve(20.0, np.nan, 4.0, 30.0, seed=7))
+    whole, part = recovery(rows, 100), recovery(rows, 100, until=300)
+    assert {seed: one.drop for seed, one in whole.items()} == {0: 9.0, 7: 16.0}
+    assert {seed: one.drop for seed, one in part.items()} == {0: 5.0, 7: 16.0}
+    assert {seed: one.final for seed, one in part.items()} == {0: 8.0, 7: 12.0}
+    assert {seed: one.steps_to_regain for seed, one in part.items()} == {0: 200.0, 7: np.inf}
+    assert whole[7].area_lost == 200 * 8 + 100 * 8

@@ -12,6 +12,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+REGAINED = 0.9  # of the return before a perturbation: the policy is back
 FEWEST_SEEDS = 5  # a bootstrap over fewer has too few distinct resamples to say anything
 
 
@@ -112,6 +113,67 @@ def last_evaluations(rows: np.ndarray, points: int = 3) -> dict[int, float]:
     _, seeds, returns = evaluation_matrix(rows)
     last = (line[~np.isnan(line)][-points:] for line in returns)
     return {int(seed): float(line.mean()) for seed, line in zip(seeds, last, strict=True) if line.size}
+
+
+class Recovery(NamedTuple):
+    """What a perturbation did to the returns of one seed, and how they came back. NaN where nothing can be told."""
+
+    before: float
+    """Mean return of the last three evaluations up to and including the perturbation's step."""
+    drop: float
+    """`before` minus the lowest return after it, 0 where none is lower."""
+    relative_drop: float
+    """The drop as a share of |before|."""
+    steps_to_regain: float
+    """Environment steps from the perturbation to 90 % of `before`: 0 if no evaluation fell below, infinite if never."""
+    area_lost: float
+    """Integral of max(0, before - return) over the steps after the perturbation, in return times steps."""
+    final: float
+    """Mean return of the last three evaluations."""
+    worst_drawdown: float
+    """The largest fall from the highest return so far, over the whole curve, before the perturbation and after it."""
+
+
+def recovery(rows: np.ndarray, step: int, until: int | None = None) -> dict[int, Recovery]:
+    """Return each seed's `Recovery` from a perturbation after `step`, of the rows of evaluations.csv until `until`.
+
+    An evaluation at `step` itself still counts as before. Of a negative return before, -100, 90 % are -110: `before`
+    less a tenth of its size. The steps to regain that end at the first evaluation that reaches it after the first one
+    that did not. The area is the trapezoids' between evaluations, beginning with no loss at `step`. Last evaluations
+    are fewer than three where there are no more; those of a seed that are NaN or missing are left out.
+    """
+    steps, seeds, returns = evaluation_matrix(rows)
+    wanted = steps <= (steps.max(initial=0) if until is None else until)
+    there = ~np.isnan(returns) & wanted
+    return {
+        int(seed): _recovery(steps[known], line[known], step)
+        for seed, line, known in zip(seeds, returns, there, strict=True)
+        if known.any()
+    }
+
+
+def _recovery(steps: np.ndarray, returns: np.ndarray, step: int) -> Recovery:
+    is_after = steps > step
+    final, drawdown = returns[-3:].mean(), (np.maximum.accumulate(returns) - returns).max()
+    if is_after.all() or not is_after.any():
+        before = np.nan if is_after.all() else returns[-3:].mean()
+        return Recovery(*map(float, (before, np.nan, np.nan, np.nan, np.nan, final, drawdown)))
+    before, steps, after = returns[~is_after][-3:].mean(), steps[is_after], returns[is_after]
+    drop = max(before - after.min(), 0.0)
+    shortfall = np.maximum(before - after, 0.0)
+    area = np.trapezoid([0.0, *shortfall], [step, *steps])
+    time = _time_to_regain(steps - step, after, (REGAINED if before >= 0 else 2 - REGAINED) * before)
+    return Recovery(*map(float, (before, drop, _divide(drop, abs(before)), time, area, final, drawdown)))
+
+
+def _time_to_regain(times: np.ndarray, returns: np.ndarray, threshold: float) -> float:
+    """Return the time of the first return at the threshold or above after the first below it."""
+    below = returns < threshold
+    if not below.any():
+        return 0.0
+    fallen = int(below.argmax())
+    back = ~below[fallen:]
+    return float(times[fallen + int(back.argmax())]) if back.any() else np.inf
 
 
 def _divide(numerator: np.ndarray, count: np.ndarray) -> np.ndarray:

@@ -16,8 +16,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from csac.record.statistics import evaluation_matrix, last_evaluations, last_means, mean_and_interval
+from csac.record.statistics import (
+    Recovery,
+    evaluation_matrix,
+    last_evaluations,
+    last_means,
+    mean_and_interval,
+    recovery,
+)
 from csac.record.tables import COLUMNS
+from csac.training.perturb import by_step, perturbations_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -98,6 +106,62 @@ def results_table(run: RunDirectory) -> Table:
         for label, cells in _over_seeds(np.stack([returns[:, -1], three, returns[:, best]], axis=1), largest):
             table.add_row(label, *cells, f"{steps[best]:,}" if label == "mean" else "", "")
     return table
+
+
+def recovery_tables(run: RunDirectory) -> list[Table]:
+    """Return a table for each step at which the task was perturbed: what it cost each seed, and how it came back.
+
+    Each looks as far as the next perturbation. There is none where no evaluation lies before the step or none after it.
+    """
+    rows, perturbed = run.evaluations, by_step(perturbations_of(run.manifest.get("perturbations", [])))
+    tables = []
+    for index, (step, text) in enumerate(perturbed):
+        until = perturbed[index + 1][0] if index + 1 < len(perturbed) else None
+        recoveries = recovery(rows, step, until)
+        if any(np.isfinite(seed.drop) for seed in recoveries.values()):
+            title = f"{text} after step {step:,}" + (
+                f", until {until:,}" if until and until < rows["step"].max() else ""
+            )
+            tables.append(_recovery_table(title, recoveries, run.manifest["failures"]))
+    return tables
+
+
+def _recovery_table(title: str, recoveries: Mapping[int, Recovery], failures: Mapping[str, str]) -> Table:
+    """Return one row per seed, and below them the mean and standard deviation over seeds that did not fail.
+
+    Where a seed never came back there is no mean of the steps, but how many did.
+    """
+    table = _table("seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "worst fall")
+    table.title, table.title_justify, table.title_style = title, "left", "bold"
+    values = np.array(list(recoveries.values()))
+    largest = float(np.nanmax(np.abs(values[:, [0, 1, 5, 6]])))
+    for seed, one in recoveries.items():
+        table.add_row(str(seed), *_recovery_cells(one, largest), style="red" if str(seed) in failures else None)
+    sound = np.array([one for seed, one in recoveries.items() if str(seed) not in failures and not np.isnan(one).any()])
+    if len(sound) > 1:
+        back = np.isfinite(sound[:, 3])
+        columns = np.where(back.all() | (np.arange(7) != 3), sound, np.nan)
+        mean, std = (
+            _recovery_cells(Recovery(*row.tolist()), largest) for row in (columns.mean(0), columns.std(0, ddof=1))
+        )
+        mean[3] = mean[3] or f"{back.sum()} of {len(back)}"
+        table.add_section()
+        table.add_row("mean", *mean)
+        table.add_row("± std", *std)
+    return table
+
+
+def _recovery_cells(one: Recovery, largest: float) -> list[str]:
+    texts = [
+        number(one.before, largest),
+        number(one.drop, largest),
+        f"{one.relative_drop:.0%}",
+        "never" if one.steps_to_regain == np.inf else f"{one.steps_to_regain:,.0f}",
+        f"{one.area_lost:,.3g}" if one.area_lost < 1000 else short(round(one.area_lost)),
+        number(one.final, largest),
+        number(one.worst_drawdown, largest),
+    ]
+    return ["" if np.isnan(value) else text for value, text in zip(one, texts, strict=True)]
 
 
 def evaluation_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Table:

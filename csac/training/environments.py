@@ -9,7 +9,7 @@ import math
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from gymnasium import spaces
 
 from csac.deploy.policy import ActionBounds
 from csac.training import tasks
+from csac.training.perturb import NOISES, PHYSICS, Noise, Physics
 from csac.training.silence import quietly
 from csac.training.snapshots import Snapshot, restore, snapshot
 from csac.types import InputError, Spec
@@ -87,6 +88,24 @@ class Environment:
         self.raw_observation: Any = None  # the last one, as the environment gave it
         self._parts = parts
         self._action_shape = self.contract_parts.action_shape
+        self._physics: Physics | None = None
+        self._noise: Noise | None = None
+        self._seed: int | None = None  # of the last reset
+
+    def perturb(self, values: Mapping[str, float]) -> None:
+        """Change the task from its next step on, for good: a value for each kind of `perturb.KINDS`, 1 or 0 for none.
+
+        Raises:
+            InputError: the task has no such physics.
+        """
+        physics = {kind: values[kind] for kind in PHYSICS if kind in values}
+        noise = {kind: values[kind] for kind in NOISES if kind in values}
+        if physics or self._physics:
+            self._physics = self._physics or Physics(self.raw, self.task_name)
+            self._physics.set(physics)
+        if noise or self._noise:
+            self._noise = self._noise or Noise()
+            self._noise.set(noise, self._seed)
 
     def reset(self, seed: int) -> np.ndarray:
         """Start an episode and return its first observation, float32 [observation].
@@ -94,6 +113,9 @@ class Environment:
         Raises:
             EnvironmentFailure: the environment raised, or the observation is not finite or misshapen.
         """
+        self._seed = seed
+        if self._noise:
+            self._noise.begin(seed)
         try:
             with self._quietly():
                 observation, _ = self.raw.reset(seed=seed)
@@ -120,7 +142,10 @@ class Environment:
         Raises:
             EnvironmentFailure: the environment raised, or action, observation or reward is not finite or misshapen.
         """
-        action = _part(action, self._action_shape, "action").reshape(self._action_shape)
+        action = _part(action, self._action_shape, "action")
+        if self._noise:
+            action = self._noise.on_action(action, self.contract_parts.action_low, self.contract_parts.action_high)
+        action = action.reshape(self._action_shape)
         try:
             observation, reward, terminated, truncated, info = self.raw.step(action)
             terminated, truncated, info = bool(terminated), bool(truncated), dict(info)
@@ -130,7 +155,10 @@ class Environment:
 
     def snapshot(self) -> Snapshot | None:
         """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell."""
-        return snapshot(self.raw)
+        saved = snapshot(self.raw)
+        if saved and self._noise:
+            saved.values["noise"] = self._noise.state()
+        return saved
 
     def restore(self, seed: int, saved: Snapshot) -> None:
         """Go on where `saved` was taken, in an episode that was reset with `seed`.
@@ -141,6 +169,8 @@ class Environment:
         self.reset(seed)
         try:
             restore(self.raw, saved)
+            if self._noise:
+                self._noise.take_back(saved.values.get("noise", {}))
         except Exception as error:
             raise EnvironmentFailure(f"the environment does not take its snapshot back: {_one_line(error)}") from error
 
@@ -154,8 +184,20 @@ class Environment:
         self.raw_observation = observation
         key, shape = self._parts[0]
         if key is None:
-            return _part(observation, shape, "observation")
-        return np.concatenate([_dict_part(observation, key, shape) for key, shape in self._parts])
+            flat = _part(observation, shape, "observation")
+        else:
+            flat = np.concatenate([_dict_part(observation, key, shape) for key, shape in self._parts])
+        return self._with_noise(flat) if self._noise else flat
+
+    def _with_noise(self, flat: np.ndarray) -> np.ndarray:
+        """Return the flat observation with its noise, and let `raw_observation` be the same in the task's own shape."""
+        assert self._noise
+        noisy = self._noise.on_observation(flat)
+        _check_finite(noisy, noisy.shape, "the observation with its noise")
+        ends = np.cumsum([math.prod(shape) for _, shape in self._parts])[:-1]
+        raw = {key: part.reshape(shape) for (key, shape), part in zip(self._parts, np.split(noisy, ends), strict=True)}
+        self.raw_observation = raw.get(None, raw)
+        return noisy
 
 
 class FinishedEpisode(NamedTuple):
@@ -221,6 +263,11 @@ class SeedEnvironments:
         for index in self._running:
             self._reset(index)
         return self._observation
+
+    def perturb(self, values: Mapping[str, float]) -> None:
+        """Change every seed's task, as `Environment.perturb`."""
+        for environment in self.environments:
+            environment.perturb(values)
 
     def step(self, actions: np.ndarray) -> Steps:
         """Step every seed that is alive with its action in [-1, 1], [seed, action]."""

@@ -9,13 +9,15 @@ import numpy as np
 
 from csac.deploy.policy import Policy
 from csac.training.environments import EVALUATION_SEED, FRESH_EVALUATION_SEED, Environment, EnvironmentFailure
+from csac.training.perturb import lasting, values_at
 from csac.training.tasks import adapter_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from csac.training.environments import Parts, Task
+    from csac.training.perturb import Perturbation
 
     OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
 
@@ -75,6 +77,13 @@ class Evaluator:
         adapter = adapter_of(task)
         self._has_memory = adapter is not None and adapter.has_memory
         self.info_names: set[str] = set()
+        self._perturbed: dict[str, float] = {}
+
+    def perturb(self, values: Mapping[str, float]) -> None:
+        """Change the task from the next `run` on, as `Environment.perturb`; what the task cannot be, `run` refuses."""
+        self._perturbed = dict(values)
+        for environment in self._environments:
+            environment.perturb(values)
 
     def run(self, policy: Policy, deterministic: bool = True) -> list[EvaluationEpisode]:
         """Return the episodes in order; stochastic actions draw from a generator of the episode's own seed.
@@ -124,7 +133,9 @@ class Evaluator:
 
     def _make_environments(self) -> None:
         while len(self._environments) < min(ROWS, self.episodes):
-            self._environments.append(Environment(self._task, self._environment_arguments))
+            environment = Environment(self._task, self._environment_arguments)
+            self._environments.append(environment)
+            environment.perturb(self._perturbed)
 
     def _run_batch(self, policy: Policy, numbers: range, deterministic: bool) -> list[EvaluationEpisode]:
         observation_size, action_size = policy.contract.spec
@@ -192,18 +203,22 @@ def evaluate(
     first_seed: int = FRESH_EVALUATION_SEED,
     deterministic: bool = True,
     environment_arguments: dict[str, Any] | None = None,
+    perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> np.ndarray:
     """Return the returns [episodes] of a policy on episodes reset with `first_seed`, `first_seed + 1`, ...
 
     `policy` is a csac `Policy`, or any object whose `predict` has Stable-Baselines3's shape: that one is given the
-    task's raw observations one at a time and answers on the task's own action scale.
+    task's raw observations one at a time and answers on the task's own action scale. `perturbations`, such as
+    `("friction=2",)`, change the task for all of every episode.
 
     Raises:
-        InputError: as `Evaluator`, or a policy without `predict`.
+        InputError: as `Evaluator`, a policy without `predict`, or perturbations that the task cannot have.
         EvaluationFailure: as `Evaluator.run`.
     """
+    perturbed = values_at(lasting(perturbations), 0)
     if isinstance(policy, Policy):
         evaluator = Evaluator(task, environment_arguments, episodes, first_seed)
+        evaluator.perturb(perturbed)
         try:
             return np.array([episode.episode_return for episode in evaluator.run(policy, deterministic)])
         finally:
@@ -213,6 +228,7 @@ def evaluate(
     _check_episodes(episodes)
     environment = Environment(task, environment_arguments)
     try:
+        environment.perturb(perturbed)
         played = (_Episode(environment, number, first_seed + number) for number in range(episodes))
         return np.array([_play(policy, episode, deterministic).episode_return for episode in played])
     finally:

@@ -13,6 +13,7 @@ from csac.training.checkpoint import Checkpoint, SeedFiles, taken_back
 from csac.training.environments import SeedEnvironments
 from csac.training.evaluation import LONGEST_EPISODE, EvaluationFailure, Evaluator
 from csac.training.learner import Learner
+from csac.training.perturb import values_at
 from csac.training.snapshots import Snapshot
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from csac.record.run import Table
     from csac.training.checkpoint import Files
     from csac.training.environments import Task
+    from csac.training.perturb import Perturbation
     from csac.types import Algorithm, PolicyNetwork
 
 METRICS_INTERVAL = 1_000
@@ -45,6 +47,7 @@ class Settings(NamedTuple):
     checkpoint_interval: int = 0
     begin: int = 0
     events: tuple[str, ...] = ()
+    perturbations: tuple[Perturbation, ...] = ()
 
 
 class Rows(NamedTuple):
@@ -141,6 +144,8 @@ class Group:
             *self.environments.contract_parts,
         )
         self._files: list[SeedFiles] = []
+        self._changes = {item.step for item in settings.perturbations}
+        self._perturb(max(settings.begin - 1, 0))  # as in the step that the checkpoint came after
         if settings.begin:
             assert settings.checkpoints
             checkpoint = Checkpoint.open(settings.checkpoints, settings.begin)
@@ -208,6 +213,8 @@ class Group:
 
     def _advance(self) -> Iterator[Event]:
         """Make one environment step, and learn from it."""
+        if self.step in self._changes:
+            self._perturb(self.step)
         outcome = self.environments.step(self._actions)
         self.step += 1
         for failure in outcome.failures:
@@ -222,6 +229,13 @@ class Group:
         # One product finds a nan or an inf in a third of the time of np.isfinite().all().
         if not flat.dot(flat) < np.inf and not np.isfinite(self._actions[self.environments.alive]).all():
             yield from self._stop_diverged()
+
+    def _perturb(self, step: int) -> None:
+        """Have the task as it is in the environment step after the first `step`, in evaluations too."""
+        if self._changes:
+            values = values_at(self.settings.perturbations, step)
+            self.environments.perturb(values)
+            self.evaluator.perturb(values)
 
     def _stop_diverged(self) -> Iterator[Event]:
         """Stop each seed whose parameters, or what they led to, are not finite. Its last checkpoint stays sound."""

@@ -14,14 +14,16 @@ from csac.deploy.policy import load
 from csac.record.run import RunDirectory
 from csac.training.environments import FRESH_EVALUATION_SEED, Environment
 from csac.training.evaluation import EvaluationEpisode, Evaluator
+from csac.training.perturb import lasting, perturbations_of, values_at
 from csac.training.pool import EvaluationPool, choose_processes
 from csac.training.tasks import adapter_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator
+    from collections.abc import Callable, Generator, Iterable, Iterator
 
     from csac.training.evaluation import OnProgress
+    from csac.training.perturb import Perturbation
 
 DEFAULT_FRAMES_PER_SECOND = 30
 SECONDS_ON_SCREEN = 1.0  # that an episode has at least: its last picture stays for as long as it takes
@@ -32,17 +34,19 @@ def evaluate_run(
     seed: int | None = None,
     episodes: int = 10,
     deterministic: bool = True,
+    perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
     processes: int | None = None,
     on_progress: OnProgress | None = None,
 ) -> Iterator[tuple[int, list[EvaluationEpisode]]]:
     """Yield (seed, episodes) for the last policy of each seed of a run, or of the one asked for.
 
-    The episodes are the same for every seed, and none that training or its evaluations have seen. They are shared by
+    The episodes are the same for every seed, and none that training or its evaluations have seen. The task is the one
+    that the run began with, but for these `perturbations`, which last from beginning to end. The episodes are shared by
     `processes`, by default as many as pay; 1 is this one. Whatever their number, the results are the same.
     `on_progress(episodes done, of how many)` is called after each batch of episodes.
 
     Raises:
-        InputError: no run there, no such seed, a damaged file, or a task that can no longer be made.
+        InputError: no run there, no such seed, a damaged file, or a task that can no longer be made or perturbed so.
         EvaluationFailure: an environment raised, or gave what is not finite; or a process died.
     """
     run = _open(directory)
@@ -53,6 +57,7 @@ def evaluate_run(
         FRESH_EVALUATION_SEED,
         run.manifest.get("events", ()),
     )
+    evaluator.perturb(values_at(lasting(perturbations), 0))
     labels = _seeds_with_policies(run) if seed is None else [seed]
     policies = [load(directory, label) for label in labels]
     processes = choose_processes(evaluator, len(policies)) if processes is None else processes
@@ -63,18 +68,34 @@ def evaluate_run(
         workers.close()
 
 
+def told_perturbations(
+    directory: str | Path, perturbations: str | Perturbation | Iterable[str | Perturbation]
+) -> list[str]:
+    """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
+    given = lasting(perturbations)
+    trained = perturbations_of(RunDirectory.open(directory).manifest.get("perturbations", []))
+    if given:
+        return [f"perturbed: {', '.join(item.label for item in given)}"]
+    return [f"not perturbed, unlike its training ({', '.join(map(str, trained))}): see --perturb"] if trained else []
+
+
 def play(
-    directory: str | Path, seed: int | None = None, episodes: int = 1, video: str | Path | None = None
+    directory: str | Path,
+    seed: int | None = None,
+    episodes: int = 1,
+    video: str | Path | None = None,
+    perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> Iterator[EvaluationEpisode]:
     """Yield the episodes that a run's policy plays, in a window or, with `video`, into an .mp4 file.
 
     Without `seed` it is the seed with the best last evaluations. The video is there once the last episode was yielded.
+    `perturbations` are as in `evaluate_run`.
 
     Raises:
         InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
         EnvironmentFailure: the environment raised, or gave what is not finite.
     """
-    run = _open(directory)
+    run, perturbed = _open(directory), values_at(lasting(perturbations), 0)
     if episodes < 1:
         raise InputError(f"{episodes} episodes: play at least one")
     policy = load(directory, seed)
@@ -84,7 +105,6 @@ def play(
         _check_video(Path(video))
         _draw_off_screen()
     environment = _drawn_environment(run, "human" if video is None else "rgb_array")
-    _follow(environment)
     adapter = adapter_of(run.manifest["task"])
     picture = adapter.camera(environment.raw) if adapter and adapter.camera else environment.raw.render
     frames_per_second = round(
@@ -93,6 +113,8 @@ def play(
         or DEFAULT_FRAMES_PER_SECOND
     )
     try:
+        environment.perturb(perturbed)
+        _follow(environment)
         with _recording(environment, picture, frames_per_second, video) as record:
             for number in range(episodes):
                 observation = environment.reset(FRESH_EVALUATION_SEED + number)

@@ -15,7 +15,16 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from csac.training.console import duration, events_table, make_console, number, program, results_table, short
+from csac.training.console import (
+    duration,
+    events_table,
+    make_console,
+    number,
+    program,
+    recovery_tables,
+    results_table,
+    short,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -117,6 +126,8 @@ class Reporter:
             self._print(results_table(run))
             if (events := events_table(evaluations)) is not None:
                 self._print(events)
+            for table in recovery_tables(run):
+                self._print(table)
         else:
             self._print(Text("no evaluations yet"))
         for seed, reason in run.manifest["failures"].items():

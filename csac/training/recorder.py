@@ -38,6 +38,7 @@ class Recorder:
         checkpoints: where checkpoints are committed, or None.
         begin: the step that the run goes on from; 0 for a new run.
         failures: the seeds that had failed by then, and how.
+        perturbations: (step, what changes there), in order.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class Recorder:
         checkpoints: Checkpoints | None = None,
         begin: int = 0,
         failures: Mapping[int, str] = MappingProxyType({}),
+        perturbations: Sequence[tuple[int, str]] = (),
     ) -> None:
         self.run, self.groups, self.reporter, self.tensorboard = run, groups, reporter, tensorboard
         self.checkpoints = checkpoints
@@ -66,6 +68,7 @@ class Recorder:
         # Told once, after the first evaluation of the run.
         self._unheard = set() if len(run.evaluations) else set(run.manifest.get("events", ()))
         self._info_names: set[str] = set()
+        self._perturbations = [(step, text) for step, text in perturbations if step >= begin]  # still to be told
 
     def handle(self, group: int, message: Message) -> None:
         """Take one message of one group."""
@@ -231,10 +234,12 @@ class Recorder:
                 getattr(self.tensorboard, table)(ready)
             if table == "evaluations":
                 self._announce(ready)
+        self._tell_perturbations(min(limit, max(self._steps.values())))
 
     def _announce(self, rows: list[dict[str, Any]]) -> None:
         """Tell whoever watches of each evaluation that every group has passed."""
         for step in sorted({row["step"] for row in rows}):
+            self._tell_perturbations(step)
             returns = _mean_returns([row for row in rows if row["step"] == step])
             self.evaluated.append((step, returns))
             self.run.log(f"step {step}: " + ", ".join(f"seed {seed} {value:.1f}" for seed, value in returns.items()))
@@ -250,6 +255,12 @@ class Recorder:
             there = ", ".join(sorted(self._info_names)) or "nothing"
             self._note(f"note: no episode's last info holds a number called {name!r} so far; it holds {there}")
         self._unheard = set()
+
+    def _tell_perturbations(self, step: int) -> None:
+        """Note, once, what has changed by this step: after a checkpoint of the very step it has not yet."""
+        while self._perturbations and self._perturbations[0][0] < step:
+            begin, text = self._perturbations.pop(0)
+            self._note(f"perturbed from step {begin + 1:,} on: {text}")
 
 
 def _best_means(evaluations: np.ndarray) -> dict[int, float]:

@@ -12,13 +12,27 @@ from csac.algorithms import ALGORITHMS
 from csac.record.run import GROWING_FILES, RunDirectory
 from csac.training.checkpoint import FOLDER, Checkpoint, Checkpoints, link, newest_sound, sound_at, taken_back
 from csac.training.learner import misfit
+from csac.training.perturb import continued, perturbations_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from csac.training.perturb import Perturbation
     from csac.types import Algorithm, Spec
 
 # What a run cannot change: with any other value it would be another run.
-_FIXED = ("task", "environment_arguments", "algorithm", "hyperparameters", "seeds", "evaluation", "events")
+_FIXED = (
+    "task",
+    "environment_arguments",
+    "perturbations",
+    "algorithm",
+    "hyperparameters",
+    "seeds",
+    "evaluation",
+    "events",
+)
+_BEFORE_THERE_WERE = {"perturbations": [], "events": []}  # in manifests that are older
 
 
 class Point(NamedTuple):
@@ -60,17 +74,38 @@ BEGINNING = Point(0, {}, [], [])
 
 def refuse_differences(run: RunDirectory, wanted: dict[str, Any], algorithm: Algorithm) -> None:
     """Raise InputError, with what differs, where `wanted` is not a continuation of `run`."""
-    plain = {"events": [], **run.manifest}  # which manifests of older runs do not have
-    differences = _differences({name: plain.get(name) for name in _FIXED}, {name: wanted[name] for name in _FIXED})
+    differences = _differences(_fixed(run.manifest), _fixed(wanted))
     if differences:
         raise InputError(f"{run.path} was trained otherwise: {'; '.join(differences)}. Choose another directory")
-    before, now = plain["steps"], wanted["steps"]
+    before, now = run.manifest["steps"], wanted["steps"]
     if now < before:
         raise InputError(f"{run.path} is a run of {before:,} steps, which {now:,} would shorten: give at least as many")
     if now > before and algorithm.has_schedule:
         raise InputError(
             f"{run.path} cannot go on beyond its {before:,} steps: its learning rate was planned for them (a schedule)"
         )
+
+
+def with_past(
+    given: Sequence[Perturbation], existing: RunDirectory | None, source: Source | None
+) -> tuple[Perturbation, ...]:
+    """Return the perturbations of a run together with those that it was forked after.
+
+    Args:
+        given: those asked for now.
+        existing: the run that goes on, if there is one.
+        source: where a new run begins, if not anew.
+
+    Raises:
+        InputError: one of those asked for lies before the step where the run was or is forked.
+    """
+    if existing:
+        before, begin = existing.manifest, existing.manifest.get("forked_from", {}).get("step", 0)
+    elif source:
+        before, begin = source.run.manifest, source.checkpoint.step
+    else:
+        return tuple(given)
+    return continued(perturbations_of(before.get("perturbations", [])), given, begin)
 
 
 def roll_back(run: RunDirectory) -> Point:
@@ -130,6 +165,7 @@ def arguments_of(run: RunDirectory) -> dict[str, Any]:
             "evaluation_interval": manifest["evaluation"]["interval"],
             "evaluation_episodes": manifest["evaluation"]["episodes"],
             "environment_arguments": manifest["environment_arguments"],
+            "perturbations": manifest.get("perturbations", []),
             "device": manifest["device"],
             "checkpoint_interval": manifest["checkpoints"]["interval"],
             "keep_checkpoints": manifest["checkpoints"]["keep"],
@@ -190,8 +226,7 @@ class Source(NamedTuple):
 
     def described(self, wanted: dict[str, Any]) -> dict[str, Any]:
         """Return what the manifest says of where the new run began, and of what is different in it."""
-        before = {name: {"events": [], **self.run.manifest}.get(name) for name in _FIXED}
-        changes = _differences(before, {name: wanted[name] for name in _FIXED})
+        changes = _differences(_fixed(self.run.manifest), _fixed(wanted))
         return {"directory": str(self.run.path), "step": self.checkpoint.step, "changes": changes}
 
     def copy_to(self, run: RunDirectory, keep: int) -> None:
@@ -217,6 +252,10 @@ def _restore_best_policies(run: RunDirectory, checkpoint: Checkpoint | None) -> 
         if name.endswith(".best.safetensors"):
             assert checkpoint
             link(checkpoint.folder / name, run.path / "policy" / name.partition(".")[2])
+
+
+def _fixed(manifest: dict[str, Any]) -> dict[str, Any]:
+    return {name: manifest.get(name, _BEFORE_THERE_WERE.get(name)) for name in _FIXED}
 
 
 def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:

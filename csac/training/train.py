@@ -26,14 +26,25 @@ from csac.training.environments import Environment, Task
 from csac.training.groups import choose_groups, run_groups, split_seeds
 from csac.training.logs import TensorBoardLog
 from csac.training.loop import Settings
+from csac.training.perturb import by_step, perturbations_of, refuse_late
 from csac.training.recorder import Recorder
-from csac.training.resume import BEGINNING, Point, Source, algorithm_of, arguments_of, refuse_differences, roll_back
+from csac.training.resume import (
+    BEGINNING,
+    Point,
+    Source,
+    algorithm_of,
+    arguments_of,
+    refuse_differences,
+    roll_back,
+    with_past,
+)
 from csac.training.tasks import adapter_of, check_events, events_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    from csac.training.perturb import Perturbation
     from csac.training.progress import Reporter
     from csac.types import Algorithm, Spec
 
@@ -76,6 +87,7 @@ def train(
     evaluation_interval: int = 5_000,
     evaluation_episodes: int = 10,
     environment_arguments: dict[str, Any] | None = None,
+    perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
     device: str = "cpu",
     checkpoint_interval: int = 50_000,
     keep_checkpoints: int = 2,
@@ -103,6 +115,8 @@ def train(
         evaluation_interval: environment steps between evaluations; there is one at the last step as well.
         evaluation_episodes: episodes of each evaluation.
         environment_arguments: keyword arguments for the environment.
+        perturbations: changes of the task, in training and evaluations, such as `("friction=1.5@300000",)`: see
+            `Perturbation`. What a run begins with (`start_from`) keeps what had happened to it.
         device: "cpu" or "gpu".
         checkpoint_interval: environment steps between checkpoints; there is one every ten minutes, at the last step and
             when a signal stops the run as well. 0 makes none.
@@ -131,14 +145,17 @@ def train(
     )
     check_events(events or ())
     _choose_device(device)
-    environment = Environment(task, environment_arguments)
-    spec, task_name = environment.spec, environment.task_name
-    environment.close()
+    with closing(Environment(task, environment_arguments)) as environment:
+        spec, task_name = environment.spec, environment.task_name
+        path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
+        existing = RunDirectory.open(path) if resume and is_run(path) else None
+        source = Source.find(start_from) if start_from is not None and not existing else None
+        perturbations = with_past(perturbations_of(perturbations), existing, source)
+        refuse_late(perturbations, steps)
+        for item in perturbations:
+            environment.perturb({item.kind: item.value})
 
-    path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
     labels = list(range(first_seed, first_seed + seeds))
-    existing = RunDirectory.open(path) if resume and is_run(path) else None
-    source = Source.find(start_from) if start_from is not None and not existing else None
     before = existing or (source.run if source else None)
     names = events_of(task, events or ()) if events is not None or not before else before.manifest.get("events", ())
     parts = split_seeds(labels, _choose_number_of_groups(groups, labels, device, existing))
@@ -152,6 +169,7 @@ def train(
         (path / FOLDER).absolute() if checkpoint_interval else None,
         checkpoint_interval,
         events=tuple(names),
+        perturbations=perturbations,
     )
     if len(parts) > 1:
         _check_picklable(settings)
@@ -160,6 +178,7 @@ def train(
         "task": task_name,
         "task_is_callable": not isinstance(task, str),
         "environment_arguments": environment_arguments,
+        "perturbations": [str(item) for item in perturbations],
         "algorithm": algorithm.name,
         "hyperparameters": dataclasses.asdict(algorithm),  # pyright: ignore[reportArgumentType]
         "preset": preset,
@@ -264,7 +283,7 @@ def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Wat
     checkpoints = None
     if settings.checkpoints:
         checkpoints = Checkpoints(settings.checkpoints, run.manifest["checkpoints"]["keep"], point.pinned)
-    recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures)
+    recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures, by_step(settings.perturbations))
     received, told = [], False
     try:
         with (
@@ -337,7 +356,9 @@ def _finish(run: RunDirectory, recorder: Recorder, state: str) -> None:
     rows = run.evaluations
     if len(rows):
         name, task = run.manifest["algorithm"].upper(), run.manifest["task"]
-        learning_curve([(name, rows)], run.path / "curve.png", title=task)
+        perturbed = by_step(perturbations_of(run.manifest.get("perturbations", [])))
+        marks = [(step, text) for step, text in perturbed if step <= rows["step"].max()]
+        learning_curve([(name, rows)], run.path / "curve.png", title=task, marks=marks)
     run.update_manifest(state=state, failures=recorder.failures)
 
 

@@ -1,0 +1,786 @@
+"""Perturbations: known physics, noise with known moments, and runs that are perturbed, killed, resumed and forked."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import probes
+import pytest
+from gymnasium import spaces
+from gymnasium.envs.mujoco import MujocoEnv
+from test_resume import LEARNERS, Crash, contents, crash_at, run
+
+from csac.deploy.policy import Contract, Policy, load
+from csac.record.run import RunDirectory
+from csac.training import loop
+from csac.training.environments import EVALUATION_SEED, Environment, SeedEnvironments
+from csac.training.evaluation import Evaluator, evaluate
+from csac.training.loop import Progress
+from csac.training.perturb import (
+    Perturbation,
+    by_step,
+    continued,
+    lasting,
+    perturbations_of,
+    refuse_late,
+    values_at,
+)
+from csac.training.recorder import Recorder
+from csac.training.snapshots import Snapshot, _mujoco_arrays
+from csac.training.train import resume
+from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
+
+PAPER_TASKS = ["HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"]
+
+# What is written, and what is refused.
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "value", "step"),
+    [
+        ("friction=1.5@300000", "friction", 1.5, 300_000),
+        ("friction=1.5@3e5", "friction", 1.5, 300_000),
+        (" mass=2@1_000 ", "mass", 2.0, 1000),
+        ("gravity=0", "gravity", 0.0, 0),
+        ("gain=.25@0", "gain", 0.25, 0),
+        ("observation-noise=1e-3@7", "observation_noise", 0.001, 7),
+        ("action_noise=0.1", "action_noise", 0.1, 0),
+    ],
+)
+def test_what_is_written_is_what_is_meant(text, kind, value, step):
+    perturbation = Perturbation.parse(text)
+    assert perturbation == Perturbation(kind, value, step)
+    assert Perturbation.parse(str(perturbation)) == perturbation
+
+
+def test_what_the_manifest_holds_is_short():
+    texts = [str(item) for item in perturbations_of(["friction=1.50@300_000", "mass=0.1", "gain=2@0"])]
+    assert texts == ["mass=0.1", "gain=2", "friction=1.5@300000"]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("frction=2", "no perturbation is called 'frction': did you mean friction? there are friction, gravity, mass,"),
+        ("wind=2", "no perturbation is called 'wind': there are friction, gravity, mass, gain, observation_noise, act"),
+        ("friction", "is written KIND=VALUE or KIND=VALUE@STEP, as friction=1.5@300000, not 'friction'"),
+        ("friction=@3", "is written KIND=VALUE or KIND=VALUE@STEP"),
+        ("friction=2@", "is written KIND=VALUE or KIND=VALUE@STEP"),
+        ("friction=two", "friction=two: 'two' is not a number"),
+        ("friction=-1", "friction takes a finite factor of 0 or more, not -1.0"),
+        ("gravity=nan", "gravity takes a finite factor of 0 or more, not nan"),
+        ("mass=0", "mass takes a finite factor above 0, not 0.0"),
+        ("mass=inf", "mass takes a finite factor above 0, not inf"),
+        ("action_noise=-0.1", "action_noise takes a finite standard deviation of 0 or more, not -0.1"),
+        ("friction=2@soon", "friction=2@soon: 'soon' is not a whole number of steps"),
+        ("friction=2@1.5", "'1.5' is not a whole number of steps"),
+        ("friction=2@inf", "'inf' is not a whole number of steps"),
+        ("friction=2@-3", "the step of friction must be a whole number of 0 or more, not -3"),
+    ],
+)
+def test_a_mistake_is_one_line(text, complaint):
+    with pytest.raises(InputError, match=re.escape(complaint)) as refusal:
+        Perturbation.parse(text)
+    assert "\n" not in str(refusal.value)
+
+
+def test_one_may_be_given_alone_and_objects_too():
+    one = Perturbation("friction", 2, 5)
+    assert perturbations_of("friction=2@5") == perturbations_of(one) == perturbations_of([one]) == (one,)
+    with pytest.raises(InputError, match="must be a whole number"):
+        Perturbation("friction", 2.0, 1.5)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="finite factor"):
+        Perturbation("friction", "2")  # pyright: ignore[reportArgumentType]
+
+
+def test_two_of_a_kind_at_one_step_are_refused():
+    with pytest.raises(InputError, match="friction=2@5 and friction=3@5 are of the same kind and step"):
+        perturbations_of(["friction=2@5", "mass=2@5", "friction=3@5"])
+
+
+def test_a_later_one_of_a_kind_replaces_the_earlier():
+    several = perturbations_of(["friction=1@200", "mass=2", "friction=1.5@100"])
+    assert values_at(several, 0) == values_at(several, 99) == {"mass": 2.0}
+    assert values_at(several, 100) == values_at(several, 199) == {"mass": 2.0, "friction": 1.5}
+    assert values_at(several, 200) == {"mass": 2.0, "friction": 1.0}
+    assert by_step(several) == [(0, "mass x 2"), (100, "friction x 1.5"), (200, "friction x 1")]
+
+
+def test_what_changes_nothing_is_refused():
+    refuse_late(perturbations_of("friction=2@99"), 100)
+    with pytest.raises(InputError, match="friction=2@100 would change nothing: the run ends at step 100"):
+        refuse_late(perturbations_of("friction=2@100"), 100)
+    with pytest.raises(InputError, match=r"friction=2@1: nothing is learnt here.*leave out @1"):
+        lasting("friction=2@1")
+
+
+def test_a_fork_keeps_what_had_happened_and_takes_what_is_to_come():
+    before = perturbations_of(["mass=2", "friction=2@100", "friction=3@300"])
+    assert continued(before, (), 100) == perturbations_of("mass=2")
+    assert continued(before, before, 300) == before
+    given = perturbations_of(["friction=4@200", "friction=2@100"])
+    assert continued(before, given, 200) == perturbations_of(["mass=2", "friction=2@100", "friction=4@200"])
+    with pytest.raises(InputError, match="gain=2@199 lies before step 200, where this run begins: write gain=2@200"):
+        continued(before, perturbations_of("gain=2@199"), 200)
+    with pytest.raises(InputError, match="friction=4 lies before step 200"):
+        continued(before, perturbations_of("friction=4"), 200)
+
+
+# Physics.
+
+
+def model_of(environment: Environment) -> Any:
+    return environment.raw.unwrapped.model  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def data_of(environment: Environment) -> Any:
+    return environment.raw.unwrapped.data  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def numbers_of(model: Any) -> dict[str, np.ndarray]:
+    """Every array of numbers of a model, and the scalars that the physics depends on."""
+    arrays = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
+    numbers = {name: a.copy() for name, a in arrays.items() if isinstance(a, np.ndarray) and a.dtype.kind in "fiu"}
+    return {**numbers, "gravity": model.opt.gravity.copy(), "meaninertia": np.array(model.stat.meaninertia)}
+
+
+def different(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> set[str]:
+    return {name for name in first if not np.array_equal(first[name], second[name], equal_nan=True)}
+
+
+def zero_action(environment: Environment) -> np.ndarray:
+    return np.zeros(environment.spec.action_size, np.float32)
+
+
+@pytest.mark.parametrize("task", PAPER_TASKS)
+def test_friction_scales_every_column_of_every_geom_and_nothing_else(task):
+    environment = Environment(task)
+    before = numbers_of(model_of(environment))
+    assert (before["geom_friction"] > 0).all()
+    environment.perturb({"friction": 1.5})
+    environment.reset(0)
+    for _ in range(3):
+        environment.step(zero_action(environment))
+    environment.reset(1)
+    after = numbers_of(model_of(environment))
+    np.testing.assert_array_equal(after["geom_friction"], 1.5 * before["geom_friction"])
+    assert different(before, after) == {"geom_friction"}
+    environment.perturb({"friction": 2.0})  # of the task's own, not of what it was just now
+    np.testing.assert_array_equal(model_of(environment).geom_friction, 2.0 * before["geom_friction"])
+    environment.perturb({})
+    assert different(before, numbers_of(model_of(environment))) == set()
+
+
+@pytest.mark.parametrize("task", PAPER_TASKS)
+def test_every_kind_alters_what_it_says_and_leaves_the_episode_as_it_was(task):
+    environment = Environment(task)
+    environment.reset(3)
+    for _ in range(5):
+        environment.step(zero_action(environment))
+    before, state = numbers_of(model_of(environment)), _mujoco_arrays(environment.raw.unwrapped)
+    state = {name: array.copy() for name, array in state.items()}
+    derived = {"actuator_acc0", "body_invweight0", "body_subtreemass", "dof_M0", "dof_invweight0", "meaninertia"}
+    for kind, names in {
+        "gravity": {"gravity"},
+        "gain": {"actuator_gainprm"},  # motors have no bias
+        "mass": {"body_mass", "body_inertia", *derived},
+    }.items():
+        environment.perturb({kind: 2.0})
+        after = numbers_of(model_of(environment))
+        assert different(before, after) == names
+        for name in names - derived:
+            np.testing.assert_array_equal(after[name], 2.0 * before[name])
+        environment.perturb({kind: 1.0})
+        assert different(before, numbers_of(model_of(environment))) == set()
+    for name, array in _mujoco_arrays(environment.raw.unwrapped).items():
+        np.testing.assert_array_equal(array, state[name])
+
+
+def test_a_doubled_mass_is_what_the_compiler_makes_of_a_doubled_mass():
+    environment = Environment("HalfCheetah-v4")
+    text = Path(environment.raw.unwrapped.fullpath).read_text()  # pyright: ignore[reportAttributeAccessIssue]
+    assert 'settotalmass="14"' in text
+    heavy = mujoco.MjModel.from_xml_string(  # pyright: ignore[reportAttributeAccessIssue]
+        text.replace('settotalmass="14"', 'settotalmass="28"')
+    )
+    environment.perturb({"mass": 2.0})
+    ours, theirs = numbers_of(model_of(environment)), numbers_of(heavy)
+    for name in ("body_mass", "body_inertia", "dof_M0", "body_invweight0", "dof_invweight0", "actuator_acc0"):
+        np.testing.assert_array_equal(ours[name], theirs[name])
+    assert different(ours, theirs) == set()
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.0, 2.0])
+def test_a_body_in_the_air_falls_as_fast_as_gravity_says(factor):
+    environment = Environment("Ant-v4")
+    environment.perturb({"gravity": factor})
+    environment.reset(0)
+    inner: Any = environment.raw.unwrapped
+    position = inner.init_qpos.copy()
+    position[2] = 50.0
+    hinges = inner.model.jnt_qposadr[1:]
+    position[hinges] = inner.model.jnt_range[1:].mean(axis=1)  # at no joint's limit
+    inner.set_state(position, 0 * inner.init_qvel)
+    assert data_of(environment).qacc[2] == pytest.approx(-9.81 * factor, abs=1e-9)
+    environment.step(zero_action(environment))  # five steps of 0.01 s
+    assert data_of(environment).qvel[2] == pytest.approx(-9.81 * factor * 0.05, rel=1e-6, abs=1e-9)
+
+
+BLOCK = """
+<mujoco>
+  <option timestep="0.002" cone="elliptic"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="50 50 1" friction="0.05 0.001 0.001"/>
+    <body name="block" pos="0 0 0.1">
+      <joint name="x" type="slide" axis="1 0 0"/> <joint name="z" type="slide" axis="0 0 1"/>
+      <geom type="box" size="0.2 0.2 0.1" mass="3" friction="0.3 0.001 0.001"/>
+    </body>
+    <body name="cart" pos="0 5 1">
+      <joint name="cart" type="slide" axis="1 0 0"/> <geom type="sphere" size="0.1" mass="2"/>
+    </body>
+  </worldbody>
+  {pairs}
+  <actuator>{actuator}</actuator>
+</mujoco>
+"""
+MOTOR = '<motor joint="cart" gear="1" ctrlrange="-1 1"/>'
+
+
+class Block(MujocoEnv):
+    """A block that slides on a floor, and beside it a cart with a motor on rails without friction."""
+
+    metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"], "render_fps": 500}  # noqa: RUF012
+
+    def __init__(self, path: str, **settings: Any) -> None:
+        space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+        super().__init__(path, 1, space, **settings)
+
+    def reset_model(self) -> np.ndarray:
+        self.set_state(self.init_qpos, self.init_qvel)
+        return self.data.qvel.copy()
+
+    def step(self, action: np.ndarray) -> Any:
+        self.do_simulation(action, self.frame_skip)
+        return self.data.qvel.copy(), 0.0, False, False, {}
+
+
+def block(folder: Path, actuator: str = MOTOR, pairs: str = "") -> Environment:
+    path = folder / "block.xml"
+    path.write_text(BLOCK.format(actuator=actuator, pairs=pairs))
+    return Environment(Block, {"path": str(path)})
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_a_sliding_block_slows_down_as_coulomb_says(tmp_path, factor):
+    """The larger of 0.3 and 0.05 counts: friction takes 0.3 factor times the impulse of the floor, whatever the mass.
+
+    The floor gives what weight takes, plus what the block has gained upwards: it bounces a little.
+    """
+    environment = block(tmp_path)
+    environment.perturb({"friction": factor, "mass": 4.0})
+    environment.reset(0)
+    data_of(environment).qvel[0] = 5.0
+    for _ in range(100):
+        environment.step(zero_action(environment))
+    along, upwards, _ = data_of(environment).qvel
+    assert along > 1.0
+    assert (5.0 - along) / (9.81 * 100 * 0.002 + upwards) == pytest.approx(0.3 * factor, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "acceleration"),
+    [({}, 0.5), ({"mass": 2.0}, 0.25), ({"gain": 2.0}, 1.0), ({"mass": 2.0, "gain": 2.0}, 0.5), ({"gain": 0.0}, 0.0)],
+)
+def test_a_cart_obeys_newton(tmp_path, values, acceleration):
+    """A force of 1 on 2 kg."""
+    environment = block(tmp_path)
+    environment.reset(0)
+    environment.perturb(values)
+    observation, *_ = environment.step(np.ones(1, np.float32))
+    assert observation[2] == pytest.approx(acceleration * 0.002, rel=1e-5)
+
+
+def test_the_gain_of_a_servo_leaves_its_goal_where_it_was(tmp_path):
+    servo = '<position joint="cart" kp="8" ctrlrange="-1 1"/>'
+    environment = block(tmp_path, servo)
+    environment.perturb({"gain": 3.0})
+    environment.reset(0)
+    data_of(environment).qpos[2] = 0.25
+    environment.step(np.full(1, 0.5, np.float32))
+    assert data_of(environment).actuator_force[0] == pytest.approx(3 * 8 * (0.5 - 0.25))
+    data_of(environment).qpos[2] = 0.5
+    environment.step(np.full(1, 0.5, np.float32))
+    assert data_of(environment).actuator_force[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_contacts_that_are_listed_as_pairs_are_scaled_too(tmp_path):
+    pairs = '<contact><pair geom1="floor" geom2="block" friction="0.7 0.7 0.1 0.2 0.3"/></contact>'
+    path = tmp_path / "block.xml"
+    path.write_text(BLOCK.replace('type="box"', 'name="block" type="box"').format(actuator=MOTOR, pairs=pairs))
+    environment = Environment(Block, {"path": str(path)})
+    environment.perturb({"friction": 2.0})
+    np.testing.assert_allclose(model_of(environment).pair_friction, [[1.4, 1.4, 0.2, 0.4, 0.6]])
+
+
+def test_muscles_have_no_gain_to_scale(tmp_path):
+    muscle = '<muscle joint="cart" ctrlrange="0 1" lengthrange="0.5 1.5"/>'
+    environment = block(tmp_path, muscle)
+    environment.perturb({"mass": 2.0})
+    with pytest.raises(InputError, match="Block has actuators such as muscles"):
+        environment.perturb({"gain": 2.0})
+
+
+@pytest.mark.parametrize("kind", ["friction", "gravity", "mass", "gain"])
+def test_a_task_without_mujoco_has_no_such_physics(kind):
+    with pytest.raises(InputError, match=r"Pendulum-v1 is no MuJoCo task: .*gravity.* observation_noise and"):
+        Environment("Pendulum-v1").perturb({kind: 2.0})
+
+
+# Noise.
+
+
+class Wide(gymnasium.Env):
+    """Observes zeros for ever, in two parts, and remembers the actions; their range is not symmetric."""
+
+    observation_space = spaces.Dict(b=spaces.Box(-9, 9, (2, 3), np.float32), a=spaces.Box(-9, 9, (), np.float64))
+    action_space = spaces.Box(np.array([-2.0, 10.0], np.float32), np.array([2.0, 30.0], np.float32))
+
+    def __init__(self) -> None:
+        self.actions: list[np.ndarray] = []
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return {"b": np.zeros((2, 3), np.float32), "a": 1.0}, {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.actions.append(action)
+        return *self.reset()[:1], 0.0, False, False, {}
+
+
+def noisy(seed: int, steps: int, **levels: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return what an episode of `Wide` shows [steps + 1, 7] and what it is given for the action (0, 0) [steps, 2]."""
+    environment = Environment(Wide)
+    environment.perturb(levels)
+    first = environment.reset(seed)
+    observations = [first, *(environment.step(np.zeros(2, np.float32))[0] for _ in range(steps))]
+    return np.array(observations), np.array(environment.raw.unwrapped.actions)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_observations_have_the_noise_that_was_asked_for():
+    seen, actions = noisy(5, 4000, observation_noise=0.3)
+    np.testing.assert_allclose(seen.mean(axis=0), [1, 0, 0, 0, 0, 0, 0], atol=4 * 0.3 / np.sqrt(4000))
+    np.testing.assert_allclose(seen.std(axis=0), 0.3, rtol=0.05)
+    np.testing.assert_allclose(np.corrcoef(seen.T), np.eye(7), atol=0.07)
+    assert abs(np.corrcoef(seen[1:, 0], seen[:-1, 0])[0, 1]) < 0.07
+    assert seen.dtype == np.float32
+    assert seen[0, 1] != 0  # what reset gives, too
+    np.testing.assert_array_equal(actions, np.tile([0.0, 20.0], (4000, 1)).astype(np.float32))
+
+
+def test_actions_have_noise_in_units_of_their_range_and_stay_within_it():
+    seen, actions = noisy(5, 4000, action_noise=0.1)
+    np.testing.assert_allclose(actions.mean(axis=0), [0.0, 20.0], atol=4 * 0.1 * 10 / np.sqrt(4000))
+    np.testing.assert_allclose(actions.std(axis=0), [0.1 * 2, 0.1 * 10], rtol=0.05)
+    assert (seen == [1, 0, 0, 0, 0, 0, 0]).all()
+    _, wild = noisy(5, 400, action_noise=5.0)
+    assert {*wild[:, 0].tolist()} >= {-2.0, 2.0}
+    assert ((wild >= [-2, 10]) & (wild <= [2, 30])).all()
+    assert actions.dtype == np.float32
+
+
+def test_noise_depends_on_the_episodes_seed_alone():
+    first, second = noisy(5, 20, observation_noise=0.3)[0], noisy(5, 20, observation_noise=0.3)[0]
+    np.testing.assert_array_equal(first, second)
+    assert (noisy(6, 20, observation_noise=0.3)[0] != first).all()
+    # Twice the noise is the same noise twice; and noise on actions takes nothing from that on observations.
+    zero = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
+    np.testing.assert_allclose(noisy(5, 20, observation_noise=0.6)[0] - zero, 2 * (first - zero), rtol=1e-4, atol=1e-6)
+    both, actions = noisy(5, 20, observation_noise=0.3, action_noise=0.2)
+    np.testing.assert_array_equal(both, first)
+    np.testing.assert_array_equal(noisy(5, 20, action_noise=0.2)[1], actions)
+    draws = [np.random.default_rng(5).normal(size=7), np.random.default_rng([5, 2]).normal(size=7)]
+    assert all(not np.allclose((first[0] - zero) / 0.3, draw, atol=1e-3) for draw in draws)
+
+
+def test_no_noise_is_none():
+    seen, actions = noisy(5, 20, observation_noise=0.0, action_noise=0.0)
+    assert (seen == [1, 0, 0, 0, 0, 0, 0]).all()
+    assert (actions == [0, 20]).all()
+
+
+def test_noise_begins_and_ends_in_mid_episode():
+    environment = Environment(Wide)
+    first = environment.reset(5)
+    environment.perturb({"observation_noise": 0.5})
+    noise = environment.step(np.zeros(2, np.float32))[0]
+    assert (first == [1, 0, 0, 0, 0, 0, 0]).all()
+    assert (noise != first).all()
+    environment.perturb({"observation_noise": 0.0})
+    np.testing.assert_array_equal(environment.step(np.zeros(2, np.float32))[0], first)
+
+
+def test_a_foreign_policy_is_given_the_same_noise_in_the_tasks_own_shape():
+    environment = Environment(Wide)
+    environment.perturb({"observation_noise": 0.5})
+    flat = environment.reset(5)
+    assert environment.raw_observation.keys() == {"a", "b"}
+    np.testing.assert_array_equal(environment.raw_observation["a"], flat[0])
+    np.testing.assert_array_equal(environment.raw_observation["b"], flat[1:].reshape(2, 3))
+    plain = Environment("Hopper-v4")
+    plain.perturb({"observation_noise": 0.5})
+    np.testing.assert_array_equal(plain.reset(5), plain.raw_observation)
+
+
+def test_an_episode_with_noise_goes_on_bit_for_bit():
+    values = {"observation_noise": 0.1, "action_noise": 0.2, "friction": 2.0}
+    first, second = (SeedEnvironments("Hopper-v4", None, (4, 9)) for _ in range(2))
+    for environments in (first, second):
+        environments.perturb(values)
+    first.reset()
+    steps_of(first, 33)
+    for index in range(2):
+        saved = first.save(index)
+        second.take_back(index, Snapshot(saved.arrays, json.loads(json.dumps(saved.values))))
+    assert steps_of(second, 100) == steps_of(first, 100)
+
+
+def test_noise_that_begins_after_a_snapshot_is_the_same_as_without_one():
+    first, second = (SeedEnvironments("Hopper-v4", None, (4,)) for _ in range(2))
+    first.reset()
+    steps_of(first, 10)
+    second.take_back(0, first.save(0))
+    for environments in (first, second):
+        environments.perturb({"observation_noise": 0.1})
+    after = steps_of(first, 60)
+    assert steps_of(second, 60) == after
+    third = SeedEnvironments("Hopper-v4", None, (4,))
+    third.reset()
+    steps_of(third, 10)
+    assert steps_of(third, 60) != after
+
+
+def steps_of(environments: SeedEnvironments, count: int) -> list[tuple]:
+    generator, outcomes = np.random.default_rng(5), []
+    for _ in range(count):
+        shape = (len(environments.seeds), environments.spec.action_size)
+        outcome = environments.step(generator.uniform(-1, 1, shape).astype(np.float32))
+        outcomes.append((outcome.next_observation.tolist(), outcome.reward.tolist(), outcome.episodes))
+    return outcomes
+
+
+# Evaluation.
+
+
+def policy_for(task: Any) -> Policy:
+    """A linear policy of which the actions depend on the observations."""
+    environment = Environment(task)
+    size, actions = environment.spec
+    weight = np.random.default_rng(1).normal(0, 0.3, (size, 2 * actions)).astype(np.float32)
+    network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * actions, np.float32)),),)))
+    return Policy(network, Contract("Task-v0", "csac", "relu", "tanh_gaussian", *environment.contract_parts))
+
+
+def test_an_evaluation_with_noise_depends_on_the_episode_alone():
+    """Not on the other episodes, how many there are, or what was evaluated before."""
+    policy, values = policy_for("Hopper-v4"), {"observation_noise": 0.1, "action_noise": 0.1, "friction": 2.0}
+    many, one = Evaluator("Hopper-v4", None, 12, 50), Evaluator("Hopper-v4", None, 1, 61)
+    for evaluator in (many, one):
+        evaluator.perturb(values)
+    episodes = many.run(policy)
+    assert [episode[1:] for episode in one.run(policy)] == [episodes[11][1:]]
+    assert many.run(policy) == episodes
+    assert len({episode.episode_return for episode in episodes}) == 12
+    many.perturb({})
+    calm = many.run(policy)
+    assert calm == Evaluator("Hopper-v4", None, 12, 50).run(policy)
+    assert calm != episodes
+    many.perturb(values)
+    assert many.run(policy) == episodes
+
+
+def test_evaluate_takes_perturbations():
+    policy = policy_for("Hopper-v4")
+    usual, light = (evaluate(policy, "Hopper-v4", 2, perturbations=given) for given in ((), "gravity=0.5"))
+    assert (usual != light).all()
+    np.testing.assert_array_equal(evaluate(policy, "Hopper-v4", 2, perturbations=["gravity=1"]), usual)
+    with pytest.raises(InputError, match="leave out @5"):
+        evaluate(policy, "Hopper-v4", 2, perturbations="gravity=0.5@5")
+    with pytest.raises(InputError, match="no MuJoCo task"):
+        evaluate(policy_for("Pendulum-v1"), "Pendulum-v1", 2, perturbations="gravity=0.5")
+
+
+class Foreign:
+    """A policy of another library, which wraps ours."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True):
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+
+def test_a_foreign_policy_meets_the_same_task():
+    policy, given = policy_for("Hopper-v4"), ("observation_noise=0.05", "friction=2")
+    ours = evaluate(policy, "Hopper-v4", 3, perturbations=given)
+    theirs = evaluate(Foreign(policy), "Hopper-v4", 3, perturbations=given)
+    np.testing.assert_allclose(theirs, ours, rtol=1e-3)
+    assert (ours != evaluate(policy, "Hopper-v4", 3)).all()
+
+
+# In the loop.
+
+
+def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-v4") -> loop.Group:
+    settings = loop.Settings(
+        LEARNERS[0], task, {}, 400, 30, 1, folder, 0, begin, perturbations=perturbations_of(perturbations)
+    )
+    return loop.Group(settings, (3,))
+
+
+def advance(group: loop.Group, until: int) -> list[loop.Event]:
+    return [event for event in group.run(lambda: group.step == until) if not isinstance(event, loop.Ended)]
+
+
+def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
+    """In the environments, in the evaluations, and in what is remembered."""
+    perturbed = group(tmp_path, ["friction=2@30", "observation_noise=0.1@35", "action_noise=0.1@38"])
+    plain = group(tmp_path, ())
+    own = model_of(plain.environments.environments[0]).geom_friction.copy()
+    at_30 = [advance(one, 30) for one in (perturbed, plain)]
+    rows = [[event.rows for event in events if isinstance(event, loop.Evaluated)] for events in at_30]
+    assert rows[0] == rows[1]
+    assert len(rows[0]) == 1
+    training, evaluation = perturbed.environments.environments[0], perturbed.evaluator._environments[0]
+    for environment in (training, evaluation):
+        np.testing.assert_array_equal(model_of(environment).geom_friction, own)
+    advance(perturbed, 31)
+    for environment in (training, evaluation):
+        np.testing.assert_array_equal(model_of(environment).geom_friction, 2 * own)
+    advance(perturbed, 60)
+    assert evaluation._noise
+    assert evaluation._noise._levels == {"observation_noise": 0.1, "action_noise": 0.1}
+
+
+def test_the_replay_holds_what_the_policy_saw_and_what_it_chose(tmp_path):
+    """Endless observes 0: what is not 0 in the replay is noise. Its actions are as without any."""
+    given = ["observation_noise=0.5@12", "action_noise=0.5@15"]
+    noisy, plain = (group(tmp_path, perturbations, task=probes.Endless) for perturbations in (given, ()))
+    for one in (noisy, plain):
+        advance(one, 39)  # the warm-up: actions are drawn, whatever is observed
+    rows, others = (one.learner.memory(0, 39).rows[:39] for one in (noisy, plain))
+    observation, action, next_observation = rows[:, 0], rows[:, 1], rows[:, 3]
+    np.testing.assert_array_equal(np.flatnonzero(next_observation), np.arange(12, 39))  # the step that makes 13
+    np.testing.assert_array_equal(np.flatnonzero(observation), np.arange(13, 39))
+    # The end of an episode, every ten steps: what came is not what the next one begins with.
+    same = observation[13:] == next_observation[12:-1]
+    np.testing.assert_array_equal(np.flatnonzero(~same) + 13, [20, 30])
+    np.testing.assert_array_equal(action, others[:, 1])
+
+
+def test_the_beginning_is_perturbed_from_the_first_observation(tmp_path):
+    noisy = group(tmp_path, "observation_noise=0.5", task=probes.Endless)
+    assert noisy._observations[0, 0] != 0
+
+
+def test_two_groups_tell_once_and_in_order(tmp_path):
+    manifest = {"task": "Hopper-v4", "algorithm": "csac", "seeds": [0, 1], "steps": 900}
+    record = RunDirectory.create(tmp_path / "run", manifest)
+    recorder = Recorder(record, [[0], [1]], None, None, perturbations=[(0, "mass x 2"), (300, "friction x 2")])
+
+    def evaluated(group: int, step: int) -> None:
+        row = {"seed": group, "step": step, "episode": 0, "return": 1.0, "length": 1, "success": None}
+        recorder._take(group, "evaluations", [row])
+
+    for group_number in (0, 1):
+        evaluated(group_number, 300)
+        recorder.handle(group_number, Progress(300))
+    log = record.path / "log.txt"
+    expected = ["perturbed from step 1 on: mass x 2", "step 300: seed 0 1.0, seed 1 1.0"]
+    assert log.read_text().splitlines() == expected
+    evaluated(0, 600)
+    recorder.handle(0, Progress(600))
+    assert log.read_text().splitlines() == expected
+    evaluated(1, 600)
+    recorder.handle(1, Progress(600))
+    expected += ["perturbed from step 301 on: friction x 2", "step 600: seed 0 1.0, seed 1 1.0"]
+    assert log.read_text().splitlines() == expected
+    recorder.close()
+    assert log.read_text().splitlines() == expected
+
+
+def test_what_a_run_does_not_reach_is_not_told(tmp_path):
+    manifest = {"task": "Hopper-v4", "algorithm": "csac", "seeds": [0], "steps": 900}
+    record = RunDirectory.create(tmp_path / "run", manifest)
+    recorder = Recorder(record, [[0]], None, None, perturbations=[(300, "friction x 2")])
+    recorder.handle(0, loop.Ended(300, {}))
+    recorder.close()
+    assert not (record.path / "log.txt").exists()
+
+
+# Whole runs. Evaluations every 100 steps, checkpoints every 100.
+
+GIVEN = ("friction=2@200", "observation_noise=0.05@200", "mass=1.5@250", "action_noise=0.1@250", "friction=1@430")
+LONG: dict[str, Any] = {"checkpoint_interval": 100, "keep_checkpoints": 0, "evaluation_interval": 50}
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A run without perturbations, with every checkpoint."""
+    return run(tmp_path_factory.mktemp("plain") / "run", **LONG)
+
+
+@pytest.fixture(scope="module")
+def perturbed(tmp_path_factory):
+    """The same with them, uninterrupted."""
+    return run(tmp_path_factory.mktemp("perturbed") / "run", perturbations=GIVEN, **LONG)
+
+
+def test_a_run_is_the_same_until_it_is_perturbed(plain, perturbed):
+    ours, theirs = perturbed.evaluations, plain.evaluations
+    np.testing.assert_array_equal(ours["return"][ours["step"] <= 200], theirs["return"][theirs["step"] <= 200])
+    after = ours["step"] > 200
+    assert after.sum() == 12
+    assert (ours["return"][after] != theirs["return"][after]).all()
+
+
+def test_a_run_says_what_it_was_perturbed_by(perturbed):
+    assert perturbed.manifest["perturbations"] == [
+        "friction=2@200",
+        "observation_noise=0.05@200",
+        "mass=1.5@250",
+        "action_noise=0.1@250",
+        "friction=1@430",
+    ]
+    log = (perturbed.path / "log.txt").read_text().splitlines()
+    told = {number: line for number, line in enumerate(log) if line.startswith("perturbed")}
+    assert told == {
+        4: "perturbed from step 201 on: friction x 2, observation noise 0.05",
+        6: "perturbed from step 251 on: mass x 1.5, action noise 0.1",
+        10: "perturbed from step 431 on: friction x 1",
+    }
+    assert [log[number - 1].split(":")[0] for number in told] == ["step 200", "step 250", "step 400"]
+
+
+def test_evaluations_meet_the_perturbed_task(perturbed):
+    rows = perturbed.evaluations
+    evaluator = Evaluator("Hopper-v4", None, 2, EVALUATION_SEED)
+    evaluator.perturb(values_at(perturbations_of(GIVEN), 500))
+    episodes = evaluator.run(load(perturbed.path, 0))
+    assert [episode.episode_return for episode in episodes] == rows["return"][rows["step"] == 500].tolist()
+
+
+@pytest.mark.parametrize("crash", [150, 200, 350, 450])
+def test_a_perturbed_run_that_crashed_goes_on_and_leaves_the_same_files(tmp_path, perturbed, crash):
+    """From checkpoints before the first perturbation, at its very step, between two and after the last."""
+    with pytest.raises(Crash):
+        run(tmp_path / "run", perturbations=GIVEN, on_evaluation=crash_at(crash + 50), **LONG)
+    finished = resume(tmp_path / "run")
+    assert finished.manifest["history"][0]["step"] == crash // 100 * 100
+    assert contents(tmp_path / "run") == contents(perturbed.path)
+    curves = [(path / "curve.png").read_bytes() for path in (tmp_path / "run", perturbed.path)]
+    assert curves[0] == curves[1]
+
+
+@pytest.mark.parametrize("step", [100, 200])
+def test_a_fork_that_is_perturbed_equals_a_run_that_was_from_the_start(tmp_path, plain, perturbed, step):
+    forked = run(tmp_path / "run", start_from=f"{plain.path}@{step}", perturbations=GIVEN, **LONG)
+    assert contents(forked.path) == contents(perturbed.path)
+    assert forked.manifest["perturbations"] == perturbed.manifest["perturbations"]
+    assert forked.manifest["forked_from"]["changes"] == [
+        f"perturbations is [], not {perturbed.manifest['perturbations']!r}"
+    ]
+
+
+def test_a_fork_that_is_not_perturbed_equals_going_on(tmp_path, plain):
+    forked = run(tmp_path / "run", start_from=f"{plain.path}@200", **LONG)
+    assert contents(forked.path) == contents(plain.path)
+
+
+def test_a_fork_of_a_perturbed_run_keeps_what_had_happened(tmp_path, perturbed):
+    """The last one, at 430, is still to come at 300: given again it is the same run."""
+    whole = run(tmp_path / "same", start_from=f"{perturbed.path}@300", perturbations="friction=1@430", **LONG)
+    assert contents(whole.path) == contents(perturbed.path)
+    other = run(tmp_path / "other", start_from=f"{perturbed.path}@300", **LONG)
+    assert other.manifest["perturbations"] == perturbed.manifest["perturbations"][:4]
+    rows, before = other.evaluations, perturbed.evaluations
+    np.testing.assert_array_equal(rows["return"][rows["step"] <= 400], before["return"][before["step"] <= 400])
+    assert contents(other.path)["evaluations.csv"] != contents(perturbed.path)["evaluations.csv"]
+    again = run(tmp_path / "other", start_from=f"{perturbed.path}@300", resume=True, **LONG)
+    assert again.manifest["perturbations"] == other.manifest["perturbations"]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((), r"perturbations is \['friction=2@200', .*\], not \[\]"),
+        ((*GIVEN[:4], "friction=1.5@430"), r"not \['friction=2@200', .*'friction=1.5@430'\]"),
+    ],
+)
+def test_other_perturbations_are_no_continuation(perturbed, given, message):
+    before = {path: path.read_bytes() for path in perturbed.path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=message):
+        run(perturbed.path, perturbations=given, resume=True, **LONG)
+    assert {path: path.read_bytes() for path in perturbed.path.rglob("*") if path.is_file()} == before
+
+
+def test_a_run_from_before_there_were_perturbations_goes_on(tmp_path):
+    old = run(tmp_path / "run", steps=60, checkpoint_interval=50)
+    path = old.path / "manifest.json"
+    fields = json.loads(path.read_text())
+    del fields["perturbations"]
+    path.write_text(json.dumps(fields))
+    assert resume(old.path, steps=70).manifest["steps_done"] == 70
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"perturbations": "friction=2@500"}, "friction=2@500 would change nothing: the run ends at step 500"),
+        ({"perturbations": "frction=2"}, "did you mean friction"),
+        ({"perturbations": ["gravity=2@5"], "task": "Pendulum-v1"}, "Pendulum-v1 is no MuJoCo task"),
+        ({"perturbations": ["friction=3", "friction=2@5"], "task": probes.Endless}, "Endless is no MuJoCo task"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        run(tmp_path / "run", **change)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_fork_is_not_perturbed_in_its_past(tmp_path, plain):
+    with pytest.raises(InputError, match="friction=2@199 lies before step 200, where this run begins"):
+        run(tmp_path / "run", start_from=f"{plain.path}@200", perturbations="friction=2@199", **LONG)
+    assert list(tmp_path.iterdir()) == []
+
+
+# The script that compares several runs.
+
+
+def test_several_runs_are_told_side_by_side(tmp_path, monkeypatch, capsys):
+    returns = {"a": [[100, 100, 40, 95], [100, 100, 100, 100]], "b": [[100, 100, 40, 40], [100, 100, 50, 60]]}
+    for name, seeds in returns.items():
+        rows = [
+            f"{seed},{10 * (t + 1)},0,{value},5," for seed, line in enumerate(seeds) for t, value in enumerate(line)
+        ]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["seed,step,episode,return,length,success", *rows, ""]))
+    script = Path(__file__).parents[1] / "results" / "recovery.py"
+    files = [f"{name.upper()}={tmp_path / name}.csv" for name in returns]
+    out = tmp_path / "picture.png"
+    monkeypatch.setattr(sys, "argv", [str(script), "--step", "20", "--out", str(out), *files])
+    runpy.run_path(str(script), run_name="__main__")
+    assert capsys.readouterr().out.splitlines()[2:] == [
+        "| A | 0 | 100 | 60 | 60% | 20 | 625 | 78.33 | 60 |",
+        "| A | 1 | 100 | 0 | 0% | 0 | 0 | 100 | 0 |",
+        "| **A** | mean ± std | 100 ± 0 | 30 ± 42.43 | 30% ± 42% | 10 ± 14.14 | 312 ± 442 | 89.17 ± 15.32 | 30 ± 42.43 |",  # noqa: E501
+        "| B | 0 | 100 | 60 | 60% | never | 900 | 60 | 60 |",
+        "| B | 1 | 100 | 50 | 50% | never | 700 | 70 | 50 |",
+        "| **B** | mean ± std | 100 ± 0 | 55 ± 7.07 | 55% ± 7% | never | 800 ± 141 | 65 ± 7.07 | 55 ± 7.07 |",
+    ]
+    assert out.stat().st_size > 10_000
