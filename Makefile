@@ -30,7 +30,7 @@ train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=2 S
 	.venv/bin/csac train $(TASK) --algorithm $(ALGORITHM) --seeds $(SEEDS) --steps $(STEPS) $(ARGS)
 
 test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
-	.venv/bin/pytest $(ARGS)
+	.venv/bin/pytest --numprocesses logical --dist loadfile $(ARGS)
 
 chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave, 20 minutes: make chaos ARGS='--kills 12'
 	.venv/bin/python tests/chaos.py --out results/reliability $(ARGS)
