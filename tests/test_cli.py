@@ -313,7 +313,7 @@ def test_version(capsys):
 
 @pytest.mark.parametrize("name", sorted(ALGORITHMS))
 def test_the_help_of_train_explains_every_hyperparameter(capsys, monkeypatch, name):
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "100")  # wider, and the options stand in two columns
 
     assert csac(f"train --help --algorithm {name}") == 0
 
@@ -543,9 +543,9 @@ def test_play_writes_a_video(capsys):
     decoded = subprocess.run(decode, capture_output=True, check=True)
     assert b"48x34" in decoded.stderr
     assert b"10 fps" in decoded.stderr
-    # Each episode: the first picture and one per step, getting lighter.
+    # Each episode: the first picture and one per step, getting lighter; the last stays until a second is over.
     pictures = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 34 * 48)
-    assert np.rint(pictures.mean(axis=1) / 40).tolist() == [0, 1, 2, 3, 4, 5] * 2
+    assert np.rint(pictures.mean(axis=1) / 40).tolist() == [0, 1, 2, 3, 4, 5, 5, 5, 5, 5] * 2
     assert [path.name for path in Path("new").iterdir()] == ["film.mp4"]
 
 

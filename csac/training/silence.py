@@ -1,8 +1,12 @@
-"""PyBullet kept quiet. It prints from C, at import and whenever it connects, where Python's streams do not see it."""
+"""PyBullet kept quiet. It prints from C, at import and whenever it connects, where Python's streams do not see it.
+
+PyFlyt prints from Python, and Python's streams need not end in the descriptors: in a notebook they do not.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import io
 import logging
 import os
 import re
@@ -33,7 +37,7 @@ def quietly() -> Iterator[None]:
 
     Whatever else is written meanwhile, by this thread or another, comes out at the end of the block.
     """
-    with _lock, _kept(1, sys.stdout), _kept(2, sys.stderr):
+    with _lock, _kept(1, sys.stdout), _kept(2, sys.stderr), _printed("stdout"), _printed("stderr"):
         yield
 
 
@@ -58,13 +62,32 @@ def _kept(descriptor: int, stream: object) -> Iterator[None]:
             _pass_on(descriptor, file.read())
 
 
+@contextmanager
+def _printed(name: str) -> Iterator[None]:
+    """Let Python's stream of this name be another during this block, and pass on what is not chatter."""
+    stream, aside = getattr(sys, name), io.StringIO()
+    setattr(sys, name, aside)
+    try:
+        yield
+    finally:
+        if getattr(sys, name) is aside:
+            setattr(sys, name, stream)
+        rest = _without_chatter(aside.getvalue().encode(errors="surrogatepass"))
+        with suppress(OSError, ValueError, AttributeError):  # nobody reads any more, or there is no stream
+            stream.write(rest.decode(errors="surrogatepass"))
+
+
 def _pass_on(descriptor: int, written: bytes) -> None:
-    if chatter := _CHATTER.findall(written):
-        _log.debug("PyBullet: %s", b"".join(chatter).decode(errors="replace").strip())
-    rest = _CHATTER.sub(b"", written)
+    rest = _without_chatter(written)
     with suppress(OSError):  # nobody reads any more
         while rest:
             rest = rest[os.write(descriptor, rest) :]
+
+
+def _without_chatter(written: bytes) -> bytes:
+    if chatter := _CHATTER.findall(written):
+        _log.debug("PyBullet: %s", b"".join(chatter).decode(errors="replace").strip())
+    return _CHATTER.sub(b"", written)
 
 
 def _flush(stream: object) -> None:
