@@ -155,6 +155,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+    with suppress(OSError):  # a folder that is gone
+        # The user's own modules, as `python -m csac` finds them; last, so that they hide nothing of csac's.
+        sys.path += [os.getcwd()] if os.getcwd() not in sys.path else []
     try:
         return _dispatch(arguments)
     except InputError as error:
@@ -215,7 +218,7 @@ def _train(arguments: list[str]) -> int:
             evaluation_interval=options.evaluation_interval,
             evaluation_episodes=options.evaluation_episodes,
             environment_arguments=json_object("--env-kwargs", options.env_kwargs),
-            perturbations=_perturbations(options.perturb, source),
+            perturbations=_perturbations(options.perturb),
             device=options.device,
             checkpoint_interval=options.checkpoint_interval,
             keep_checkpoints=options.keep_checkpoints,
@@ -263,13 +266,13 @@ def _source(where: str | None) -> dict[str, Any] | None:
     return Source.find(where).run.manifest
 
 
-def _perturbations(given: tuple[str, ...], source: dict[str, Any] | None) -> tuple[str, ...]:
-    """Return what a run is to be perturbed by: without a word of it, what the run had planned that it begins with."""
+def _perturbations(given: tuple[str, ...]) -> tuple[str, ...] | None:
+    """Return what a run is to be perturbed by; without a word of it None, as planned in the run that it begins with."""
     if "none" in given:
         if len(given) > 1:
             raise InputError("--perturb none leaves everything out: give it alone")
         return ()
-    return given or tuple((source or {}).get("perturbations", ()))
+    return given or None
 
 
 def _evaluate(arguments: list[str]) -> int:

@@ -53,6 +53,8 @@ def main() -> None:
     arguments = parser.parse_args()
     pairs = [argument.partition("=")[::2] for argument in arguments.runs]
     runs = [(label, up_to(read_rows(path), arguments.until)) for label, path in pairs]
+    if wrong := [text for text in arguments.mark if not text.partition("=")[0].isdecimal()]:
+        parser.error(f"write --mark STEP=TEXT, not {wrong[0]}")
     marks = [(int(step), text) for step, _, text in (mark.partition("=") for mark in arguments.mark)]
     learning_curve(runs, arguments.out, title=arguments.title, marks=marks)
     print(table(runs))

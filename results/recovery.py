@@ -16,7 +16,7 @@ from csac.record.run import read_rows
 from csac.record.statistics import Recovery, recovery
 
 
-def table(runs: list[tuple[str, np.ndarray]], step: int) -> str:
+def table(runs: list[tuple[str, np.ndarray]], step: int, until: int | None = None) -> str:
     """Return a Markdown table: for each run a row per seed, then the mean ± standard deviation over its seeds."""
     lines = [
         "| run | seed | return before | drop | relative | steps to 90 % | area lost, return x steps "
@@ -24,7 +24,7 @@ def table(runs: list[tuple[str, np.ndarray]], step: int) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for label, rows in runs:
-        recoveries = recovery(rows, step)
+        recoveries = recovery(rows, step, until)
         lines += [_row(label, str(seed), _cells(one)) for seed, one in recoveries.items()]
         if len(recoveries) > 1:
             lines.append(_row(f"**{label}**", "mean ± std", _over_seeds(np.array(list(recoveries.values())))))
@@ -72,16 +72,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="LABEL=CSV")
     parser.add_argument("--step", type=int, required=True, help="environment steps before the change")
+    parser.add_argument("--until", type=int, help="leave out evaluations after this step, where the next change is")
     parser.add_argument("--mark", default="perturbed", help="what to write at the line in the picture")
     parser.add_argument("--title", default="")
     parser.add_argument("--out", type=Path, help="a PNG file")
     arguments = parser.parse_args()
     pairs = [argument.partition("=")[::2] for argument in arguments.runs]
+    if wrong := [label for label, path in pairs if not path]:
+        parser.error(f"write LABEL=CSV, not {wrong[0]}")
     runs = [(label, read_rows(path)) for label, path in pairs]
     if arguments.out:
         marks = [(arguments.step, arguments.mark)]
         learning_curve(runs, arguments.out, title=arguments.title, marks=marks)
-    print(table(runs, arguments.step))
+    print(table(runs, arguments.step, arguments.until))
 
 
 if __name__ == "__main__":

@@ -235,14 +235,14 @@ def test_train_without_options_uses_the_defaults(train_call):
     assert call["algorithm"] == CSAC()
     assert (call["steps"], call["seeds"], call["groups"], call["directory"]) == (1_000_000, 1, None, None)
     assert call["preset"] is None
-    assert (call["resume"], call["start_from"], call["perturbations"]) == (False, None, ())
+    assert (call["resume"], call["start_from"], call["perturbations"]) == (False, None, None)
     assert (call["checkpoint_interval"], call["keep_checkpoints"]) == (50_000, 2)
 
 
 @pytest.mark.parametrize(
     ("options", "perturbations"),
     [
-        ("", ("friction=2@60",)),
+        ("", None),  # as planned there
         ("--perturb mass=2@70", ("mass=2@70",)),
         ("--perturb none", ()),
     ],

@@ -704,16 +704,18 @@ def test_a_fork_that_is_not_perturbed_equals_going_on(tmp_path, plain):
 
 
 def test_a_fork_of_a_perturbed_run_keeps_what_had_happened(tmp_path, perturbed):
-    """The last one, at 430, is still to come at 300: given again it is the same run."""
-    whole = run(tmp_path / "same", start_from=f"{perturbed.path}@300", perturbations="friction=1@430", **LONG)
+    """The last one, at 430, is still to come at 300: without a word of it, it is the same run."""
+    whole = run(tmp_path / "same", start_from=f"{perturbed.path}@300", **LONG)
     assert contents(whole.path) == contents(perturbed.path)
-    other = run(tmp_path / "other", start_from=f"{perturbed.path}@300", **LONG)
+    other = run(tmp_path / "other", start_from=f"{perturbed.path}@300", perturbations=(), **LONG)
     assert other.manifest["perturbations"] == perturbed.manifest["perturbations"][:4]
     rows, before = other.evaluations, perturbed.evaluations
     np.testing.assert_array_equal(rows["return"][rows["step"] <= 400], before["return"][before["step"] <= 400])
     assert contents(other.path)["evaluations.csv"] != contents(perturbed.path)["evaluations.csv"]
     again = run(tmp_path / "other", start_from=f"{perturbed.path}@300", resume=True, **LONG)
     assert again.manifest["perturbations"] == other.manifest["perturbations"]
+    with pytest.raises(InputError, match=r"friction=1@430 .*the run ends at step 400; was planned in the run"):
+        run(tmp_path / "short", start_from=f"{perturbed.path}@300", steps=400)
 
 
 @pytest.mark.parametrize(
@@ -776,11 +778,11 @@ def test_several_runs_are_told_side_by_side(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(script), "--step", "20", "--out", str(out), *files])
     runpy.run_path(str(script), run_name="__main__")
     assert capsys.readouterr().out.splitlines()[2:] == [
-        "| A | 0 | 100 | 60 | 60% | 20 | 625 | 78.33 | 60 |",
+        "| A | 0 | 100 | 60 | 60% | 20 | 625 | 67.50 | 60 |",
         "| A | 1 | 100 | 0 | 0% | 0 | 0 | 100 | 0 |",
-        "| **A** | mean ± std | 100 ± 0 | 30 ± 42.43 | 30% ± 42% | 10 ± 14.14 | 312 ± 442 | 89.17 ± 15.32 | 30 ± 42.43 |",  # noqa: E501
-        "| B | 0 | 100 | 60 | 60% | never | 900 | 60 | 60 |",
-        "| B | 1 | 100 | 50 | 50% | never | 700 | 70 | 50 |",
-        "| **B** | mean ± std | 100 ± 0 | 55 ± 7.07 | 55% ± 7% | never | 800 ± 141 | 65 ± 7.07 | 55 ± 7.07 |",
+        "| **A** | mean ± std | 100 ± 0 | 30 ± 42.43 | 30% ± 42% | 10 ± 14.14 | 312 ± 442 | 83.75 ± 22.98 | 30 ± 42.43 |",  # noqa: E501
+        "| B | 0 | 100 | 60 | 60% | never | 900 | 40 | 60 |",
+        "| B | 1 | 100 | 50 | 50% | never | 700 | 55 | 50 |",
+        "| **B** | mean ± std | 100 ± 0 | 55 ± 7.07 | 55% ± 7% | never | 800 ± 141 | 47.50 ± 10.61 | 55 ± 7.07 |",
     ]
     assert out.stat().st_size > 10_000

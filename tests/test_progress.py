@@ -269,13 +269,13 @@ def test_a_perturbed_run_shows_what_it_cost(tmp_path):
     assert first == [
         "friction x 1.5 after step 20, until 40",
         "seed before drop relative steps to 90 % area lost final worst fall",
-        "0 100.0 60.0 60% 20 625 78.3 60.0",
-        "1 200.0 100.0 50% never 1.25k 150.0 100.0",
-        "mean 150.0 80.0 55% 1 of 2 938 114.2 80.0",
-        "± std 70.7 28.3 7% 442 50.7 28.3",
+        "0 100.0 60.0 60% 20 625 67.5 60.0",
+        "1 200.0 100.0 50% never 1.25k 125.0 100.0",
+        "mean 150.0 80.0 55% 1 of 2 938 96.2 80.0",
+        "± std 70.7 28.3 7% 442 40.7 28.3",
     ]
     assert second[0] == "mass x 2 after step 40"
-    assert second[2].startswith("0 78.3 0.0 0% 0 0 76.7")
+    assert second[2].startswith("0 67.5 0.0 0% 0 0 95.0")
 
 
 def test_a_perturbed_run_ends_with_its_table(plain, clock, tmp_path):
@@ -285,6 +285,13 @@ def test_a_perturbed_run_ends_with_its_table(plain, clock, tmp_path):
     reporter.start("Hopper-v4", "csac", [0], 1000, run.path)
     reporter.finish(run)
     assert any("friction x 1.5 after step 10" in line for line in lines(plain))
+
+
+def test_a_return_of_nothing_has_no_share_and_is_in_the_other_means(tmp_path):
+    run = make_run(tmp_path / "run", [[0.0, -6.0], [-2.0, -4.0], [-4.0, -8.0]])
+    run.update_manifest(perturbations=["friction=1.5@10"])
+    (table,) = (text_of(table) for table in recovery_tables(run))
+    assert table[5].split()[:5] == ["mean", "-2.00", "4.00", "100%", "0"]
 
 
 def test_a_failed_seed_is_shown_and_not_in_the_mean_of_what_it_cost(tmp_path):

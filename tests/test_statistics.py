@@ -5,9 +5,11 @@ from scipy import stats
 from csac.record.statistics import (
     evaluation_matrix,
     interquartile_mean,
+    is_case,
     last_evaluations,
     maximum_average_return,
     mean_and_interval,
+    mean_told,
     recovery,
     stratified_bootstrap_interval,
 )
@@ -172,6 +174,24 @@ def test_the_recovery_of_negative_returns():
     assert np.isnan(recovery(rows_of(*curve(0.0, -1.0)), 100)[0].relative_drop)
 
 
+def test_the_drop_of_small_returns_is_a_share_of_them():
+    assert recovery(rows_of(*curve(0.5, 0.1)), 100)[0].relative_drop == pytest.approx(0.8)
+    assert recovery(rows_of(*curve(-0.5, -1.0)), 100)[0].relative_drop == pytest.approx(1.0)
+
+
+def test_final_and_before_stay_between_their_perturbations():
+    """After step 200; the one before it was after step 100."""
+    one = recovery(rows_of(*curve(100.0, 60.0, 30.0, 40.0)), 200, since=100)[0]
+    assert (one.before, one.drop, one.final) == (60.0, 30.0, 35.0)
+
+
+def test_silence_is_a_no_in_cases_and_unknown_in_numbers():
+    cases, counts = np.array([1.0, np.nan, np.nan, 0.0]), np.array([3.0, np.nan, 1.0])
+    assert (is_case(cases), is_case(counts), is_case(np.array([np.nan]))) == (True, False, False)
+    assert (mean_told(cases, True), mean_told(counts, False)) == (0.25, 2.0)
+    assert np.isnan(mean_told(np.array([np.nan]), False))
+
+
 def test_recovery_begins_between_evaluations():
     """After step 150: no loss there, 20 at 200 and 10 at 300: 50 / 2 * 20 + 100 * 15."""
     one = recovery(rows_of(*curve(100.0, 80.0, 90.0)), 150)[0]
@@ -192,6 +212,6 @@ def test_recovery_is_each_seeds_own_and_ends_where_it_is_told():
     whole, part = recovery(rows, 100), recovery(rows, 100, until=300)
     assert {seed: one.drop for seed, one in whole.items()} == {0: 9.0, 7: 16.0}
     assert {seed: one.drop for seed, one in part.items()} == {0: 5.0, 7: 16.0}
-    assert {seed: one.final for seed, one in part.items()} == {0: 8.0, 7: 12.0}
+    assert {seed: one.final for seed, one in part.items()} == {0: 7.0, 7: 4.0}
     assert {seed: one.steps_to_regain for seed, one in part.items()} == {0: 200.0, 7: np.inf}
     assert whole[7].area_lost == 200 * 8 + 100 * 8

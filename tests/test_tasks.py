@@ -24,8 +24,10 @@ from csac.cli import main
 from csac.deploy.policy import Contract, Policy
 from csac.record.run import RunDirectory
 from csac.training import tasks
+from csac.training.console import case_table
 from csac.training.environments import EVALUATION_SEED, Environment
-from csac.training.evaluation import ROWS, EvaluationFailure, Evaluator
+from csac.training.evaluation import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, _number
+from csac.training.play import evaluate_run
 from csac.training.pool import EvaluationPool, choose_processes
 from csac.training.progress import Reporter
 from csac.training.silence import quietly
@@ -173,6 +175,20 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, task, blocked
     assert ended.stderr.count("\n") == 1
     assert ended.stdout == ""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_another_release_of_a_package_is_said(monkeypatch):
+    tasks.register(QUAD)
+    monkeypatch.delitem(gymnasium.registry, QUAD)
+    with pytest.raises(InputError, match=r"^the PyFlyt that is installed has no .*: pip install 'csac\[robots\]'$"):
+        Environment(QUAD)
+
+
+def test_only_known_tasks_get_arguments_for_pictures():
+    known, foreign = tasks.adapter_of("PandaPush-v3"), tasks.adapter_of("PandaDoor-v0")
+    assert known
+    assert known.picture_arguments
+    assert foreign == tasks.Adapter("panda_gym")
 
 
 ROBOTS = """
@@ -449,7 +465,66 @@ def test_the_report_says_how_the_last_episodes_ended(cases, capsys):
     assert any(line.startswith("success ") for line in lines)
 
 
+class Unreadable:
+    def __array__(self, *_, **__):
+        raise TypeError("on another device")
+
+
+def test_info_may_hold_anything():
+    odd = (Unreadable(), [[1], [1, 2]], "3", b"3", None, np.nan, np.array([1, 2]), {})
+    assert [_number(value) for value in odd] == [None] * len(odd)
+    assert [_number(value) for value in (True, np.bool_(False), 2, np.float32(0.5), np.array([7]))] == [
+        True,
+        0,
+        2,
+        0.5,
+        7,
+    ]
+
+
+def test_an_episode_that_does_not_speak_of_a_case_had_none():
+    told = [{"crashed": True, "stops": 4}, {"crashed": None, "stops": None}, {"crashed": None, "stops": 1}]
+    episodes = [EvaluationEpisode(n, 1.0, 5, 1.0 if n == 0 else None, events) for n, events in enumerate(told)]
+    table = case_table({0: episodes})
+    assert table is not None
+    cells = [list(column.cells) for column in table.columns]
+    assert [str(name) for name in cells[0]] == ["success", "crashed", "stops (mean)"]
+    assert cells[1] == ["333.3", "333.3", "2.500"]
+
+
 # Evaluation in several processes
+
+
+def test_perturbed_episodes_do_not_depend_on_the_processes_either(tmp_path):
+    make_run(tmp_path / "run", "Hopper-v4")
+    perturbed = [
+        dict(evaluate_run(tmp_path / "run", episodes=2 * ROWS, perturbations="gravity=0.5", processes=processes))
+        for processes in (1, 2)
+    ]
+    assert perturbed[0] == perturbed[1]
+    assert perturbed[0] != dict(evaluate_run(tmp_path / "run", episodes=2 * ROWS, processes=1))
+
+
+def test_a_task_that_cannot_be_perturbed_so_is_never_evaluated():
+    evaluator = Evaluator("Pendulum-v1", episodes=1)
+    evaluator.perturb({"mass": 2.0})
+    for _ in range(2):
+        with pytest.raises(InputError, match="Pendulum-v1 is no MuJoCo task"):
+            evaluator.run(policy_for("Pendulum-v1"))
+
+
+def test_the_command_finds_modules_of_the_folder_that_it_is_called_in(tmp_path):
+    make_run(tmp_path / "run", "probes:Cases-v0")
+    ended = subprocess.run(
+        [Path(sys.executable).with_name("csac"), "evaluate", tmp_path / "run", "--episodes", "2"],
+        cwd=TESTS,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "per 1,000 rollouts (from 2 of each seed)" in ended.stdout
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
@@ -474,6 +549,17 @@ def test_an_arm_that_pushes_is_made_anew_for_each_batch():
     first = evaluator.run(policy)
     assert evaluator.run(policy) == first
     assert Evaluator("PandaPush-v3", episodes=2, first_seed=EVALUATION_SEED + ROWS).run(policy)[1][1:] == first[-1][1:]
+
+
+def test_memory_is_known_by_what_a_task_is_made_of():
+    gymnasium.register("MyPush-v0", entry_point="panda_gym.envs:PandaPushEnv", max_episode_steps=5)
+    try:
+        environments = [Environment(task) for task in ("PandaPush-v3", "MyPush-v0", REACH, QUAD, "Hopper-v4")]
+        assert [environment.has_memory for environment in environments] == [True, True, False, False, False]
+        for environment in environments:
+            environment.close()
+    finally:
+        del gymnasium.registry["MyPush-v0"]
 
 
 def test_robots_beside_each_other_do_not_interfere():

@@ -39,13 +39,28 @@ def evaluation_matrix(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def last_means(rows: np.ndarray, column: str) -> dict[int, float]:
-    """Return each seed's mean of one column over the episodes of its own last evaluation, empty cells left out."""
-    means = {}
+    """Return each seed's mean of one column over the episodes of its own last evaluation, as `mean_told` takes it."""
+    means, cases = {}, is_case(rows[column])
     for seed in np.unique(rows["seed"]).tolist():
         own = rows[rows["seed"] == seed]
-        values = own[column][own["step"] == own["step"].max()]
-        means[seed] = float(values[~np.isnan(values)].mean()) if not np.isnan(values).all() else np.nan
+        means[seed] = mean_told(own[column][own["step"] == own["step"].max()], cases)
     return means
+
+
+def is_case(values: np.ndarray) -> bool:
+    """Whether `values` [episode], NaN where an episode said nothing, tell of something that happens or does not."""
+    told = values[~np.isnan(values)]
+    return bool(len(told) and np.isin(told, (0.0, 1.0)).all())
+
+
+def mean_told(values: np.ndarray, is_case: bool) -> float:
+    """Return the mean over `values` [episode], NaN where an episode said nothing.
+
+    In a case, silence is a no: many tasks speak of a success or a crash only when there is one. A number that an
+    episode does not tell is unknown, and left out. NaN where nothing is known.
+    """
+    values = np.where(np.isnan(values), 0.0, values) if is_case else values[~np.isnan(values)]
+    return float(values.mean()) if len(values) else np.nan
 
 
 def mean_and_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
@@ -129,41 +144,44 @@ class Recovery(NamedTuple):
     area_lost: float
     """Integral of max(0, before - return) over the steps after the perturbation, in return times steps."""
     final: float
-    """Mean return of the last three evaluations."""
+    """Mean return of the last three evaluations after the perturbation, or of all where none is after it."""
     worst_drawdown: float
     """The largest fall from the highest return so far, over the whole curve, before the perturbation and after it."""
 
 
-def recovery(rows: np.ndarray, step: int, until: int | None = None) -> dict[int, Recovery]:
+def recovery(rows: np.ndarray, step: int, until: int | None = None, since: int = -1) -> dict[int, Recovery]:
     """Return each seed's `Recovery` from a perturbation after `step`, of the rows of evaluations.csv until `until`.
 
-    An evaluation at `step` itself still counts as before. Of a negative return before, -100, 90 % are -110: `before`
-    less a tenth of its size. The steps to regain that end at the first evaluation that reaches it after the first one
-    that did not. The area is the trapezoids' between evaluations, beginning with no loss at `step`. Last evaluations
-    are fewer than three where there are no more; those of a seed that are NaN or missing are left out.
+    What came until `since`, where the perturbation before it was, is no return before this one; an evaluation at `step`
+    itself still is. Of a negative return before, -100, 90 % are -110: `before` less a tenth of its size. The steps to
+    regain that end at the first evaluation that reaches it after the first one that did not. The area is the
+    trapezoids' between evaluations, beginning with no loss at `step`. Last evaluations are fewer than three where there
+    are no more; those of a seed that are NaN or missing are left out.
     """
     steps, seeds, returns = evaluation_matrix(rows)
     wanted = steps <= (steps.max(initial=0) if until is None else until)
     there = ~np.isnan(returns) & wanted
     return {
-        int(seed): _recovery(steps[known], line[known], step)
+        int(seed): _recovery(steps[known], line[known], step, since)
         for seed, line, known in zip(seeds, returns, there, strict=True)
         if known.any()
     }
 
 
-def _recovery(steps: np.ndarray, returns: np.ndarray, step: int) -> Recovery:
-    is_after = steps > step
-    final, drawdown = returns[-3:].mean(), (np.maximum.accumulate(returns) - returns).max()
-    if is_after.all() or not is_after.any():
-        before = np.nan if is_after.all() else returns[-3:].mean()
+def _recovery(steps: np.ndarray, returns: np.ndarray, step: int, since: int) -> Recovery:
+    is_before, is_after = (since < steps) & (steps <= step), steps > step
+    before = returns[is_before][-3:].mean() if is_before.any() else np.nan
+    final = (returns[is_after] if is_after.any() else returns)[-3:].mean()
+    drawdown = (np.maximum.accumulate(returns) - returns).max()
+    if np.isnan(before) or not is_after.any():
         return Recovery(*map(float, (before, np.nan, np.nan, np.nan, np.nan, final, drawdown)))
-    before, steps, after = returns[~is_after][-3:].mean(), steps[is_after], returns[is_after]
+    steps, after = steps[is_after], returns[is_after]
     drop = max(before - after.min(), 0.0)
     shortfall = np.maximum(before - after, 0.0)
     area = np.trapezoid([0.0, *shortfall], [step, *steps])
     time = _time_to_regain(steps - step, after, (REGAINED if before >= 0 else 2 - REGAINED) * before)
-    return Recovery(*map(float, (before, drop, _divide(drop, abs(before)), time, area, final, drawdown)))
+    relative = drop / abs(before) if before else np.nan
+    return Recovery(*map(float, (before, drop, relative, time, area, final, drawdown)))
 
 
 def _time_to_regain(times: np.ndarray, returns: np.ndarray, threshold: float) -> float:

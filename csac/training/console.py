@@ -22,6 +22,7 @@ from csac.record.statistics import (
     last_evaluations,
     last_means,
     mean_and_interval,
+    mean_told,
     recovery,
 )
 from csac.record.tables import COLUMNS
@@ -117,7 +118,7 @@ def recovery_tables(run: RunDirectory) -> list[Table]:
     tables = []
     for index, (step, text) in enumerate(perturbed):
         until = perturbed[index + 1][0] if index + 1 < len(perturbed) else None
-        recoveries = recovery(rows, step, until)
+        recoveries = recovery(rows, step, until, perturbed[index - 1][0] if index else -1)
         if any(np.isfinite(seed.drop) for seed in recoveries.values()):
             title = f"{text} after step {step:,}" + (
                 f", until {until:,}" if until and until < rows["step"].max() else ""
@@ -129,7 +130,7 @@ def recovery_tables(run: RunDirectory) -> list[Table]:
 def _recovery_table(title: str, recoveries: Mapping[int, Recovery], failures: Mapping[str, str]) -> Table:
     """Return one row per seed, and below them the mean and standard deviation over seeds that did not fail.
 
-    Where a seed never came back there is no mean of the steps, but how many did.
+    Where a seed never came back there is no mean of the steps, but how many did; a share of a return of 0 is left out.
     """
     table = _table("seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "worst fall")
     table.title, table.title_justify, table.title_style = title, "left", "bold"
@@ -137,13 +138,14 @@ def _recovery_table(title: str, recoveries: Mapping[int, Recovery], failures: Ma
     largest = float(np.nanmax(np.abs(values[:, [0, 1, 5, 6]])))
     for seed, one in recoveries.items():
         table.add_row(str(seed), *_recovery_cells(one, largest), style="red" if str(seed) in failures else None)
-    sound = np.array([one for seed, one in recoveries.items() if str(seed) not in failures and not np.isnan(one).any()])
+    sound = np.array([one for seed, one in recoveries.items() if str(seed) not in failures and np.isfinite(one.drop)])
     if len(sound) > 1:
         back = np.isfinite(sound[:, 3])
-        columns = np.where(back.all() | (np.arange(7) != 3), sound, np.nan)
-        mean, std = (
-            _recovery_cells(Recovery(*row.tolist()), largest) for row in (columns.mean(0), columns.std(0, ddof=1))
-        )
+        columns = np.where(back.all() | (np.arange(7) != 3), sound, np.nan).T
+        known = [column[~np.isnan(column)] for column in columns]
+        means = [column.mean() if len(column) else np.nan for column in known]
+        deviations = [column.std(ddof=1) if len(column) > 1 else np.nan for column in known]
+        mean, std = (_recovery_cells(Recovery(*map(float, row)), largest) for row in (means, deviations))
         mean[3] = mean[3] or f"{back.sum()} of {len(back)}"
         table.add_section()
         table.add_row("mean", *mean)
@@ -215,8 +217,9 @@ def events_table(rows: np.ndarray) -> Table | None:
 def case_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Table | None:
     """Return the paper's case table: how often success and each event came in 1,000 rollouts, one column per seed.
 
-    What is a count in itself, such as waypoints reached, is a mean per rollout instead. Where there are several seeds,
-    the last columns are the mean over them and their standard deviation. None where the task says nothing.
+    A rollout that does not speak of a case counts as one without it. What is a count in itself, such as waypoints
+    reached, is a mean per rollout instead, over those that tell it. Where there are several seeds, the last columns are
+    the mean over them and their standard deviation. None where the task says nothing.
     """
     episodes = [episode for result in results.values() for episode in result]
     rows: dict[str, list[list[float | None]]]
@@ -233,10 +236,10 @@ def case_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Table | No
     table = _table(f"per {ROLLOUTS:,} rollouts{scaled}", *headings, *["mean", "± std"] * (len(results) > 1))
     table.columns[0].justify = "left"
     for name, by_seed in rows.items():
-        told = [[value for value in values if value is not None] for values in by_seed]
-        is_case = all(isinstance(value, bool) for values in told for value in values)
+        told = [value for values in by_seed for value in values if value is not None]
+        is_case = all(isinstance(value, bool) for value in told)
         scale, digits = (ROLLOUTS, 1) if is_case else (1, 3)
-        values = np.array([scale * np.mean(value) if value else np.nan for value in told])
+        values = np.array([scale * mean_told(np.array(values, float), is_case and told != []) for values in by_seed])
         known = values[~np.isnan(values)]
         cells = [_cell(value, digits) for value in values] if shown else []
         if len(results) > 1:

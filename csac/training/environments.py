@@ -76,6 +76,7 @@ class Environment:
         self.raw = _make(task, arguments)
         self.task_name = _task_name(task, self.raw)
         self._quietly = quietly if tasks.is_pybullet(self.raw) else nullcontext
+        self.has_memory = tasks.has_memory(task, self.raw)
         try:
             _check_render_mode(self.raw, render_mode)
             parts = _observation_parts(self.raw.observation_space)

@@ -10,7 +10,6 @@ import numpy as np
 from csac.deploy.policy import Policy
 from csac.training.environments import EVALUATION_SEED, FRESH_EVALUATION_SEED, Environment, EnvironmentFailure
 from csac.training.perturb import lasting, values_at
-from csac.training.tasks import adapter_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -74,8 +73,6 @@ class Evaluator:
         self._task, self._environment_arguments = task, environment_arguments
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
         self._environments: list[Environment] = []
-        adapter = adapter_of(task)
-        self._has_memory = adapter is not None and adapter.has_memory
         self.info_names: set[str] = set()
         self._perturbed: dict[str, float] = {}
 
@@ -119,7 +116,7 @@ class Evaluator:
         Raises:
             InputError, EvaluationFailure: as `run`.
         """
-        if self._has_memory:
+        if self._environments and self._environments[0].has_memory:
             self.close()
         self._make_environments()
         _check_contract(policy, self._environments[0])
@@ -134,8 +131,12 @@ class Evaluator:
     def _make_environments(self) -> None:
         while len(self._environments) < min(ROWS, self.episodes):
             environment = Environment(self._task, self._environment_arguments)
+            try:
+                environment.perturb(self._perturbed)
+            except InputError:
+                environment.close()
+                raise
             self._environments.append(environment)
-            environment.perturb(self._perturbed)
 
     def _run_batch(self, policy: Policy, numbers: range, deterministic: bool) -> list[EvaluationEpisode]:
         observation_size, action_size = policy.contract.spec
@@ -157,7 +158,11 @@ class Evaluator:
                 observations[row] = episode.step(actions[row])
             running = [(row, episode) for row, episode in running if not episode.ended]
         for episode in episodes:
-            self.info_names |= {name for name, value in episode.last_info.items() if _number(value) is not None}
+            self.info_names |= {
+                name
+                for name, value in episode.last_info.items()
+                if isinstance(name, str) and _number(value) is not None
+            }
         return [episode.result(self._events) for episode in episodes]
 
 
@@ -228,9 +233,15 @@ def evaluate(
     _check_episodes(episodes)
     environment = Environment(task, environment_arguments)
     try:
-        environment.perturb(perturbed)
-        played = (_Episode(environment, number, first_seed + number) for number in range(episodes))
-        return np.array([_play(policy, episode, deterministic).episode_return for episode in played])
+        returns = []
+        for number in range(episodes):
+            if number and environment.has_memory:
+                environment.close()
+                environment = Environment(task, environment_arguments)
+            environment.perturb(perturbed)
+            episode = _Episode(environment, number, first_seed + number)
+            returns.append(_play(policy, episode, deterministic).episode_return)
+        return np.array(returns)
     finally:
         environment.close()
 
@@ -273,7 +284,7 @@ def _number(value: Any) -> bool | float | None:
         return None
     try:
         array = np.asarray(value)
-    except ValueError:
+    except Exception:  # `info` may hold anything
         return None
     if array.size != 1 or array.dtype.kind not in "buif" or not np.isfinite(array).all():
         return None

@@ -12,6 +12,7 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
+from csac.record.statistics import is_case, mean_told
 from csac.record.tables import COLUMNS
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ class TensorBoardLog:
         self._files = {seed: _EventFile(path / f"seed_{seed}", purge) for seed in seeds}
         self._begin = begin
         self._recent: dict[int, deque[tuple[float, int]]] = {seed: deque(maxlen=EPISODES_AVERAGED) for seed in seeds}
+        self._cases: set[str] = set()  # events that happen or do not: where nobody speaks of one, it did not
         self._clock, self._began = clock, clock()
 
     def episodes(self, rows: Sequence[Row]) -> None:
@@ -64,14 +66,19 @@ class TensorBoardLog:
     def evaluations(self, rows: Sequence[Row]) -> None:
         """Write the means over each evaluation's episodes, rows of evaluations.csv."""
         for (seed, step), episodes in _grouped(rows).items():
-            values = {
+            values: dict[str, Any] = {
                 "eval/mean_reward": np.mean([row["return"] for row in episodes]),
                 "eval/mean_ep_length": np.mean([row["length"] for row in episodes]),
             }
             for name in ("success", *(name for name in episodes[0] if name not in COLUMNS["evaluations"])):
-                told = [row[name] for row in episodes if row.get(name) is not None]
-                if told:
-                    values["eval/success_rate" if name == "success" else f"eval/{name}"] = np.mean(told)
+                told = np.array([row.get(name) for row in episodes], float)
+                if is_case(told):
+                    self._cases.add(name)
+                elif not np.isnan(told).all():
+                    self._cases.discard(name)
+                mean = mean_told(told, name in self._cases)
+                if not np.isnan(mean):
+                    values["eval/success_rate" if name == "success" else f"eval/{name}"] = mean
             self._write(seed, step, values)
 
     def close(self) -> None:

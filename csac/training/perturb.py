@@ -65,9 +65,10 @@ class Perturbation:
             raise InputError(f"mass takes a finite factor above 0, not {self.value!r}")
         if not (is_number and 0 <= self.value < math.inf):
             raise InputError(f"{self.kind} takes a finite {what} of 0 or more, not {self.value!r}")
-        if isinstance(self.step, bool) or not isinstance(self.step, int) or self.step < 0:
+        if isinstance(self.step, bool) or not isinstance(self.step, int | np.integer) or self.step < 0:
             raise InputError(f"the step of {self.kind} must be a whole number of 0 or more, not {self.step!r}")
         object.__setattr__(self, "value", float(self.value))
+        object.__setattr__(self, "step", int(self.step))
 
     @classmethod
     def parse(cls, text: str) -> Perturbation:
@@ -97,6 +98,9 @@ def perturbations_of(given: str | Perturbation | Iterable[str | Perturbation]) -
     """
     several = (given,) if isinstance(given, str | Perturbation) else given
     parsed = [Perturbation.parse(item) if isinstance(item, str) else item for item in several]
+    for item in parsed:
+        if not isinstance(item, Perturbation):
+            raise InputError(f"{item!r} is no perturbation: write it as {_EXAMPLE!r}, or make a Perturbation")
     parsed.sort(key=lambda item: (item.step, KINDS.index(item.kind)))
     for first, second in itertools.pairwise(parsed):
         if (first.kind, first.step) == (second.kind, second.step):
@@ -135,11 +139,17 @@ def continued(before: Sequence[Perturbation], given: Sequence[Perturbation], beg
     return perturbations_of([*past, *(item for item in given if item.step >= begin)])
 
 
-def refuse_late(perturbations: Iterable[Perturbation], steps: int) -> None:
-    """Raise InputError for what would only change steps that a run of `steps` does not make."""
+def refuse_late(perturbations: Iterable[Perturbation], steps: int, planned: bool = False) -> None:
+    """Raise InputError for what would only change steps that a run of `steps` does not make.
+
+    Those that were `planned` in the run that this one begins with have nobody who asked for them now.
+    """
     for item in perturbations:
         if item.step >= steps:
-            raise InputError(f"{item} would change nothing: the run ends at step {steps}; give an earlier step")
+            hint = "was planned in the run that this one begins with: --perturb none leaves that out" if planned else ""
+            raise InputError(
+                f"{item} would change nothing: the run ends at step {steps}; {hint or 'give an earlier step'}"
+            )
 
 
 def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:

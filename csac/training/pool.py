@@ -130,8 +130,13 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, evaluator), daemon=True)
-        with worker_surroundings():
-            self.process.start()
+        try:
+            with worker_surroundings():
+                self.process.start()
+        except BaseException:  # a Ctrl-C that waited until the worker was there
+            if self.process.pid:
+                self.kill()
+            raise
         theirs.close()
 
     def ask(self, batch: tuple[Policy, int, bool]) -> None:

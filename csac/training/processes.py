@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import multiprocessing
 import os
 import signal
 import sys
@@ -25,8 +26,11 @@ def usable_cores() -> list[int]:
 
 def die_with_parent() -> None:
     """Ask Linux to kill this process with its parent, so that nobody writes into a run that another has taken over."""
+    parent = multiprocessing.parent_process()
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if parent and os.getppid() != parent.pid:  # it died before it was asked
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from csac.training.perturb import continued, perturbations_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable
 
     from csac.training.perturb import Perturbation
     from csac.types import Algorithm, Spec
@@ -87,25 +87,29 @@ def refuse_differences(run: RunDirectory, wanted: dict[str, Any], algorithm: Alg
 
 
 def with_past(
-    given: Sequence[Perturbation], existing: RunDirectory | None, source: Source | None
+    given: str | Perturbation | Iterable[str | Perturbation] | None,
+    existing: RunDirectory | None,
+    source: Source | None,
 ) -> tuple[Perturbation, ...]:
     """Return the perturbations of a run together with those that it was forked after.
 
     Args:
-        given: those asked for now.
+        given: those asked for now; None for those that were planned where it goes on or begins.
         existing: the run that goes on, if there is one.
         source: where a new run begins, if not anew.
 
     Raises:
-        InputError: one of those asked for lies before the step where the run was or is forked.
+        InputError: one of those asked for cannot be, or lies before the step where the run was or is forked.
     """
+    asked = perturbations_of(() if given is None else given)
     if existing:
         before, begin = existing.manifest, existing.manifest.get("forked_from", {}).get("step", 0)
     elif source:
         before, begin = source.run.manifest, source.checkpoint.step
     else:
-        return tuple(given)
-    return continued(perturbations_of(before.get("perturbations", [])), given, begin)
+        return asked
+    planned = perturbations_of(before.get("perturbations", []))
+    return planned if given is None else continued(planned, asked, begin)
 
 
 def roll_back(run: RunDirectory) -> Point:

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -46,11 +46,16 @@ def _kept(descriptor: int, stream: object) -> Iterator[None]:
     """Let a descriptor point to a file during this block, and pass on what is not chatter."""
     _flush(stream)
     try:
-        original = os.dup(descriptor)
-    except OSError:  # closed: nobody can be disturbed
+        file = _file()
+    except OSError:  # no place for one: rather noise than a task that cannot be made
         yield
         return
-    with tempfile.TemporaryFile() as file:
+    with file:
+        try:
+            original = os.dup(descriptor)
+        except OSError:  # closed: nobody can be disturbed
+            yield
+            return
         os.dup2(file.fileno(), descriptor)
         try:
             yield
@@ -75,6 +80,11 @@ def _printed(name: str) -> Iterator[None]:
         rest = _without_chatter(aside.getvalue().encode(errors="surrogatepass"))
         with suppress(OSError, ValueError, AttributeError):  # nobody reads any more, or there is no stream
             stream.write(rest.decode(errors="surrogatepass"))
+
+
+def _file() -> IO[bytes]:
+    """Return a file without a name, in memory where there is such a thing."""
+    return os.fdopen(os.memfd_create("quietly"), "w+b") if hasattr(os, "memfd_create") else tempfile.TemporaryFile()
 
 
 def _pass_on(descriptor: int, written: bytes) -> None:

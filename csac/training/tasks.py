@@ -116,7 +116,7 @@ ADAPTERS: Mapping[str, Adapter] = MappingProxyType(
         },
     }
 )
-_FAMILIES = {"PyFlyt/": _PYFLYT, "Panda": _PANDA}
+_FAMILIES = {"PyFlyt/": _PYFLYT, "Panda": Adapter("panda_gym")}  # what other ids of that name take is not known
 
 
 def adapter_of(task: object) -> Adapter | None:
@@ -131,7 +131,7 @@ def register(name: str) -> None:
     """Import what registers a known task, if there is such a task and it is not registered yet.
 
     Raises:
-        InputError: the package is not installed; the message says what to install.
+        InputError: the package is not installed, or another version; the message says what to install.
     """
     adapter = adapter_of(name)
     if adapter is None or name in gymnasium.registry:
@@ -141,6 +141,9 @@ def register(name: str) -> None:
     except ImportError as error:
         if name in ADAPTERS:
             raise InputError(missing(name, error)) from error
+    if name in ADAPTERS and name not in gymnasium.registry:
+        package = adapter.module.partition(".")[0]
+        raise InputError(f"the {package} that is installed has no {name}: {INSTALL}")
 
 
 def missing(name: str, error: Exception) -> str:
@@ -171,5 +174,15 @@ def check_events(events: Sequence[str]) -> None:
 
 def is_pybullet(environment: gymnasium.Env) -> bool:
     """Whether this is one of PyFlyt's or panda-gym's environments, or derived from one."""
-    packages = {kind.__module__.partition(".")[0] for kind in type(environment.unwrapped).__mro__}
-    return bool(packages & {"PyFlyt", "panda_gym"})
+    return bool(_packages(environment) & {"PyFlyt", "panda_gym"})
+
+
+def has_memory(task: object, environment: gymnasium.Env) -> bool:
+    """Whether what an episode gives depends on those before it: so a task of panda-gym's that is not known not to."""
+    if isinstance(task, str) and (adapter := ADAPTERS.get(task.rpartition(":")[2])):
+        return adapter.has_memory
+    return "panda_gym" in _packages(environment)
+
+
+def _packages(environment: gymnasium.Env) -> set[str]:
+    return {kind.__module__.partition(".")[0] for kind in type(environment.unwrapped).__mro__}

@@ -87,7 +87,7 @@ def train(
     evaluation_interval: int = 5_000,
     evaluation_episodes: int = 10,
     environment_arguments: dict[str, Any] | None = None,
-    perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
+    perturbations: str | Perturbation | Iterable[str | Perturbation] | None = None,
     device: str = "cpu",
     checkpoint_interval: int = 50_000,
     keep_checkpoints: int = 2,
@@ -116,7 +116,8 @@ def train(
         evaluation_episodes: episodes of each evaluation.
         environment_arguments: keyword arguments for the environment.
         perturbations: changes of the task, in training and evaluations, such as `("friction=1.5@300000",)`: see
-            `Perturbation`. What a run begins with (`start_from`) keeps what had happened to it.
+            `Perturbation`. What a run begins with (`start_from`) keeps what had happened to it; with None also what was
+            still to happen.
         device: "cpu" or "gpu".
         checkpoint_interval: environment steps between checkpoints; there is one every ten minutes, at the last step and
             when a signal stops the run as well. 0 makes none.
@@ -150,9 +151,10 @@ def train(
         path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
         existing = RunDirectory.open(path) if resume and is_run(path) else None
         source = Source.find(start_from) if start_from is not None and not existing else None
-        perturbations = with_past(perturbations_of(perturbations), existing, source)
-        refuse_late(perturbations, steps)
-        for item in perturbations:
+        changes = with_past(perturbations, existing, source)
+        if not existing:  # whose number of steps has its own refusal
+            refuse_late(changes, steps, planned=source is not None and perturbations is None)
+        for item in changes:
             environment.perturb({item.kind: item.value})
 
     labels = list(range(first_seed, first_seed + seeds))
@@ -169,7 +171,7 @@ def train(
         (path / FOLDER).absolute() if checkpoint_interval else None,
         checkpoint_interval,
         events=tuple(names),
-        perturbations=perturbations,
+        perturbations=changes,
     )
     if len(parts) > 1:
         _check_picklable(settings)
@@ -178,7 +180,7 @@ def train(
         "task": task_name,
         "task_is_callable": not isinstance(task, str),
         "environment_arguments": environment_arguments,
-        "perturbations": [str(item) for item in perturbations],
+        "perturbations": [str(item) for item in changes],
         "algorithm": algorithm.name,
         "hyperparameters": dataclasses.asdict(algorithm),  # pyright: ignore[reportArgumentType]
         "preset": preset,
