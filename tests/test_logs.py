@@ -68,9 +68,13 @@ def test_evaluations_are_averaged_per_seed_and_step(log, tmp_path):
     assert scalars(tmp_path / "seed_0") == {
         "eval/mean_reward": [(10, 1.5), (20, 5.0)],
         "eval/mean_ep_length": [(10, 4.0), (20, 4.0)],
-        "eval/success_rate": [(10, 0.5)],
+        "eval/success_rate": [(10, 0.5), (20, 0.0)],  # once episodes have spoken of it, silence is a no
     }
-    assert scalars(tmp_path / "seed_7") == {"eval/mean_reward": [(10, 8.0)], "eval/mean_ep_length": [(10, 4.0)]}
+    assert scalars(tmp_path / "seed_7") == {
+        "eval/mean_reward": [(10, 8.0)],
+        "eval/mean_ep_length": [(10, 4.0)],
+        "eval/success_rate": [(10, 0.0)],
+    }
 
 
 def test_closing_twice_is_harmless(log):
