@@ -23,15 +23,16 @@ def steps_per_second(task: str, seconds: float) -> tuple[float, float]:
     actions = generator.uniform(-1, 1, (1_000, environment.spec.action_size)).astype(np.float32)
     environment.step(actions[0])  # PyFlyt compiles in its first steps
     environment.reset(0)
-    steps, episodes, began = 0, 0, time.perf_counter()
+    steps, in_episodes, episodes, began = 0, 0, 0, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds or not episodes:
         _, _, terminated, truncated, _ = environment.step(actions[steps % len(actions)])
         steps += 1
         if terminated or truncated:
             episodes += 1
+            in_episodes = steps
             environment.reset(episodes)
     environment.close()
-    return steps / elapsed, steps / episodes
+    return steps / elapsed, in_episodes / episodes
 
 
 def main() -> None:
