@@ -119,6 +119,8 @@ class Evaluate:
     """Draw actions from the policy instead of taking its most likely one."""
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
     """Change the task, as friction=2 does; the kinds are those of csac train."""
+    csv: Annotated[Path | None, arg(metavar="FILE.csv")] = None
+    """Write a row for each episode there as well, as in evaluations.csv."""
 
 
 @dataclass(frozen=True)
@@ -277,6 +279,8 @@ def _perturbations(given: tuple[str, ...]) -> tuple[str, ...] | None:
 
 def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
+    from csac.record.run import RunDirectory
+    from csac.record.tables import COLUMNS, check_new, write_rows
     from csac.training.console import case_table, evaluation_table, make_console, silent_events
     from csac.training.evaluation import EvaluationFailure
     from csac.training.play import evaluate_run, told_perturbations
@@ -284,6 +288,8 @@ def _evaluate(arguments: list[str]) -> int:
 
     console = make_console()
     told = told_perturbations(options.run, options.perturb)
+    if options.csv:
+        check_new(options.csv)
     results = {}
     try:
         with _waiting(console, "evaluating") as status:
@@ -308,6 +314,11 @@ def _evaluate(arguments: list[str]) -> int:
         console.print(cases)
     for name in silent_events(results):
         _say(f"note: no episode's last info holds a number called {name!r}")
+    if options.csv:
+        step = RunDirectory.open(options.run).manifest["steps_done"]
+        rows = [episode.row(seed, step) for seed, episodes in results.items() for episode in episodes]
+        write_rows(options.csv, COLUMNS["evaluations"], rows)
+        console.print(str(options.csv), soft_wrap=True)
     return 0
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from csac.record.plots import learning_curve
 from csac.record.run import read_rows
-from csac.record.statistics import last_evaluations, maximum_average_return, mean_and_interval
+from csac.record.statistics import is_case, last_evaluations, maximum_average_return, mean_and_interval, mean_told
 
 
 def up_to(rows: np.ndarray, step: int | None) -> np.ndarray:
@@ -22,11 +22,12 @@ def up_to(rows: np.ndarray, step: int | None) -> np.ndarray:
 
 
 def table(runs: list[tuple[str, np.ndarray]]) -> str:
-    """Return a Markdown table: each run's last three evaluations and maximum average return."""
+    """Return a Markdown table: each run's last three evaluations, maximum average return, and success if it is told."""
+    tells = any(is_case(rows["success"]) for _, rows in runs)
     lines = [
         "| run | seeds | steps | last three evaluations, mean ± std over seeds | 95 % t-interval | to the first "
-        "| maximum average return |",
-        "|---|---|---|---|---|---|---|",
+        "| maximum average return |" + " success, last three evaluations |" * tells,
+        "|---|---|---|---|---|---|---|" + "---|" * tells,
     ]
     first = None
     for label, rows in runs:
@@ -37,9 +38,16 @@ def table(runs: list[tuple[str, np.ndarray]]) -> str:
         spread = last.std(ddof=1) if len(last) > 1 else float("nan")
         lines.append(
             f"| {label} | {len(last)} | {rows['step'].max():,} | {mean:.0f} ± {spread:.0f} | {low:.0f} to {high:.0f} "
-            f"| {mean / first:.2f} | {best:.0f} at {step:,} |"
+            f"| {mean / first:.2f} | {best:.0f} at {step:,} |" + f" {success(rows)} |" * tells
         )
     return "\n".join(lines)
+
+
+def success(rows: np.ndarray, points: int = 3) -> str:
+    """Return the share of successful episodes in the last evaluations, mean ± standard deviation over seeds."""
+    last = rows[np.isin(rows["step"], np.unique(rows["step"])[-points:])]
+    shares = np.array([mean_told(last["success"][last["seed"] == seed], True) for seed in np.unique(last["seed"])])
+    return f"{shares.mean():.0%}" + (f" ± {shares.std(ddof=1):.0%}" if len(shares) > 1 else "")
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ import trainer  # noqa: F401  (its cache of compiled programs)
 from csac.algorithms import SAC
 from csac.cli import main
 from csac.deploy.policy import Contract, Policy
-from csac.record.run import RunDirectory
+from csac.record.run import RunDirectory, read_rows
 from csac.training import tasks
 from csac.training.console import case_table
 from csac.training.environments import EVALUATION_SEED, Environment
@@ -567,6 +567,29 @@ def test_robots_beside_each_other_do_not_interfere():
     together = Evaluator(REACH, episodes=3).run(policy)
     alone = [Evaluator(REACH, episodes=1, first_seed=EVALUATION_SEED + n).run(policy)[0] for n in range(3)]
     assert [episode[1:] for episode in together] == [episode[1:] for episode in alone]
+
+
+def test_evaluate_writes_its_episodes_where_nothing_is(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    make_run(Path("run"), "probes:Cases-v0", events=("crashed", "stops"), seeds=(0, 3))
+    assert main(["evaluate", "run", "--episodes", "3", "--csv", "cases.csv"]) == 0
+    assert capsys.readouterr().out.endswith("cases.csv\n")
+    rows = read_rows("cases.csv")
+    assert rows.dtype.names == ("seed", "step", "episode", "return", "length", "success", "crashed", "stops")
+    results = dict(evaluate_run("run", episodes=3))
+    expected = [(seed, 9, *episode[:4], *episode.events.values()) for seed in (0, 3) for episode in results[seed]]
+    assert rows.tolist() == expected
+
+    before = Path("cases.csv").read_bytes()
+    for name, complaint in (
+        ("cases.csv", "cases.csv exists: give another name"),
+        ("none/cases.csv", "cannot write into none"),
+        ("cases.txt", "the table is a .csv file: name it cases.csv"),
+    ):
+        assert main(["evaluate", "run", "--csv", name]) == 2
+        assert complaint in capsys.readouterr().err
+    assert Path("cases.csv").read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cases.csv", "run"]
 
 
 def test_workers_import_no_jax_and_are_several():

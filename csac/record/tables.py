@@ -46,6 +46,33 @@ def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
         file.write(text.getvalue().encode())
 
 
+def check_new(path: Path) -> None:
+    """Raise InputError where there is a file already or none can be, before anything has been computed for it."""
+    if path.suffix.lower() != ".csv":
+        raise InputError(f"the table is a .csv file: name it {path.with_suffix('.csv')}")
+    if path.exists():
+        raise InputError(f"{path} exists: give another name, or remove it first")
+    folder = path.parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise InputError(f"cannot write into {folder}: choose a folder that exists and is yours to write")
+
+
+def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a table as `append_rows` does; the file gets its name once it is whole.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        append_rows(aside, columns, rows)
+        aside.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}; choose another place") from error
+    finally:
+        aside.unlink(missing_ok=True)
+
+
 def read_rows(path: str | Path) -> np.ndarray:
     """Read a table of a run as a structured array [row].
 

@@ -41,6 +41,18 @@ class EvaluationEpisode(NamedTuple):
     success: float | None
     events: Mapping[str, float | None] = MappingProxyType({})
 
+    def row(self, seed: int, step: int) -> dict[str, Any]:
+        """Return the row of evaluations.csv that says this of a seed's policy of that step."""
+        return {
+            "seed": seed,
+            "step": step,
+            "episode": self.episode,
+            "return": self.episode_return,
+            "length": self.length,
+            "success": self.success,
+            **self.events,
+        }
+
 
 class Evaluator:
     """Evaluates policies on a task, always on the same episodes: episode j is reset with `first_seed + j`.

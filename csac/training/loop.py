@@ -282,18 +282,7 @@ def _evaluate(
             environments.stop(list(seeds).index(seed))
             yield Failed(seed, step, f"its evaluation failed: {error}", "", policies.pop(seed))
             continue
-        rows += [
-            {
-                "seed": seed,
-                "step": step,
-                "episode": episode.episode,
-                "return": episode.episode_return,
-                "length": episode.length,
-                "success": episode.success,
-                **episode.events,
-            }
-            for episode in episodes
-        ]
+        rows += [episode.row(seed, step) for episode in episodes]
     if any(row["length"] >= LONGEST_EPISODE for row in rows):
         yield Noted(f"step {step}: evaluation episodes were broken off after {LONGEST_EPISODE:,} steps: do they end?")
     yield Evaluated(step, rows, policies, frozenset(evaluator.info_names))
