@@ -43,7 +43,7 @@ check: $(SETUP)  ## Check format, lint, types and the direction of imports
 
 peers: $(PEERS)  ## Install stable-baselines3 and SBX into .venv-peers, to measure against
 
-bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS))  ## Measure speed beside the peers, 16 minutes: make bench ARGS=--quick
+bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS))  ## Measure speed beside the peers, 20 minutes: make bench ARGS=--quick
 	.venv/bin/python benchmarks/speed.py --out benchmarks $(ARGS)
 
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml

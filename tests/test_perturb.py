@@ -17,6 +17,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
 from test_resume import LEARNERS, Crash, contents, crash_at, run
+from test_snapshots import steps_of
 
 from csac.deploy.policy import Contract, Policy, load
 from csac.record.run import RunDirectory
@@ -464,15 +465,6 @@ def test_noise_that_begins_after_a_snapshot_is_the_same_as_without_one():
     third.reset()
     steps_of(third, 10)
     assert steps_of(third, 60) != after
-
-
-def steps_of(environments: SeedEnvironments, count: int) -> list[tuple]:
-    generator, outcomes = np.random.default_rng(5), []
-    for _ in range(count):
-        shape = (len(environments.seeds), environments.spec.action_size)
-        outcome = environments.step(generator.uniform(-1, 1, shape).astype(np.float32))
-        outcomes.append((outcome.next_observation.tolist(), outcome.reward.tolist(), outcome.episodes))
-    return outcomes
 
 
 # Evaluation.
