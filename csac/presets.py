@@ -24,6 +24,7 @@ _PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
         "discount": 0.99,
         # Not in the table, but in the equations and in Algorithm 1: one update per step, no clipping.
         "updates_per_step": 1,
+        "update_interval": 1,
         "max_gradient_norm": 0.0,
     }
 )

@@ -95,12 +95,12 @@ class Algorithm(Protocol):
 
     @property
     def update_interval(self) -> int:
-        """Environment steps from one update to the next: 1, or as many as a rollout has."""
+        """Environment steps after each of which it learns: 1 in strict order, or as many as a rollout has."""
         ...
 
     @property
-    def updates_per_step(self) -> int:
-        """Calls of `update` after each of those environment steps, once the warm-up is over."""
+    def updates_per_interval(self) -> int:
+        """Calls of `update` each time that it learns, once the warm-up is over."""
         ...
 
     @property

@@ -22,6 +22,7 @@ BOTH = {
     "replay_size": [0, 1e6],
     "warmup_steps": [-1, 0.5],
     "updates_per_step": [0, 0.5],
+    "update_interval": [0, 2.5],
     "max_gradient_norm": [-1.0, math.inf],
 }
 CSAC_ONLY = {

@@ -100,7 +100,7 @@ class Watcher:
     """An algorithm that learns nothing and keeps every batch."""
 
     warmup_steps: int = 10
-    updates_per_step: int = 2
+    updates_per_interval: int = 2
     batch_size: int = 16
     update_interval: int = 1
     has_schedule = False
@@ -111,7 +111,7 @@ class Watcher:
         return self.batch_size
 
     def memory(self, spec, steps):
-        return Replay.create(steps, spec)
+        return Replay.create(steps, spec, self.update_interval)
 
     def init(self, key, spec, steps):
         drawn = jnp.zeros((100, self.batch_size, spec.observation_size))
@@ -179,7 +179,7 @@ class RolloutWatcher(Watcher):
 
 
 def test_a_rollout_reaches_its_update_whole_and_in_order():
-    watcher = RolloutWatcher(warmup_steps=0, updates_per_step=1, batch_size=5, update_interval=5)
+    watcher = RolloutWatcher(warmup_steps=0, updates_per_interval=1, batch_size=5, update_interval=5)
     outcome = run(watcher, probes.IdEncoded, 23, SEEDS)
     for seed, state, rows in zip(SEEDS, outcome.states, outcome.memories, strict=True):
         # Updates follow the steps 5, 10, 15 and 20; the last three steps wait for ever.
@@ -193,6 +193,26 @@ def test_a_rollout_reaches_its_update_whole_and_in_order():
 
 
 def test_the_warm_up_of_a_rollout_ends_with_a_whole_one():
-    watcher = RolloutWatcher(warmup_steps=7, updates_per_step=2, batch_size=5, update_interval=5)
+    watcher = RolloutWatcher(warmup_steps=7, updates_per_interval=2, batch_size=5, update_interval=5)
     state = run(watcher, probes.IdEncoded, 20, SEEDS).states[0]
     np.testing.assert_array_equal(state.times, [1.0] * 6 + [0.0] * 94)  # after the steps 10, 15 and 20
+
+
+def test_the_updates_of_an_interval_draw_from_all_of_it():
+    # Learning after the steps 12, 16, 20 and 24, four updates each: strict order would have made one after each step.
+    watcher = Watcher(warmup_steps=10, updates_per_interval=4, update_interval=4)
+    outcome = run(watcher, probes.IdEncoded, 26, SEEDS)
+    for rows, state in zip(outcome.memories, outcome.states, strict=True):
+        assert len(rows) == 28  # room for the whole intervals of 26 steps
+        np.testing.assert_array_equal(rows[24:], 0)  # the last two steps wait
+        np.testing.assert_array_equal(state.times, [1.0] * 16 + [0.0] * 84)
+        known = [tuple(row) for row in rows[:24, :4]]
+        indices = np.array([[known.index(tuple(row)) for row in batch] for batch in state.drawn[:16]])
+        so_far = 12 + np.arange(16) // 4 * 4
+        assert (indices < so_far[:, None]).all()
+        assert len({tuple(batch) for batch in indices}) == 16
+
+
+def test_a_ring_holds_whole_intervals():
+    assert Replay.create(10, Spec(2, 1), 4).rows.shape == (12, 8)
+    assert Replay.create(12, Spec(2, 1), 4).rows.shape == (12, 8)

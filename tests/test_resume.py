@@ -38,6 +38,7 @@ LEARNERS = [
     TD3(**SMALL),
     SD3(noise_samples=4, **SMALL),
     ROLLOUT,
+    SAC(update_interval=7, **SMALL),
 ]
 SHORT: dict[str, Any] = {"evaluation_interval": 100, "evaluation_episodes": 2, "tensorboard": False}
 
@@ -56,7 +57,7 @@ def everything(group: loop.Group) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in leaves] + [group._actions, group._observations, group.learner._waiting]
 
 
-@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda algorithm: algorithm.name)
+@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda learner: f"{learner.name}-{learner.update_interval}")
 def test_a_group_goes_on_bit_for_bit(tmp_path, algorithm):
     check_that_a_group_goes_on(tmp_path, algorithm, (3,))
 
@@ -211,6 +212,16 @@ def test_more_steps_go_on_where_the_run_ended(tmp_path):
     assert after.startswith(before)
     run(tmp_path / "long", steps=500)
     assert after == (tmp_path / "long" / "evaluations.csv").read_bytes()
+
+
+def test_a_run_from_before_there_were_update_intervals_goes_on(tmp_path):
+    older = run(tmp_path / "run", steps=120)
+    hyperparameters = dict(older.manifest["hyperparameters"])
+    assert hyperparameters.pop("update_interval") == 1
+    older.update_manifest(hyperparameters=hyperparameters)
+    assert resume(tmp_path / "run", steps=130).manifest["steps_done"] == 130
+    with pytest.raises(InputError, match="update_interval is 1, not 5"):
+        run(tmp_path / "run", replace(LEARNERS[0], update_interval=5), steps=130, resume=True)
 
 
 def test_a_finished_run_stays_as_it_is(tmp_path, finished):

@@ -83,16 +83,22 @@ class CSAC:
     warmup_steps: int = 10_000
     """Environment steps with uniform random actions before learning starts (the paper's T_initial)."""
     updates_per_step: int = 1
-    """Updates after each environment step."""
+    """Updates for each environment step."""
+    update_interval: int = 1
+    """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
     max_gradient_norm: float = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
-    update_interval = 1
     has_schedule = False
     name: ClassVar[str] = "csac"
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
+
+    @property
+    def updates_per_interval(self) -> int:
+        """Calls of `update` after every `update_interval` environment steps."""
+        return self.updates_per_step * self.update_interval
 
     @property
     def transitions_per_update(self) -> int:
@@ -101,7 +107,7 @@ class CSAC:
 
     def memory(self, spec: Spec, steps: int) -> Replay:
         """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
-        return Replay.create(min(self.replay_size, steps), spec)
+        return Replay.create(min(self.replay_size, steps), spec, self.update_interval)
 
     def init(self, key: jax.Array, spec: Spec, steps: int) -> State:
         """Return random networks; targets and reference are copies."""

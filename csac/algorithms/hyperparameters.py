@@ -54,6 +54,7 @@ LIMITS: dict[str, Limit] = {
     "replay_size": COUNT,
     "warmup_steps": NOT_NEGATIVE,
     "updates_per_step": COUNT,
+    "update_interval": COUNT,
     "max_gradient_norm": NOT_NEGATIVE,
 }
 

@@ -23,8 +23,9 @@ class Replay(NamedTuple):
     rows: jax.Array  # [capacity, 2 observation + action + 3]
 
     @classmethod
-    def create(cls, capacity: int, spec: Spec) -> Replay:
-        """Return an empty ring."""
+    def create(cls, capacity: int, spec: Spec, together: int = 1) -> Replay:
+        """Return an empty ring for rows that are added `together` at a time; it holds a multiple of these."""
+        capacity = -(-capacity // together) * together
         return cls(jnp.zeros((capacity, row_width(spec)), jnp.float32))
 
     def add(self, rows: jax.Array, count: jax.Array) -> Replay:

@@ -131,7 +131,7 @@ class PPO:
         return 0
 
     @property
-    def updates_per_step(self) -> int:
+    def updates_per_interval(self) -> int:
         """One call of `update` for each rollout."""
         return 1
 

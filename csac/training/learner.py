@@ -66,7 +66,7 @@ class Learner:
         program = self._explore
         if step >= self.algorithm.warmup_steps:
             program = self._learn
-            self._updates_summed += self.algorithm.updates_per_step
+            self._updates_summed += self.algorithm.updates_per_interval
         next_actions, self._buffers = program(self._buffers, self._waiting, outcome.observation, np.int32(step))
         return np.asarray(next_actions)
 
@@ -204,10 +204,10 @@ class Learner:
             state, metrics = self.algorithm.update(state, batch, jax.random.fold_in(update_key, i), first + i)
             return state, sums + jnp.stack([metrics[name] for name in self._metrics])
 
-        if self.algorithm.updates_per_step == 1:
+        if self.algorithm.updates_per_interval == 1:
             state, sums = update(jnp.int32(0), (state, sums))
         else:
-            state, sums = jax.lax.fori_loop(0, self.algorithm.updates_per_step, update, (state, sums))
+            state, sums = jax.lax.fori_loop(0, self.algorithm.updates_per_interval, update, (state, sums))
         carry = (state, memory, sums, key_data)
         return self._act(carry, observation, step), carry
 
@@ -218,7 +218,7 @@ class Learner:
         """Return how many updates came before those that follow environment step `step`."""
         interval = self.algorithm.update_interval
         first_step = -(-max(self.algorithm.warmup_steps, 1) // interval) * interval
-        return (step - first_step) // interval * self.algorithm.updates_per_step
+        return (step - first_step) // interval * self.algorithm.updates_per_interval
 
     def _act(self, carry: tuple, observation: jax.Array, step: jax.Array) -> jax.Array:
         return self.algorithm.act(carry[0], observation, self._keys(carry[3], step)[2], True)

@@ -259,7 +259,10 @@ def _restore_best_policies(run: RunDirectory, checkpoint: Checkpoint | None) -> 
 
 
 def _fixed(manifest: dict[str, Any]) -> dict[str, Any]:
-    return {name: manifest.get(name, _BEFORE_THERE_WERE.get(name)) for name in _FIXED}
+    fixed = {name: manifest.get(name, _BEFORE_THERE_WERE.get(name)) for name in _FIXED}
+    if "updates_per_step" in (hyperparameters := fixed["hyperparameters"] or {}):
+        fixed["hyperparameters"] = {"update_interval": 1, **hyperparameters}  # older runs all learnt in strict order
+    return fixed
 
 
 def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
