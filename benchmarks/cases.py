@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import sysconfig
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +13,7 @@ from report import Reach
 
 HERE = Path(__file__).resolve().parent
 PEERS_PYTHON = os.environ.get("PEERS_PYTHON") or str(HERE.parent / ".venv-peers" / "bin" / "python")
+PARL_PYTHON = os.environ.get("PARL_PYTHON") or str(HERE.parent / ".venv-parl" / "bin" / "python")
 
 SINGLE, SINGLE_ONE_CORE = "one seed, 2 cores", "one seed, 1 core"
 FIVE, FIVE_ONE_CORE = "five seeds, 2 cores", "five seeds, 1 core"
@@ -35,6 +38,10 @@ class Library(NamedTuple):
         """Return what the machine lacks to run it, in words, or nothing."""
         if not Path(self.python).exists():
             return "it is not installed; `make peers` does that, or says why not"
+        if self.engine == "torch.compile" and not shutil.which(os.environ.get("CXX") or "g++"):
+            return "torch.compile needs a C++ compiler: g++, or the one that CXX names"
+        if self.engine == "torch.compile" and not Path(sysconfig.get_path("include"), "Python.h").exists():
+            return "torch.compile needs Python's headers, Python.h (python3-dev)"
         return ""
 
 
@@ -42,6 +49,10 @@ LIBRARIES = {
     "csac": Library("csac_speed.py", sys.executable, "XLA"),
     "sbx": Library("peers/sb3_speed.py", PEERS_PYTHON, "XLA", ("--library=sbx",)),
     "sb3": Library("peers/sb3_speed.py", PEERS_PYTHON, "PyTorch", ("--library=sb3",)),
+    "eager": Library("peers/cleanrl_speed.py", PEERS_PYTHON, "PyTorch"),
+    "compiled": Library("peers/cleanrl_speed.py", PEERS_PYTHON, "torch.compile", ("--compile",)),
+    "tianshou": Library("peers/tianshou_speed.py", PEERS_PYTHON, "PyTorch"),
+    "parl": Library("peers/parl_speed.py", PARL_PYTHON, "Paddle"),
 }
 
 
@@ -78,6 +89,10 @@ CASES = [
     Case(SINGLE, "SBX SAC", "sbx", repeated=True),
     Case(SINGLE, "SB3 SAC", "sb3", repeated=True),
     Case(SINGLE, "csac CSAC", "csac", "csac", repeated=True),
+    Case(SINGLE, "CleanRL-style SAC", "eager"),
+    Case(SINGLE, "CleanRL-style SAC, compiled", "compiled"),
+    Case(SINGLE, "Tianshou SAC", "tianshou"),
+    Case(SINGLE, "PARL SAC", "parl", threads=1),  # with two it takes twice as long
     Case(FIVE, "csac SAC", "csac", seeds=5, repeated=True),
     Case(FIVE, "SBX SAC, two at a time", "sbx", together=2, repeated=True),
     Case(FIVE, "SB3 SAC, two at a time", "sb3", together=2),
@@ -86,6 +101,8 @@ CASES = [
     Case(SINGLE_ONE_CORE, "SBX SAC", "sbx", cores=1),
     Case(SINGLE_ONE_CORE, "SB3 SAC", "sb3", cores=1),
     Case(SINGLE_ONE_CORE, "csac CSAC", "csac", "csac", cores=1),
+    Case(SINGLE_ONE_CORE, "CleanRL-style SAC", "eager", cores=1),
+    Case(SINGLE_ONE_CORE, "CleanRL-style SAC, compiled", "compiled", cores=1),
     Case(FIVE_ONE_CORE, "csac SAC", "csac", seeds=5, cores=1),
     Case(EVALUATED, "csac SAC", "csac", evaluated=True),
     Case(EVALUATED, "SBX SAC", "sbx", evaluated=True),
@@ -94,6 +111,8 @@ CASES = [
     Case(TD3, "csac TD3", "csac", "td3", repeated=True),
     Case(TD3, "SBX TD3", "sbx", "td3", repeated=True),
     Case(TD3, "SB3 TD3", "sb3", "td3", repeated=True),
+    Case(TD3, "CleanRL-style TD3", "eager", "td3"),
+    Case(TD3, "Tianshou TD3", "tianshou", "td3"),
     Case(TD3, "csac SD3", "csac", "sd3"),
     Case(PPO, "csac PPO", "csac", "ppo", repeated=True),
     Case(PPO, "SBX PPO", "sbx", "ppo", repeated=True),

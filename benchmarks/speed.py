@@ -1,6 +1,6 @@
 """Measure csac against its peers: environment steps, each with its update, per second.
 
-    make bench                       # everything, sixteen minutes on a quiet machine; writes the table of README.md
+    make bench                       # everything, TODO minutes on a quiet machine; writes the table of README.md
     make bench ARGS=--quick          # does it run? Its numbers mean nothing and are only printed
 
 Every measurement is a process of its own, bound to its processors. README.md says how it is done and what was found.
@@ -21,7 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
-from cases import CASES, HERE, LIBRARIES, PEERS_PYTHON, REACHES, Case
+from cases import CASES, HERE, LIBRARIES, PARL_PYTHON, PEERS_PYTHON, REACHES, Case
 from report import Measurement, markdown, write_between_markers, write_csv
 
 if TYPE_CHECKING:
@@ -99,7 +99,8 @@ def command(case: Case, protocol: Protocol, cores: Sequence[int]) -> list[str]:
 
 
 def _launch(case: Case, protocol: Protocol, cores: Sequence[int], folder: str, errors: IO[str]) -> subprocess.Popen:
-    environment = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
+    # What torch.compile made for another measurement is not found: every start is a cold one.
+    environment = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "TORCHINDUCTOR_CACHE_DIR": folder}
     return subprocess.Popen(
         command(case, protocol, cores),
         stdin=subprocess.PIPE,
@@ -150,12 +151,14 @@ def describe_machine(measurements: Sequence[Measurement], protocol: Protocol) ->
         models = [line.partition(":")[2].strip() for line in file if line.startswith("model name")]
     loads = [m.other_load for m in measurements]
     packages = ("jax", "gymnasium", "mujoco", "numpy")
-    peers = ("stable_baselines3", "torch", "sbx-rl", "jax", "gymnasium", "mujoco", "numpy")
+    peers = ("stable_baselines3", "tianshou", "torch", "sbx-rl", "jax", "gymnasium", "mujoco", "numpy")
+    parl = ("parl", "paddlepaddle", "gymnasium", "mujoco", "numpy")
     return [
         f"processor: {models[0] if models else platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
         f"csac {version('csac')} at commit {_commit()}, Python {platform.python_version()}, "
         + ", ".join(f"{name} {version(name)}" for name in packages),
         f"peers: {_versions(PEERS_PYTHON, peers)}",
+        *([f"PARL apart from them: {_versions(PARL_PYTHON, parl)}"] if not LIBRARIES["parl"].lacks() else []),
         *(f"not measured: {line}" for line in lacking()),
         f"one-seed windows of {protocol.seconds:g} s and more, five-seed windows of {protocol.seconds_of_five:g} s; "
         f"repetitions: {protocol.repetitions} of the settings with a range, 1 of the others",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from argparse import Namespace
 from pathlib import Path
 
@@ -83,11 +84,20 @@ def test_the_scripts_understand_what_they_are_given(case: Case):
         (Case("", "", "csac", seeds=5), "XLA, 2 cores"),
         (Case("", "", "sbx", together=2), "XLA, 1 core each"),
         (Case("", "", "sb3", together=2), "PyTorch, 1 thread each"),
-        (Case("", "", "sb3", "ppo", threads=1), "PyTorch, 1 thread"),
+        (Case("", "", "compiled"), "torch.compile, 2 threads"),
+        (Case("", "", "parl", threads=1), "Paddle, 1 thread"),
     ],
 )
 def test_allowed(case: Case, allowed: str):
     assert case.allowed == allowed
+
+
+def test_a_machine_without_a_compiler_leaves_torch_compile_out(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+
+    assert "C++ compiler" in LIBRARIES["compiled"]._replace(python=sys.executable).lacks()
+    assert not LIBRARIES["eager"]._replace(python=sys.executable).lacks()
+    assert "make peers" in LIBRARIES["eager"]._replace(python="/no/such/python").lacks()
 
 
 def test_a_window_begins_once_settled_and_counts_its_steps(capsys):
