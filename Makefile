@@ -13,6 +13,7 @@ ARGS ?=
 
 SETUP := .venv/.installed
 PEERS := .venv-peers/.installed
+PARL := .venv-parl/.installed
 
 define require_python
 @test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
@@ -41,9 +42,9 @@ check: $(SETUP)  ## Check format, lint, types and the direction of imports
 	.venv/bin/pyright
 	.venv/bin/lint-imports --no-logo
 
-peers: $(PEERS)  ## Install stable-baselines3 and SBX into .venv-peers, to measure against
+peers: $(PEERS) $(PARL)  ## Install what to measure against: into .venv-peers, and PARL into .venv-parl
 
-bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS))  ## Measure speed beside the peers, 20 minutes: make bench ARGS=--quick
+bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS)) $(if $(PARL_PYTHON),,$(PARL))  ## Measure speed beside the peers, 20 minutes: make bench ARGS=--quick
 	.venv/bin/python benchmarks/speed.py --out benchmarks $(ARGS)
 
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml
@@ -67,6 +68,14 @@ $(PEERS): benchmarks/requirements-peers.txt
 	@test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
 	@.venv-peers/bin/python -m pip install --quiet --requirement $<
 	@touch $@
+
+# PARL's own list of dependencies cannot be installed: benchmarks/requirements-parl.txt is complete, and says why.
+$(PARL): benchmarks/requirements-parl.txt
+	$(require_python)
+	@echo "Installing PARL into .venv-parl"
+	@test -x .venv-parl/bin/python || $(PYTHON) -m venv .venv-parl
+	@if .venv-parl/bin/python -m pip install --quiet --no-deps --requirement $<; then touch $@; \
+		else echo "PARL cannot be installed here; the benchmark leaves it out"; fi
 
 .tools/bin/uv:
 	$(require_python)

@@ -1,6 +1,6 @@
 """One measurement of csac, in a process of its own: `csac.train`, timed from outside by its reporter.
 
-`speed.py` runs this; it prints one line of JSON. The two scripts that measure take the same arguments.
+`speed.py` runs this; it prints one line of JSON. The scripts of the peers take the same arguments.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from csac.presets import hyperparameters
 from csac.training.progress import Reporter
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
 STEPS = 1_000_000  # never reached: it sizes the replay as the paper has it
 SLACK = 0.02  # of an update interval, by which a window may differ from a whole number of them
@@ -89,13 +89,12 @@ def _peak_kib(process: int) -> int:
         return next(int(line.split()[1]) for line in file if line.startswith("VmHWM:"))
 
 
-def parse() -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Return the arguments that `speed.py` gives."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--algorithm", choices=ALGORITHMS, required=True)
     parser.add_argument("--task", required=True)
     parser.add_argument("--seeds", type=int, required=True)
-    parser.add_argument("--cores", required=True, help="processors to run on, such as 0,1")
     parser.add_argument("--launched", type=float, required=True, help="time.monotonic() when this process was started")
     parser.add_argument("--warmup", type=int, required=True, help="uniform random steps before the first update")
     parser.add_argument("--settled", type=int, required=True, help="steps of each seed before the window begins")
@@ -103,13 +102,12 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, required=True, help="the window has at least so many steps")
     parser.add_argument("--evaluation-interval", type=int, required=True, help="0 for no evaluation")
     parser.add_argument("--evaluation-episodes", type=int, required=True)
-    return parser.parse_args()
+    return parser.parse_args(arguments)
 
 
 def main() -> None:
     """Train until the window is over and print what was measured."""
     arguments = parse()
-    os.sched_setaffinity(0, [int(core) for core in arguments.cores.split(",")])
     paper = hyperparameters("paper", arguments.algorithm, arguments.task)
     algorithm = ALGORITHMS[arguments.algorithm](**paper)
     if algorithm.warmup_steps:

@@ -19,6 +19,7 @@ class Measurement(NamedTuple):
     repetition: int
     setting: str
     contender: str
+    allowed: str  # what does its arithmetic, and on how many cores or threads
     steps_per_second: float  # environment steps, each with its update, of all seeds together
     steps: int
     seconds: float
@@ -91,13 +92,15 @@ def _measured(measurements: Sequence[Measurement]) -> str:
             [
                 setting,
                 contender,
+                mine[0].allowed,
                 _with_range(speeds, ".0f"),
                 _with_range(against, ".2f") if against and contender != first else "",
                 f"{statistics.median(m.start_seconds for m in mine):.1f}",
                 f"{max(m.peak_mib for m in mine):.0f}",
             ]
         )
-    return _table(["setting", "", "steps/s", "the setting's first / this", "start, s", "peak memory, MiB"], rows)
+    head = ["setting", "", "allowed", "steps/s", "the setting's first / this", "start, s", "peak memory, MiB"]
+    return _table(head, rows)
 
 
 def _with_range(values: Sequence[float], form: str) -> str:

@@ -1,6 +1,6 @@
-"""Measure csac against stable-baselines3 and SBX: environment steps, each with its update, per second.
+"""Measure csac against its peers: environment steps, each with its update, per second.
 
-    make bench                       # everything, sixteen minutes on a quiet machine; writes the table of README.md
+    make bench                       # everything, TODO minutes on a quiet machine; writes the table of README.md
     make bench ARGS=--quick          # does it run? Its numbers mean nothing and are only printed
 
 Every measurement is a process of its own, bound to its processors. README.md says how it is done and what was found.
@@ -21,73 +21,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
-from report import Measurement, Reach, markdown, write_between_markers, write_csv
+from cases import CASES, HERE, LIBRARIES, PARL_PYTHON, PEERS_PYTHON, REACHES, Case
+from report import Measurement, markdown, write_between_markers, write_csv
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-HERE = Path(__file__).resolve().parent
-PEERS_PYTHON = os.environ.get("PEERS_PYTHON") or str(HERE.parent / ".venv-peers" / "bin" / "python")
 TASK = "HalfCheetah-v4"
-
-SINGLE, SINGLE_ONE_CORE = "one seed, 2 cores", "one seed, 1 core"
-FIVE, FIVE_ONE_CORE = "five seeds, 2 cores", "five seeds, 1 core"
-EVALUATED = "one seed, 2 cores, evaluation on"
-TD3, PPO = "TD3, one seed, 2 cores", "PPO, one seed, 2 cores"
 ROLLOUT_STEPS = 2048  # of PPO: its first update is at this step
-
-
-class Case(NamedTuple):
-    """One contender in one setting. The first of a setting is what the others are compared with."""
-
-    setting: str
-    contender: str
-    library: str  # csac, sbx or sb3
-    algorithm: str = "sac"
-    seeds: int = 1
-    cores: int = 2
-    together: int = 1  # processes side by side, the cores divided among them
-    threads: int = 0  # of PyTorch, 0 for one on each core
-    evaluated: bool = False
-    repeated: bool = False  # measured in every repetition, and not only in the first
-
-
-CASES = [
-    Case(SINGLE, "csac SAC", "csac", repeated=True),
-    Case(SINGLE, "SBX SAC", "sbx", repeated=True),
-    Case(SINGLE, "SB3 SAC", "sb3", repeated=True),
-    Case(SINGLE, "csac CSAC", "csac", "csac", repeated=True),
-    Case(FIVE, "csac SAC", "csac", seeds=5, repeated=True),
-    Case(FIVE, "SBX SAC, two at a time", "sbx", together=2, repeated=True),
-    Case(FIVE, "SB3 SAC, two at a time", "sb3", together=2),
-    Case(FIVE, "csac CSAC", "csac", "csac", seeds=5),
-    Case(SINGLE_ONE_CORE, "csac SAC", "csac", cores=1),
-    Case(SINGLE_ONE_CORE, "SBX SAC", "sbx", cores=1),
-    Case(SINGLE_ONE_CORE, "SB3 SAC", "sb3", cores=1),
-    Case(SINGLE_ONE_CORE, "csac CSAC", "csac", "csac", cores=1),
-    Case(FIVE_ONE_CORE, "csac SAC", "csac", seeds=5, cores=1),
-    Case(EVALUATED, "csac SAC", "csac", evaluated=True),
-    Case(EVALUATED, "SBX SAC", "sbx", evaluated=True),
-    Case(EVALUATED, "SB3 SAC", "sb3", evaluated=True),
-    Case(EVALUATED, "csac CSAC", "csac", "csac", evaluated=True),
-    Case(TD3, "csac TD3", "csac", "td3", repeated=True),
-    Case(TD3, "SBX TD3", "sbx", "td3", repeated=True),
-    Case(TD3, "SB3 TD3", "sb3", "td3", repeated=True),
-    Case(TD3, "csac SD3", "csac", "sd3"),
-    Case(PPO, "csac PPO", "csac", "ppo", repeated=True),
-    Case(PPO, "SBX PPO", "sbx", "ppo", repeated=True),
-    Case(PPO, "SB3 PPO", "sb3", "ppo", repeated=True),
-    Case(PPO, "SB3 PPO, 1 thread", "sb3", "ppo", threads=1, repeated=True),
-]
-
-REACHES = [
-    Reach(SINGLE, "csac SAC", "SBX SAC", 1.4),
-    Reach(SINGLE, "csac SAC", "SB3 SAC", 2.7),
-    Reach(FIVE, "csac SAC", "SBX SAC, two at a time", 1.25),
-    Reach(TD3, "csac TD3", "SBX TD3", 1.3),
-    Reach(PPO, "csac PPO", "SB3 PPO", 3.0),
-    Reach(PPO, "csac PPO", "SB3 PPO, 1 thread", 3.0),
-]
 
 
 class Protocol(NamedTuple):
@@ -124,6 +65,7 @@ def measure(case: Case, repetition: int, protocol: Protocol) -> Measurement:
         repetition=repetition,
         setting=case.setting,
         contender=case.contender,
+        allowed=case.allowed,
         steps_per_second=sum(result["steps_per_second"] for result in results),
         steps=sum(result["steps"] for result in results),
         seconds=max(result["seconds"] for result in results),
@@ -133,14 +75,13 @@ def measure(case: Case, repetition: int, protocol: Protocol) -> Measurement:
     )
 
 
-def _launch(case: Case, protocol: Protocol, cores: Sequence[int], folder: str, errors: IO[str]) -> subprocess.Popen:
-    ours = case.library == "csac"
-    script = HERE / "csac_speed.py" if ours else HERE / "peers" / "speed.py"
+def command(case: Case, protocol: Protocol, cores: Sequence[int]) -> list[str]:
+    """Return how one process of the case is started, bound to these cores."""
+    library = LIBRARIES[case.library]
     arguments = {
         "algorithm": case.algorithm,
         "task": TASK,
         "seeds": case.seeds,
-        "cores": ",".join(map(str, cores)),
         "launched": time.monotonic(),
         "warmup": ROLLOUT_STEPS if case.algorithm == "ppo" else protocol.warmup,
         "settled": ROLLOUT_STEPS if case.algorithm == "ppo" else protocol.settled,
@@ -149,18 +90,25 @@ def _launch(case: Case, protocol: Protocol, cores: Sequence[int], folder: str, e
         "evaluation-interval": protocol.evaluation_interval if case.evaluated else 0,
         "evaluation-episodes": protocol.evaluation_episodes,
     }
-    if not ours:
-        arguments |= {"library": case.library, "threads": case.threads or len(cores)}
-    command = [sys.executable if ours else PEERS_PYTHON, str(script)]
-    command += [f"--{name}={value}" for name, value in arguments.items()]
+    if library.has_threads:
+        arguments["threads"] = case.threads_each
+    # The cores come first, for XLA and others look only once which they have.
+    bound = ["taskset", "--cpu-list", ",".join(map(str, cores)), library.python, str(HERE / library.script)]
+    options = [f"--{name}={value}" for name, value in arguments.items()]
+    return [*bound, *options, *library.options, *["--together"] * (case.together > 1)]
+
+
+def _launch(case: Case, protocol: Protocol, cores: Sequence[int], folder: str, errors: IO[str]) -> subprocess.Popen:
+    # What torch.compile made for another measurement is not found: every start is a cold one.
+    environment = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "TORCHINDUCTOR_CACHE_DIR": folder}
     return subprocess.Popen(
-        command + ["--together"] * (case.together > 1),
+        command(case, protocol, cores),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=errors,
         text=True,
         cwd=folder,
-        env={**os.environ, "JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""},
+        env={**os.environ, **environment},
     )
 
 
@@ -203,12 +151,15 @@ def describe_machine(measurements: Sequence[Measurement], protocol: Protocol) ->
         models = [line.partition(":")[2].strip() for line in file if line.startswith("model name")]
     loads = [m.other_load for m in measurements]
     packages = ("jax", "gymnasium", "mujoco", "numpy")
-    peers = ("stable_baselines3", "torch", "sbx-rl", "jax", "gymnasium", "mujoco", "numpy")
+    peers = ("stable_baselines3", "tianshou", "torch", "sbx-rl", "jax", "gymnasium", "mujoco", "numpy")
+    parl = ("parl", "paddlepaddle", "gymnasium", "mujoco", "numpy")
     return [
         f"processor: {models[0] if models else platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
         f"csac {version('csac')} at commit {_commit()}, Python {platform.python_version()}, "
         + ", ".join(f"{name} {version(name)}" for name in packages),
-        f"peers: {_peers_versions(peers)}",
+        f"peers: {_versions(PEERS_PYTHON, peers)}",
+        *([f"PARL apart from them: {_versions(PARL_PYTHON, parl)}"] if not LIBRARIES["parl"].lacks() else []),
+        *(f"not measured: {line}" for line in lacking()),
         f"one-seed windows of {protocol.seconds:g} s and more, five-seed windows of {protocol.seconds_of_five:g} s; "
         f"repetitions: {protocol.repetitions} of the settings with a range, 1 of the others",
         f"other programs kept {sum(loads) / len(loads):.2f} cores busy on average, {max(loads):.2f} at most"
@@ -216,9 +167,9 @@ def describe_machine(measurements: Sequence[Measurement], protocol: Protocol) ->
     ]
 
 
-def _peers_versions(packages: Sequence[str]) -> str:
+def _versions(python: str, packages: Sequence[str]) -> str:
     code = "import sys, importlib.metadata as m; print(', '.join(f'{n} {m.version(n)}' for n in sys.argv[1:]))"
-    result = subprocess.run([PEERS_PYTHON, "-c", code, *packages], capture_output=True, text=True, check=True)
+    result = subprocess.run([python, "-c", code, *packages], capture_output=True, text=True, check=True)
     return result.stdout.strip()
 
 
@@ -232,9 +183,16 @@ def _commit() -> str:
     return f"{commit} with changes" if changed else commit
 
 
+def lacking() -> list[str]:
+    """Return a line for each contender that this machine cannot run."""
+    reasons = {case.contender: LIBRARIES[case.library].lacks() for case in CASES}
+    return [f"{contender}: {reason}" for contender, reason in reasons.items() if reason]
+
+
 def run(protocol: Protocol, only: str) -> list[Measurement]:
     """Measure the contenders in turns, A B C A B C, and say what comes out."""
-    chosen = [case for case in CASES if only in f"{case.setting}: {case.contender}"]
+    able = [case for case in CASES if not LIBRARIES[case.library].lacks()]
+    chosen = [case for case in able if only in f"{case.setting}: {case.contender}"]
     plan = [(r, case) for r in range(protocol.repetitions) for case in chosen if case.repeated or r == 0]
     measurements = []
     for number, (repetition, case) in enumerate(plan, start=1):
@@ -263,6 +221,8 @@ def main() -> None:
         sys.exit(f"there is no {PEERS_PYTHON}: run `make peers` first")
 
     protocol = QUICK if arguments.quick else Protocol(repetitions=arguments.repetitions)
+    for line in lacking():
+        print(f"not measured: {line}", flush=True)
     began = time.monotonic()
     measurements = run(protocol, arguments.only)
     if not measurements:

@@ -1,19 +1,25 @@
-"""The peers' SAC, TD3 and PPO at the settings of csac's presets `paper`, for the scripts beside this one."""
+"""SB3's and SBX's SAC, TD3 and PPO at the settings of csac's presets `paper`, for the scripts beside this one."""
 
 from importlib import import_module
 
+import settings
+
 OFF_POLICY = {
-    "learning_rate": 3e-4,
-    "buffer_size": 1_000_000,
-    "batch_size": 256,
-    "tau": 0.005,
-    "gamma": 0.99,
+    "learning_rate": settings.LEARNING_RATE,
+    "buffer_size": settings.REPLAY_SIZE,
+    "batch_size": settings.BATCH_SIZE,
+    "tau": settings.TARGET_RATE,
+    "gamma": settings.DISCOUNT,
     "train_freq": 1,
     "gradient_steps": 1,
-    "policy_kwargs": {"net_arch": [256, 256]},
+    "policy_kwargs": {"net_arch": list(settings.HIDDEN_SIZES)},
 }
-TD3 = {**OFF_POLICY, "policy_delay": 2, "target_policy_noise": 0.2, "target_noise_clip": 0.5}
-TD3_EXPLORATION_NOISE = 0.1
+TD3 = {
+    **OFF_POLICY,
+    "policy_delay": settings.TD3_POLICY_DELAY,
+    "target_policy_noise": settings.TD3_TARGET_NOISE,
+    "target_noise_clip": settings.TD3_TARGET_NOISE_LIMIT,
+}
 PPO = {
     # The last rollout ends after the last step, where the line would be below zero.
     "learning_rate": lambda progress_remaining: 3e-4 * max(progress_remaining, 0.0),
@@ -32,7 +38,7 @@ PPO = {
 SCALES = {"norm_obs": True, "norm_reward": True, "clip_obs": 10.0, "clip_reward": 10.0, "gamma": 0.99}
 
 
-def make_model(library, algorithm, task, seed, learning_starts, entropy_weight="0.2"):
+def make_model(library, algorithm, task, seed, learning_starts, entropy_weight=settings.SAC_ENTROPY_WEIGHT):
     """Return the model: `library` is sb3 or sbx, `algorithm` sac, td3 or ppo; an `auto` entropy weight begins at 1."""
     module = import_module({"sb3": "stable_baselines3", "sbx": "sbx"}[library])
     common = {"seed": seed, "device": "cpu"}
@@ -55,7 +61,7 @@ def _noise(shape):
     import numpy as np
     from stable_baselines3.common.noise import NormalActionNoise
 
-    return NormalActionNoise(np.zeros(shape), np.full(shape, TD3_EXPLORATION_NOISE))
+    return NormalActionNoise(np.zeros(shape), np.full(shape, settings.TD3_EXPLORATION_NOISE))
 
 
 def _scaled(task):
