@@ -47,6 +47,12 @@ peers: $(PEERS) $(PARL)  ## Install what to measure against: into .venv-peers, a
 bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS)) $(if $(PARL_PYTHON),,$(PARL))  ## Measure speed beside the peers, 20 minutes: make bench ARGS=--quick
 	.venv/bin/python benchmarks/speed.py --out benchmarks $(ARGS)
 
+roofline: $(SETUP)  ## Measure how near training comes to the machine's limit, 25 minutes: make roofline ARGS='--repetitions 1'
+	.venv/bin/python benchmarks/roofline.py --out benchmarks --page docs/performance.md $(ARGS)
+
+scaling: $(SETUP)  ## Measure what seeds, widths, batches, observations and replays cost, 15 minutes
+	.venv/bin/python benchmarks/scaling.py --out benchmarks --page docs/performance.md $(ARGS)
+
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml
 	$(UV) pip compile pyproject.toml --extra robots --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
 		--no-emit-index-url --no-annotate --no-header --quiet --output-file requirements.lock

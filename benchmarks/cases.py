@@ -67,6 +67,8 @@ class Case(NamedTuple):
     cores: int = 2
     together: int = 1  # processes side by side, the cores divided among them
     threads: int = 0  # of a library that is told, 0 for one on each core
+    interval: int = 1  # of csac: environment steps, and their updates, in one dispatch
+    device: str = "cpu"  # of csac
     evaluated: bool = False
     repeated: bool = False  # measured in every repetition, and not only in the first
 

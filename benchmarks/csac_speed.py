@@ -102,6 +102,8 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--steps", type=int, required=True, help="the window has at least so many steps")
     parser.add_argument("--evaluation-interval", type=int, required=True, help="0 for no evaluation")
     parser.add_argument("--evaluation-episodes", type=int, required=True)
+    parser.add_argument("--interval", type=int, required=True, help="environment steps, and updates, in one dispatch")
+    parser.add_argument("--device", choices=("cpu", "gpu"), required=True)
     return parser.parse_args(arguments)
 
 
@@ -111,7 +113,7 @@ def main() -> None:
     paper = hyperparameters("paper", arguments.algorithm, arguments.task)
     algorithm = ALGORITHMS[arguments.algorithm](**paper)
     if algorithm.warmup_steps:
-        algorithm = dataclasses.replace(algorithm, warmup_steps=arguments.warmup)
+        algorithm = dataclasses.replace(algorithm, warmup_steps=arguments.warmup, update_interval=arguments.interval)
     clock = Clock(arguments, algorithm.update_interval)
     try:
         train(
@@ -120,6 +122,7 @@ def main() -> None:
             steps=STEPS,
             seeds=arguments.seeds,
             directory="run",
+            device=arguments.device,
             groups=None,
             evaluation_interval=arguments.evaluation_interval or STEPS,
             evaluation_episodes=arguments.evaluation_episodes,

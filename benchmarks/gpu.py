@@ -4,8 +4,8 @@
     python benchmarks/gpu.py --out benchmarks           # ten minutes on one GPU; writes gpu.csv
     python benchmarks/gpu.py --device cpu --quick       # does it run, without a GPU?
 
-What runs is `csac.train` on HalfCheetah-v4 with evaluation off, at the paper's settings: all seeds in one program, the replay
-on the device, one dispatch for each environment step of all seeds, or for ten.
+What runs is `csac.train` on HalfCheetah-v4 with evaluation off, at the paper's settings: all seeds in one program, the
+replay on the device, one dispatch for each environment step of all seeds, or for ten.
 """
 
 from __future__ import annotations

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import csv
 import statistics
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
-
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
 
 class Measurement(NamedTuple):
@@ -52,23 +50,24 @@ def markdown(measurements: Sequence[Measurement], reaches: Sequence[Reach], mach
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def write_csv(path: Path, measurements: Sequence[Measurement]) -> None:
-    """Write one row for each measurement, in the order in which they were made."""
+def write_csv(path: Path, measurements: Sequence[Any]) -> None:
+    """Write one row for each measurement, a named tuple, in the order in which they were made."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(Measurement._fields)
+        writer.writerow(measurements[0]._fields)
         for measurement in measurements:
             writer.writerow([f"{value:.4g}" if isinstance(value, float) else value for value in measurement])
 
 
-def write_between_markers(path: Path, text: str) -> None:
-    """Replace what stands between the markers of the Markdown file `path`, which is made if there is none."""
-    before = path.read_text() if path.exists() else f"{BEGIN}\n{END}\n"
-    head, begin, rest = before.partition(BEGIN)
-    _, end, tail = rest.partition(END)
+def write_between_markers(path: Path, text: str, name: str = "measured") -> None:
+    """Replace what stands between the markers `name` of the Markdown file `path`, which is made if there is none."""
+    start, stop = (f"<!-- {name}: {end} -->" for end in ("begin", "end"))
+    before = path.read_text() if path.exists() else f"{start}\n{stop}\n"
+    head, begin, rest = before.partition(start)
+    _, end, tail = rest.partition(stop)
     if not (begin and end):
-        raise SystemExit(f"{path} lacks the lines {BEGIN} and {END}, between which the table goes")
-    path.write_text(f"{head}{BEGIN}\n{text}{END}{tail}")
+        raise SystemExit(f"{path} lacks the lines {start} and {stop}, between which the table goes")
+    path.write_text(f"{head}{start}\n{text}{stop}{tail}")
 
 
 def _reached(measurements: Sequence[Measurement], reaches: Sequence[Reach]) -> str:
@@ -78,7 +77,7 @@ def _reached(measurements: Sequence[Measurement], reaches: Sequence[Reach]) -> s
             ratio = statistics.median(found)
             verdict = "yes" if ratio >= wanted else "**no**"
             rows.append([setting, f"{contender} / {peer}", f">= {wanted}", _with_range(found, ".2f"), verdict])
-    return _table(["setting", "ratio of steps/s", "to reach", "measured", "reached"], rows) if rows else ""
+    return table(["setting", "ratio of steps/s", "to reach", "measured", "reached"], rows) if rows else ""
 
 
 def _measured(measurements: Sequence[Measurement]) -> str:
@@ -100,7 +99,7 @@ def _measured(measurements: Sequence[Measurement]) -> str:
             ]
         )
     head = ["setting", "", "allowed", "steps/s", "the setting's first / this", "start, s", "peak memory, MiB"]
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def _with_range(values: Sequence[float], form: str) -> str:
@@ -108,6 +107,7 @@ def _with_range(values: Sequence[float], form: str) -> str:
     return f"{median} ({min(values):{form}} to {max(values):{form}})" if len(values) > 1 else median
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -19,9 +19,10 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
+from cases import Case
 from products import Product, operations, update_products
 from report import table, write_between_markers, write_csv
-from speed import Case, Protocol, describe_processor, measure
+from speed import Protocol, describe_processor, measure
 
 HERE = Path(__file__).resolve().parent
 DOMINANT = Product(256, 256, 256)
@@ -90,10 +91,10 @@ def one_core_rate() -> float:
 def product_rates(sizes: list[Product], groups: list[list[int]], seconds: float = 1.0) -> list[dict[Product, float]]:
     """Return operations per second of each size in each of several processes, side by side on these processors."""
     names = [",".join(map(str, size)) for size in sizes]
+    command = [sys.executable, str(HERE / "products.py"), "--seconds", str(seconds)]
     processes = [
         subprocess.Popen(
-            [sys.executable, HERE / "products.py", "--cores", ",".join(map(str, cores)), "--seconds", str(seconds)]
-            + names,
+            [*command, "--cores", ",".join(map(str, cores)), *names],
             stdout=subprocess.PIPE,
             text=True,
             env={**os.environ, "JAX_PLATFORMS": "cpu"},
@@ -194,11 +195,8 @@ def main() -> None:
             rate, before = (before + after) / 2, after
             measured = Measured(repetition, setting.name, setting.algorithm, setting.cores, speed, cost, rate)
             measurements.append(measured)
-            print(
-                f"{setting.name}, {setting.algorithm}: {speed:.1f} updates/s, {100 * measured.share:.0f} % of the limit "
-                f"(one core {rate:.0f} x 10^9 operations/s)",
-                flush=True,
-            )
+            share = f"{100 * measured.share:.0f} % of the limit (one core {rate:.0f} x 10^9 operations/s)"
+            print(f"{setting.name}, {setting.algorithm}: {speed:.1f} updates/s, {share}", flush=True)
     text = report(measurements, product_rows(), describe_processor())
     print(f"\n{text}")
     if arguments.out:

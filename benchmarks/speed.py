@@ -92,6 +92,8 @@ def command(case: Case, protocol: Protocol, cores: Sequence[int]) -> list[str]:
     }
     if library.has_threads:
         arguments["threads"] = case.threads_each
+    if case.library == "csac":
+        arguments |= {"interval": case.interval, "device": case.device}
     # The cores come first, for XLA and others look only once which they have.
     bound = ["taskset", "--cpu-list", ",".join(map(str, cores)), library.python, str(HERE / library.script)]
     options = [f"--{name}={value}" for name, value in arguments.items()]
@@ -100,7 +102,9 @@ def command(case: Case, protocol: Protocol, cores: Sequence[int]) -> list[str]:
 
 def _launch(case: Case, protocol: Protocol, cores: Sequence[int], folder: str, errors: IO[str]) -> subprocess.Popen:
     # What torch.compile made for another measurement is not found: every start is a cold one.
-    environment = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "TORCHINDUCTOR_CACHE_DIR": folder}
+    environment = {"TORCHINDUCTOR_CACHE_DIR": folder}
+    if case.device == "cpu":
+        environment |= {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
     return subprocess.Popen(
         command(case, protocol, cores),
         stdin=subprocess.PIPE,
@@ -147,14 +151,12 @@ def _own_seconds() -> float:
 
 def describe_machine(measurements: Sequence[Measurement], protocol: Protocol) -> list[str]:
     """Return what the numbers depend on, one line each."""
-    with open("/proc/cpuinfo") as file:
-        models = [line.partition(":")[2].strip() for line in file if line.startswith("model name")]
     loads = [m.other_load for m in measurements]
     packages = ("jax", "gymnasium", "mujoco", "numpy")
     peers = ("stable_baselines3", "tianshou", "torch", "sbx-rl", "jax", "gymnasium", "mujoco", "numpy")
     parl = ("parl", "paddlepaddle", "gymnasium", "mujoco", "numpy")
     return [
-        f"processor: {models[0] if models else platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
+        describe_processor(),
         f"csac {version('csac')} at commit {_commit()}, Python {platform.python_version()}, "
         + ", ".join(f"{name} {version(name)}" for name in packages),
         f"peers: {_versions(PEERS_PYTHON, peers)}",
@@ -165,6 +167,13 @@ def describe_machine(measurements: Sequence[Measurement], protocol: Protocol) ->
         f"other programs kept {sum(loads) / len(loads):.2f} cores busy on average, {max(loads):.2f} at most"
         + (": **not a quiet machine**" if max(loads) > 0.2 else ""),
     ]
+
+
+def describe_processor() -> str:
+    """Return what the machine is, in words."""
+    with open("/proc/cpuinfo") as file:
+        models = [line.partition(":")[2].strip() for line in file if line.startswith("model name")]
+    return f"processor: {models[0] if models else platform.machine()}, {os.cpu_count()} cores, {platform.system()}"
 
 
 def _versions(python: str, packages: Sequence[str]) -> str:

@@ -41,11 +41,7 @@ class Driver:
         self.actions = np.zeros((seeds, action_size), np.float32)
         none = np.zeros(seeds, bool)
         reward = np.zeros(seeds, np.float32)
-        self.outcome = Steps(
-            **{name: [] for name in Steps._fields}
-            | {"observation": self.observations, "next_observation": self.observations, "reward": reward}
-            | {"terminated": none, "truncated": none}
-        )
+        self.outcome = Steps(self.observations, reward, none, none, self.observations, [], [])
 
     def run(self, seconds: float) -> float:
         """Make whole intervals for at least so long, and return environment steps per second."""

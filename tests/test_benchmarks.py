@@ -11,7 +11,8 @@ import csac_speed
 import pytest
 from cases import CASES, HERE, LIBRARIES, REACHES, Case
 from measuring import Window, argument_parser, parse
-from report import BEGIN, END, Measurement, markdown, ratios, write_between_markers
+from products import Network, Product, operations, update_products
+from report import Measurement, markdown, ratios, write_between_markers
 from speed import Protocol, command
 
 
@@ -34,7 +35,7 @@ def test_a_ratio_is_of_one_repetition():
 
 def test_the_table_says_what_each_was_allowed(tmp_path):
     path = tmp_path / "README.md"
-    path.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    path.write_text("before\n<!-- measured: begin -->\nold\n<!-- measured: end -->\nafter\n")
 
     write_between_markers(path, markdown(MEASURED, [], ["a machine"]))
 
@@ -119,3 +120,31 @@ def test_a_peer_that_cannot_evaluate_says_so(capsys):
 
     assert stopped.value.code == 2
     assert "without evaluation" in capsys.readouterr().err
+
+
+def test_the_products_of_a_small_network_by_hand():
+    network = Network((3, 5, 2))
+    assert network.forward(7) == {Product(7, 3, 5): 1, Product(7, 5, 2): 1}
+    assert network.weight_gradient(7) == {Product(3, 7, 5): 1, Product(5, 7, 2): 1}
+    assert network.input_gradient(7) == {Product(7, 2, 5): 1}  # the network's own inputs are data
+    assert network.input_gradient(7, 1) == {Product(7, 2, 5): 1, Product(7, 5, 1): 1}
+    assert operations(dict(network.forward(7))) == 2 * 7 * (3 * 5 + 5 * 2)
+
+
+@pytest.mark.parametrize(("algorithm", "hidden"), [("csac", 18), ("sac", 16), ("td3", 11.5)])
+def test_the_products_of_an_update(algorithm, hidden):
+    # By hand, in hidden products of one network: forward 1, learning 3, a gradient through a critic 2.
+    # CSAC: target 1 + 1 + 2, critics 3 + 3, actor 3 + 1 + 2 + 2. SAC has no reference, twice 1.
+    # TD3: target 1 + 2, critics 3 + 3, and every other time actor 3 and one critic 2.
+    counts = update_products(algorithm)
+    assert counts[Product(256, 256, 256)] == hidden
+    assert 1 < operations(counts) / (hidden * Product(256, 256, 256).operations) < 1.1  # the edges are small
+
+
+def test_a_table_goes_between_its_own_markers(tmp_path):
+    path = tmp_path / "page.md"
+    path.write_text("<!-- a: begin -->\n<!-- a: end -->\n<!-- b: begin -->\nold\n<!-- b: end -->\n")
+    write_between_markers(path, "new\n", "b")
+    assert path.read_text() == "<!-- a: begin -->\n<!-- a: end -->\n<!-- b: begin -->\nnew\n<!-- b: end -->\n"
+    with pytest.raises(SystemExit, match="lacks the lines <!-- c: begin -->"):
+        write_between_markers(path, "new\n", "c")
