@@ -19,7 +19,7 @@ define require_python
 @test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
 endef
 
-.PHONY: help setup train test chaos check lock clean peers bench
+.PHONY: help setup train test chaos check lock clean peers bench roofline scaling
 
 help:  ## List the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
