@@ -10,6 +10,7 @@ import numpy as np
 
 from csac.algorithms.memory import pack, row_width
 from csac.training.checkpoint import Ring
+from csac.training.compilation import keep_programs
 from csac.training.snapshots import Snapshot
 from csac.types import InputError, PolicyNetwork, Transition
 
@@ -34,6 +35,7 @@ class Learner:
         self._metrics: list[str] = []
         self._updates_summed = 0
         self._waiting = np.zeros((len(seeds), algorithm.update_interval, row_width(spec)), np.float32)
+        keep_programs()
         keys = np.stack([np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds])
         begin = jax.jit(lambda key: self._begin(key, steps))
         carry = begin(keys[0]) if self._is_alone else jax.vmap(begin)(keys)
