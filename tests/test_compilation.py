@@ -102,6 +102,17 @@ def test_a_home_that_cannot_be_written_costs_a_note_and_nothing_else(tmp_path, c
     assert jax.config.jax_compilation_cache_dir is None
 
 
+def test_without_a_home_nothing_is_kept(tmp_path, choices, monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as Python does for a user that nobody knows
+    monkeypatch.chdir(tmp_path)
+
+    assert compilation.tidy_programs() == (
+        "note: compiled programs cannot be kept for the next run (there is no home directory)"
+    )
+    assert not list(tmp_path.iterdir())
+
+
 def test_broken_programs_are_removed_before_a_run(tmp_path, choices):
     folder = tmp_path / "csac" / "programs" / "some-2"
     folder.mkdir(parents=True)

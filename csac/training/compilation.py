@@ -73,6 +73,8 @@ def _home() -> Path:
 def _make_home() -> Path:
     """Return the folder of all programs. Raises OSError where nothing can be written there."""
     home = _home()
+    if not home.is_absolute():
+        raise FileNotFoundError("there is no home directory")
     home.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=home):
         return home
