@@ -36,9 +36,12 @@ def table(runs: list[tuple[str, np.ndarray]]) -> str:
         first = mean if first is None else first
         best, step = maximum_average_return(rows)
         spread = last.std(ddof=1) if len(last) > 1 else float("nan")
+        form = ".0f" if abs(mean) >= 20 else ".2f"
+        ratio = f"{mean / first:.2f}" if first > 0 else ""  # of costs, it would be the larger the worse
         lines.append(
-            f"| {label} | {len(last)} | {rows['step'].max():,} | {mean:.0f} ± {spread:.0f} | {low:.0f} to {high:.0f} "
-            f"| {mean / first:.2f} | {best:.0f} at {step:,} |" + f" {success(rows)} |" * tells
+            f"| {label} | {len(last)} | {rows['step'].max():,} | {mean:{form}} ± {spread:{form}} "
+            f"| {low:{form}} to {high:{form}} | {ratio} | {best:{form}} at {step:,} |"
+            + f" {success(rows)} |" * tells
         )
     return "\n".join(lines)
 

@@ -1,8 +1,13 @@
 """Before anything imports JAX: small processes, and a broadcast that raises the rank is an error."""
 
 import os
+import tempfile
 
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 os.environ["JAX_PLATFORMS"] = "cpu"
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[threads] = "1"
+
+# Compiled programs are kept for the length of the tests, and not among the user's own.
+_CACHE = tempfile.TemporaryDirectory()
+os.environ["XDG_CACHE_HOME"] = _CACHE.name

@@ -30,6 +30,18 @@ def test_what_needs_no_learning_imports_no_jax(arguments):
     assert not {"jax", "equinox", "optax"} & modules_after(code)
 
 
+def test_the_help_of_train_imports_no_task_and_no_picture():
+    code = "import csac.cli\nassert csac.cli.main(['train', '--help']) == 0"
+
+    assert not {"gymnasium", "mujoco", "matplotlib", "scipy", "tensorboardX"} & modules_after(code)
+
+
+def test_what_only_the_end_of_a_run_needs_is_not_imported_at_its_start():
+    code = "import csac.training.train, csac.training.progress, csac.training.groups"
+
+    assert not {"matplotlib", "scipy", "tensorboardX", "imageio_ffmpeg"} & modules_after(code)
+
+
 @pytest.mark.parametrize("name", csac.__all__)
 def test_public_names_resolve(name):
     assert getattr(csac, name) is not None

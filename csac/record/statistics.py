@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy import special
 
 from csac.types import InputError
 
@@ -68,6 +67,8 @@ def mean_and_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
 
     NaNs are left out. One value alone has a mean but no interval.
     """
+    from scipy import special  # slow to import, and what imports this module need not come so far
+
     values = np.asarray(values, dtype=np.float64)
     present = ~np.isnan(values)
     count = present.sum(axis=0)

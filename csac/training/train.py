@@ -19,12 +19,11 @@ import jax
 import psutil
 
 from csac import __version__
-from csac.record.plots import learning_curve
 from csac.record.run import RunDirectory, StorageFailure, default_directory, is_run
 from csac.training.checkpoint import FOLDER, Checkpoints
+from csac.training.compilation import tidy_programs
 from csac.training.environments import Environment, Task
 from csac.training.groups import choose_groups, run_groups, split_seeds
-from csac.training.logs import TensorBoardLog
 from csac.training.loop import Settings
 from csac.training.perturb import by_step, perturbations_of, refuse_late
 from csac.training.recorder import Recorder
@@ -44,6 +43,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    from csac.training.logs import TensorBoardLog
     from csac.training.perturb import Perturbation
     from csac.training.progress import Reporter
     from csac.types import Algorithm, Spec
@@ -278,10 +278,11 @@ def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Wat
     """Train until the last step, a signal or a failure, and write down what happens."""
     reporter, labels, begin, failures = watchers.reporter, run.manifest["seeds"], point.step, point.failures
     groups = [group for group in run.manifest["groups"] if not set(group) <= set(failures)]
+    notes = [*notes, *filter(None, [tidy_programs()])]
     if reporter:
         reporter.start(run.manifest["task"], run.manifest["algorithm"], labels, settings.steps, run.path, notes)
         reporter.go_on(begin, run.evaluations, failures)
-    log = TensorBoardLog(run.path / "tensorboard", labels, begin) if watchers.tensorboard else None
+    log = _tensorboard_log(run, labels, begin) if watchers.tensorboard else None
     checkpoints = None
     if settings.checkpoints:
         checkpoints = Checkpoints(settings.checkpoints, run.manifest["checkpoints"]["keep"], point.pinned)
@@ -315,6 +316,12 @@ def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Wat
     if stopped:
         raise Interrupted(run, received[0])
     return run
+
+
+def _tensorboard_log(run: RunDirectory, labels: list[int], begin: int) -> TensorBoardLog:
+    from csac.training.logs import TensorBoardLog  # slow to import, and some runs do without
+
+    return TensorBoardLog(run.path / "tensorboard", labels, begin)
 
 
 @contextmanager
@@ -360,6 +367,8 @@ def _finish(run: RunDirectory, recorder: Recorder, state: str) -> None:
         name, task = run.manifest["algorithm"].upper(), run.manifest["task"]
         perturbed = by_step(perturbations_of(run.manifest.get("perturbations", [])))
         marks = [(step, text) for step, text in perturbed if step <= rows["step"].max()]
+        from csac.record.plots import learning_curve  # matplotlib is slow to import
+
         learning_curve([(name, rows)], run.path / "curve.png", title=task, marks=marks)
     run.update_manifest(state=state, failures=recorder.failures)
 

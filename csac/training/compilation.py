@@ -1,0 +1,131 @@
+"""Compiled programs, kept from one run to the next in JAX's own cache on disk.
+
+JAX's key for a program says which processor features it may use, but not how many threads it was divided for, and a
+folder may be shared by machines: so each kind of processor and each number of cores has a folder of its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import tempfile
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import jax
+
+from csac.training.processes import usable_cores
+
+MOST_BYTES = 256 * 2**20  # of all programs together; those of one algorithm, task and preset take half a MiB
+SECONDS_WORTH_KEEPING = 0.1  # of compilation; loading takes a tenth of it or less
+
+_PROCESSOR = (  # the lines of /proc/cpuinfo that say for what XLA compiles
+    *("vendor_id", "cpu family", "model", "model name", "stepping", "flags"),
+    *("CPU implementer", "CPU architecture", "CPU variant", "CPU part", "Features"),
+)
+
+
+def keep_programs() -> None:
+    """Have JAX load what this process compiles from now on, and keep what it has to compile.
+
+    Does nothing where the user has chosen otherwise (`JAX_COMPILATION_CACHE_DIR`, `JAX_ENABLE_COMPILATION_CACHE=0`, or
+    the same in `jax.config`), or where the folder cannot be written.
+    """
+    with suppress(OSError):
+        if not _is_users_choice():
+            folder = _make_home() / f"{_processor()}-{len(usable_cores())}"
+            jax.config.update("jax_compilation_cache_dir", str(folder))
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", SECONDS_WORTH_KEEPING)
+
+
+def tidy_programs() -> str | None:
+    """Remove what is broken or too much before a run; return a note where programs cannot be kept."""
+    if _is_users_choice():
+        _tell_workers()
+        return None
+    try:
+        home = _make_home()
+        _remove_broken(home)
+        _remove_oldest(home)
+    except OSError as error:
+        return f"note: compiled programs cannot be kept for the next run ({error})"
+    return None
+
+
+def _is_users_choice() -> bool:
+    chosen = jax.config.jax_compilation_cache_dir
+    return not jax.config.jax_enable_compilation_cache or (chosen is not None and Path(chosen).parent != _home())
+
+
+def _tell_workers() -> None:
+    os.environ["JAX_ENABLE_COMPILATION_CACHE"] = str(int(jax.config.jax_enable_compilation_cache))
+    if jax.config.jax_compilation_cache_dir is not None:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = jax.config.jax_compilation_cache_dir
+
+
+def _home() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if os.path.isabs(base) else Path(os.path.expanduser("~/.cache"))) / "csac" / "programs"
+
+
+def _make_home() -> Path:
+    """Return the folder of all programs. Raises OSError where nothing can be written there."""
+    home = _home()
+    if not home.is_absolute():
+        raise FileNotFoundError("there is no home directory")
+    home.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=home):
+        return home
+
+
+def _processor() -> str:
+    """Return a name for what XLA compiles for here; where the system does not tell, the machine's own."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    facts = sorted({line for line in lines if line.partition(":")[0].strip() in _PROCESSOR}) or [platform.node()]
+    return hashlib.sha256("\n".join([platform.system(), platform.machine(), *facts]).encode()).hexdigest()[:12]
+
+
+def _remove_broken(home: Path) -> None:
+    """Remove what a process that was killed has written in part, among what is new: JAX would never replace it."""
+    mark = home / "checked"
+    since = mark.stat().st_mtime if mark.exists() else 0.0
+    mark.touch()
+    for entry in _entries(home):
+        with suppress(FileNotFoundError):
+            if entry.stat().st_mtime >= since and not _is_whole(entry.read_bytes()):
+                entry.unlink(missing_ok=True)
+
+
+def _is_whole(program: bytes) -> bool:
+    """Whether a program can be unpacked, where JAX has packed it with zlib; with zstd, whether there is anything."""
+    if program[:1] != b"\x78":
+        return bool(program)
+    try:
+        zlib.decompress(program)
+    except zlib.error:
+        return False
+    return True
+
+
+def _remove_oldest(home: Path) -> None:
+    """Remove the programs that were compiled first, until the others are not too much."""
+    sizes = {}
+    for entry in _entries(home):
+        with suppress(FileNotFoundError):
+            facts = entry.stat()
+            sizes[entry] = (facts.st_mtime, facts.st_size)
+    total = sum(size for _, size in sizes.values())
+    for entry in sorted(sizes, key=lambda entry: sizes[entry]):
+        if total <= MOST_BYTES:
+            return
+        entry.unlink(missing_ok=True)
+        total -= sizes[entry][1]
+
+
+def _entries(home: Path) -> list[Path]:
+    return list(home.glob("*/*-cache"))

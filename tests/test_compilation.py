@@ -1,0 +1,181 @@
+"""Compiled programs are kept from run to run, change no number, and keep nobody from training."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from csac.algorithms import CSAC
+from csac.training import compilation
+from csac.training.environments import Steps
+from csac.training.learner import Learner
+from csac.training.train import train
+from csac.types import Spec
+
+TESTS = Path(__file__).parent
+TINY: dict[str, Any] = {"actor_hidden_sizes": (8,), "critic_hidden_sizes": (8,)}
+CHOICES = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")
+
+
+def learn() -> None:
+    """Print what a learner learns in a few updates, and how many of its programs came from disk."""
+    events: list[str] = []
+    jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
+    learner = Learner(CSAC(batch_size=8, warmup_steps=3, **TINY), Spec(3, 1), [7], 100)
+    observation, action = np.ones((1, 3), np.float32), np.zeros((1, 1), np.float32)
+    ends = np.zeros(1, bool)
+    donated = []
+    for step in range(1, 11):
+        before = learner._buffers
+        outcome = Steps(observation * step, np.ones(1, np.float32), ends, ends, observation * step, [], [])
+        action = learner.step(observation * (step - 1), action, outcome, step)
+        donated.append(all(buffer.is_deleted() for buffer in before))
+    bits = b"".join(np.asarray(buffer).tobytes() for buffer in learner._buffers)
+    loaded = events.count("/jax/compilation_cache/cache_hits")
+    print(json.dumps({"bits": hashlib.sha256(bits).hexdigest(), "loaded": loaded, "donated": donated}))
+
+
+def learnt(home: Path, **settings: str) -> dict[str, Any]:
+    """Return what `learn` prints in a process of its own."""
+    surroundings = {name: value for name, value in os.environ.items() if name not in CHOICES}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", "import test_compilation; test_compilation.learn()"],
+        cwd=TESTS,
+        env={**surroundings, "XDG_CACHE_HOME": str(home), **settings},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stderr == ""
+    return json.loads(done.stdout)
+
+
+def kept(home: Path) -> list[Path]:
+    return sorted(home.rglob("*-cache"))
+
+
+def test_programs_are_kept_and_change_no_bit(tmp_path):
+    without = learnt(tmp_path / "none", JAX_ENABLE_COMPILATION_CACHE="0")
+    assert not (tmp_path / "none").exists()
+
+    first = learnt(tmp_path / "home")
+    programs = kept(tmp_path / "home")
+    second = learnt(tmp_path / "home")
+
+    assert first["loaded"] == 0
+    assert 2 <= len(programs) == second["loaded"]
+    assert kept(tmp_path / "home") == programs
+    assert without["bits"] == first["bits"] == second["bits"]
+    assert all(without["donated"] + first["donated"] + second["donated"])
+
+
+def test_each_number_of_cores_has_its_own_programs(tmp_path, choices, monkeypatch):
+    folders = set()
+    for cores in (1, 2):
+        monkeypatch.setattr(compilation, "usable_cores", lambda cores=cores: list(range(cores)))
+        compilation.keep_programs()
+        folders.add(jax.config.jax_compilation_cache_dir)
+
+    assert len(folders) == 2
+    assert {Path(folder).parent for folder in folders} == {tmp_path / "csac" / "programs"}
+
+
+def test_a_home_that_cannot_be_written_costs_a_note_and_nothing_else(tmp_path, choices):
+    (tmp_path / "csac").write_text("no folder")
+
+    note = compilation.tidy_programs()
+    compilation.keep_programs()
+
+    assert note is not None
+    assert note.startswith("note: compiled programs cannot be kept")
+    assert str(tmp_path / "csac") in note
+    assert jax.config.jax_compilation_cache_dir is None
+
+
+def test_without_a_home_nothing_is_kept(tmp_path, choices, monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as Python does for a user that nobody knows
+    monkeypatch.chdir(tmp_path)
+
+    assert compilation.tidy_programs() == (
+        "note: compiled programs cannot be kept for the next run (there is no home directory)"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_broken_programs_are_removed_before_a_run(tmp_path, choices):
+    folder = tmp_path / "csac" / "programs" / "some-2"
+    folder.mkdir(parents=True)
+    whole = zlib.compress(b"program" * 100)
+    for name, content in {"whole": whole, "cut": whole[:-3], "empty": b"", "zstd": b"\x28\xb5\x2f\xfd..."}.items():
+        (folder / f"{name}-cache").write_bytes(content)
+
+    assert compilation.tidy_programs() is None
+
+    assert [entry.name for entry in kept(tmp_path)] == ["whole-cache", "zstd-cache"]
+
+
+def test_the_oldest_programs_go_first(tmp_path, choices, monkeypatch):
+    folder = tmp_path / "csac" / "programs" / "some-2"
+    folder.mkdir(parents=True)
+    program = zlib.compress(bytes(range(256)), 0)
+    for age, name in enumerate(("newest", "middle", "oldest")):
+        (folder / f"{name}-cache").write_bytes(program)
+        os.utime(folder / f"{name}-cache", (1e9 - age, 1e9 - age))
+    monkeypatch.setattr(compilation, "MOST_BYTES", 2 * len(program))
+
+    compilation.tidy_programs()
+
+    assert [entry.name for entry in kept(tmp_path)] == ["middle-cache", "newest-cache"]
+
+
+def test_the_users_own_choice_comes_first_and_workers_hear_of_it(tmp_path, choices):
+    own = str(tmp_path / "own")
+    jax.config.update("jax_compilation_cache_dir", own)
+
+    assert compilation.tidy_programs() is None
+    compilation.keep_programs()
+
+    assert jax.config.jax_compilation_cache_dir == own
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == own
+    assert os.environ["JAX_ENABLE_COMPILATION_CACHE"] == "1"
+    assert not (tmp_path / "csac").exists()
+
+
+def test_the_programs_of_one_worker_serve_the_others(tmp_path, choices):
+    algorithm = CSAC(batch_size=8, warmup_steps=50, **TINY)
+    settings: dict[str, Any] = {"steps": 100, "evaluation_episodes": 1, "checkpoint_interval": 0, "tensorboard": False}
+
+    train(algorithm, "Pendulum-v1", seeds=2, groups=2, directory=tmp_path / "first", **settings)
+    programs = kept(tmp_path / "csac")
+    train(algorithm, "Pendulum-v1", seeds=2, groups=2, directory=tmp_path / "second", **settings)
+
+    assert programs
+    assert kept(tmp_path / "csac") == programs
+    first, second = (tmp_path / name / "metrics.csv" for name in ("first", "second"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.fixture
+def choices(tmp_path, monkeypatch):
+    """Leave the choice of a folder to csac, below `tmp_path`, and afterwards everything as it was."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for name in CHOICES:
+        monkeypatch.setenv(name, "")  # so that it is restored
+        monkeypatch.delenv(name)
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    jax.config.update("jax_compilation_cache_dir", None)
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
