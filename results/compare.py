@@ -40,8 +40,7 @@ def table(runs: list[tuple[str, np.ndarray]]) -> str:
         ratio = f"{mean / first:.2f}" if first > 0 else ""  # of costs, it would be the larger the worse
         lines.append(
             f"| {label} | {len(last)} | {rows['step'].max():,} | {mean:{form}} ± {spread:{form}} "
-            f"| {low:{form}} to {high:{form}} | {ratio} | {best:{form}} at {step:,} |"
-            + f" {success(rows)} |" * tells
+            f"| {low:{form}} to {high:{form}} | {ratio} | {best:{form}} at {step:,} |" + f" {success(rows)} |" * tells
         )
     return "\n".join(lines)
 

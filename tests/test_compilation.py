@@ -84,7 +84,7 @@ def test_each_number_of_cores_has_its_own_programs(tmp_path, choices, monkeypatc
     for cores in (1, 2):
         monkeypatch.setattr(compilation, "usable_cores", lambda cores=cores: list(range(cores)))
         compilation.keep_programs()
-        folders.add(jax.config.jax_compilation_cache_dir)
+        folders.add(compilation._jax_settings()[1])
 
     assert len(folders) == 2
     assert {Path(folder).parent for folder in folders} == {tmp_path / "csac" / "programs"}
@@ -99,7 +99,7 @@ def test_a_home_that_cannot_be_written_costs_a_note_and_nothing_else(tmp_path, c
     assert note is not None
     assert note.startswith("note: compiled programs cannot be kept")
     assert str(tmp_path / "csac") in note
-    assert jax.config.jax_compilation_cache_dir is None
+    assert compilation._jax_settings()[1] is None
 
 
 def test_without_a_home_nothing_is_kept(tmp_path, choices, monkeypatch):
@@ -146,7 +146,7 @@ def test_the_users_own_choice_comes_first_and_workers_hear_of_it(tmp_path, choic
     assert compilation.tidy_programs() is None
     compilation.keep_programs()
 
-    assert jax.config.jax_compilation_cache_dir == own
+    assert compilation._jax_settings()[1] == own
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == own
     assert os.environ["JAX_ENABLE_COMPILATION_CACHE"] == "1"
     assert not (tmp_path / "csac").exists()

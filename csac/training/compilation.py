@@ -13,6 +13,7 @@ import tempfile
 import zlib
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -55,14 +56,21 @@ def tidy_programs() -> str | None:
 
 
 def _is_users_choice() -> bool:
-    chosen = jax.config.jax_compilation_cache_dir
-    return not jax.config.jax_enable_compilation_cache or (chosen is not None and Path(chosen).parent != _home())
+    is_enabled, folder = _jax_settings()
+    return not is_enabled or (folder is not None and Path(folder).parent != _home())
 
 
 def _tell_workers() -> None:
-    os.environ["JAX_ENABLE_COMPILATION_CACHE"] = str(int(jax.config.jax_enable_compilation_cache))
-    if jax.config.jax_compilation_cache_dir is not None:
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = jax.config.jax_compilation_cache_dir
+    is_enabled, folder = _jax_settings()
+    os.environ["JAX_ENABLE_COMPILATION_CACHE"] = str(int(is_enabled))
+    if folder is not None:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+
+
+def _jax_settings() -> tuple[bool, str | None]:
+    """Return whether JAX keeps what it compiles, and where; its settings are no attributes that a type checker sees."""
+    config: Any = jax.config
+    return config.jax_enable_compilation_cache, config.jax_compilation_cache_dir
 
 
 def _home() -> Path:
