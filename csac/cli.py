@@ -87,6 +87,8 @@ class Train:
     """Environment steps between two evaluations; there is one at the last step as well."""
     evaluation_episodes: int = 10
     """Episodes of each evaluation."""
+    evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
+    """Processes in which each group evaluates while it trains on; 0 evaluates in line. The results are the same."""
     checkpoint_interval: int = 50_000
     """Environment steps between checkpoints; there is one every ten minutes and at the end as well. 0 makes none."""
     keep_checkpoints: int = 2
@@ -219,6 +221,7 @@ def _train(arguments: list[str]) -> int:
             groups=options.groups,
             evaluation_interval=options.evaluation_interval,
             evaluation_episodes=options.evaluation_episodes,
+            evaluation_processes=options.evaluation_processes,
             environment_arguments=json_object("--env-kwargs", options.env_kwargs),
             perturbations=_perturbations(options.perturb),
             device=options.device,
@@ -240,7 +243,11 @@ def _resume(arguments: list[str]) -> int:
     from csac.training.train import resume
 
     command = shlex.join(["csac", "resume", *arguments])
-    return _exit_code(lambda: resume(options.run, steps=options.steps, reporter=Reporter(), command=command))
+    return _exit_code(
+        lambda: resume(
+            options.run, steps=options.steps, evaluation_processes=None, reporter=Reporter(), command=command
+        )
+    )
 
 
 def _exit_code(training: Callable[[], RunDirectory]) -> int:

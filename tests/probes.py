@@ -5,6 +5,7 @@ Each is also registered, so that `probes:ConstantReward-v0` names it wherever th
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import sys
@@ -175,15 +176,32 @@ class Cases(Endless):
         return observation, reward, terminated, truncated, self.info
 
 
-class Deadly(Endless):
-    """Kills its process in an episode reset with `seed`."""
+class Picky(Endless):
+    """Raises where an action is above `most` in an episode reset with one of `seeds`."""
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, most: float = 0.0, seeds: Collection[int] = ()) -> None:
         super().__init__(length=3)
-        self.seed = seed
+        self.most, self.seeds, self.is_chosen = most, seeds, False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        if seed == self.seed:
+        self.is_chosen = seed in self.seeds
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: np.ndarray) -> Result:
+        if self.is_chosen and action[0] > self.most:
+            raise RuntimeError("too much")
+        return super().step(action)
+
+
+class Deadly(Endless):
+    """Kills its process in an episode reset with `seed`; with `spare_first`, all processes but Python's first."""
+
+    def __init__(self, seed: int = 0, spare_first: bool = False) -> None:
+        super().__init__(length=3)
+        self.seed = None if spare_first and multiprocessing.parent_process() is None else seed
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        if self.seed is not None and seed == self.seed:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().reset(seed=seed, options=options)
 
@@ -226,6 +244,7 @@ for name in (
     "Failing",
     "NonFinite",
     "Cases",
+    "Picky",
     "Deadly",
     "IdEncoded",
 ):

@@ -201,7 +201,8 @@ def test_a_long_word_in_a_complaint_stays_whole(capsys):
 def test_train_passes_its_options_on(train_call):
     call = train_call(
         "Hopper-v4 --steps 1e5 --seeds 3 --first-seed 7 --directory some/where --device gpu --groups 2 "
-        "--evaluation-interval 1_000 --evaluation-episodes 4 --checkpoint-interval 5e3 --keep-checkpoints 0 --resume "
+        "--evaluation-interval 1_000 --evaluation-episodes 4 --evaluation-processes 3 "
+        "--checkpoint-interval 5e3 --keep-checkpoints 0 --resume "
         "--warmup-steps 2e3 --actor-hidden-sizes 8 9 "
         "--perturb friction=1.5@5e4 --perturb=action-noise=0.1 "
         """--env-kwargs '{"ctrl_cost_weight": 0.5}'"""
@@ -222,6 +223,7 @@ def test_train_passes_its_options_on(train_call):
         "groups": 2,
         "evaluation_interval": 1000,
         "evaluation_episodes": 4,
+        "evaluation_processes": 3,
         "checkpoint_interval": 5000,
         "keep_checkpoints": 0,
         "resume": True,
@@ -237,6 +239,7 @@ def test_train_without_options_uses_the_defaults(train_call):
     assert call["preset"] is None
     assert (call["resume"], call["start_from"], call["perturbations"]) == (False, None, None)
     assert (call["checkpoint_interval"], call["keep_checkpoints"]) == (50_000, 2)
+    assert call["evaluation_processes"] is None
 
 
 @pytest.mark.parametrize(

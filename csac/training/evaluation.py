@@ -60,7 +60,7 @@ class Evaluator:
     Episodes run side by side in batches of one fixed shape, so that an episode's numbers depend neither on when the
     others end nor on how many there are. The environments are made at the first `run` and kept, but for tasks whose
     resets do not forget what was before: they are made anew for each batch. `info_names` are the names of all numbers
-    that the last steps of episodes have held in `info` so far.
+    that the last steps of episodes have held in `info` so far, `perturbed` what `perturb` was last given.
 
     Args:
         task: as `Environment`'s.
@@ -86,11 +86,11 @@ class Evaluator:
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
         self._environments: list[Environment] = []
         self.info_names: set[str] = set()
-        self._perturbed: dict[str, float] = {}
+        self.perturbed: dict[str, float] = {}
 
     def perturb(self, values: Mapping[str, float]) -> None:
         """Change the task from the next `run` on, as `Environment.perturb`; what the task cannot be, `run` refuses."""
-        self._perturbed = dict(values)
+        self.perturbed = dict(values)
         for environment in self._environments:
             environment.perturb(values)
 
@@ -144,7 +144,7 @@ class Evaluator:
         while len(self._environments) < min(ROWS, self.episodes):
             environment = Environment(self._task, self._environment_arguments)
             try:
-                environment.perturb(self._perturbed)
+                environment.perturb(self.perturbed)
             except InputError:
                 environment.close()
                 raise

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import time
 import traceback
+from contextlib import closing
 from itertools import count
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from csac.training.checkpoint import remove_unfinished
-from csac.training.loop import Ended, Event, Group, Progress, Saved, Settings, is_boundary
-from csac.training.processes import cause_of_death, die_with_parent, usable_cores, worker_surroundings
+from csac.training.evaluation import ROWS
+from csac.training.loop import Boundary, Ended, Event, Group, Saved, Settings, is_boundary
+from csac.training.processes import cause_of_death, die_with_parent, move_to, usable_cores, worker_surroundings
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -73,6 +74,16 @@ def choose_groups(seeds: int, device: str) -> int:
     return 1 if device == "gpu" else min(seeds, GROUPS_PER_CORE * len(usable_cores()))
 
 
+def choose_evaluation_processes(groups: Sequence[Sequence[int]], episodes: int) -> int:
+    """Return how many processes each group is to evaluate with while it trains on: none where no core is to spare.
+
+    Several groups may share the cores that are to spare, since they evaluate for a small part of the time only.
+    """
+    spare = len(usable_cores()) - len(groups)
+    batches = max(map(len, groups)) * -(-episodes // ROWS)
+    return min(batches, max(1, spare // len(groups))) if spare > 0 else 0
+
+
 def run_groups(
     settings: Settings,
     groups: Sequence[Sequence[int]],
@@ -90,8 +101,7 @@ def run_groups(
     try:
         yield from scheduler.run()
     finally:
-        for worker in scheduler.workers:
-            worker.kill()
+        scheduler.kill()
 
 
 class _Timer:
@@ -108,19 +118,21 @@ class _Timer:
 
 
 def _run_here(settings: Settings, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[Event]:
-    group, timer, saved = Group(settings, seeds), _Timer(), settings.begin
-    for event in group.run(should_stop):
-        over = isinstance(event, Ended) and group.environments.alive.any()
-        regular = isinstance(event, Progress) and (is_regular(settings, event.step) or timer.is_due())
-        if isinstance(event, Progress):
-            yield event
-        if settings.checkpoints and (over or regular) and group.step > saved:
-            saved = group.step
-            timer.reset()
-            yield group.save()
-        if not isinstance(event, Progress):
-            yield event
-    group.close()
+    timer, saved = _Timer(), settings.begin
+    with closing(Group(settings, seeds)) as group:
+        for event in group.run(should_stop):
+            due = isinstance(event, Ended)
+            if isinstance(event, Boundary):
+                yield event
+                due = is_regular(settings, event.step) or timer.is_due()
+            if settings.checkpoints and due and group.step > saved:
+                yield from group.settle()
+                if group.environments.alive.any():
+                    saved = group.step
+                    timer.reset()
+                    yield group.save()
+            if not isinstance(event, Boundary):
+                yield event
 
 
 def is_regular(settings: Settings, step: int) -> bool:
@@ -135,12 +147,18 @@ class _Worker:
     def __init__(self, settings: Settings, seeds: Sequence[int]) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, settings, list(seeds)), daemon=True)
+        # Not a daemon, which could not have processes that evaluate.
+        self.process = context.Process(target=_work, args=(theirs, settings, list(seeds)))
         self.begin = self.step = self.saved = settings.begin
         self.seeds, self.over = seeds, False
         self.cores: list[int] | None = None
-        with worker_surroundings():
-            self.process.start()
+        try:
+            with worker_surroundings():
+                self.process.start()
+        except BaseException:  # a Ctrl-C that waited until the worker was there
+            if self.process.pid:
+                self.kill()
+            raise
         theirs.close()
 
     def tell(self, order: Order) -> None:
@@ -172,7 +190,13 @@ class _Scheduler:
         checkpoints: Checkpoints | None,
     ) -> None:
         self.settings, self.should_stop, self.checkpoints = settings, should_stop, checkpoints
-        self.workers = [_Worker(settings, seeds) for seeds in groups]
+        self.workers: list[_Worker] = []
+        try:
+            for seeds in groups:
+                self.workers.append(_Worker(settings, seeds))
+        except BaseException:
+            self.kill()
+            raise
         self.restarted: set[int] = set()
         cores = usable_cores()
         sets = min(len(self.workers), len(cores))
@@ -195,12 +219,17 @@ class _Scheduler:
                     yield index, self._receive(index, worker)
             self._hand_out()
 
+    def kill(self) -> None:
+        """End every process."""
+        for worker in self.workers:
+            worker.kill()
+
     def _receive(self, index: int, worker: _Worker) -> Message:
         try:
             message: Message = worker.connection.recv()
         except (EOFError, OSError):  # the latter where it died in the middle of a message
             return self._died(index, worker)
-        if isinstance(message, Progress):
+        if isinstance(message, Boundary):
             worker.step = message.step
             self._take_cores(worker)
             self._next(worker)
@@ -280,17 +309,17 @@ class _Scheduler:
 def _work(connection: Connection, settings: Settings, seeds: list[int]) -> None:
     """Train one group in a process of its own, one turn at a time."""
     die_with_parent()
-    turns = _Turns(connection)
+    cores, turns = usable_cores(), _Turns(connection)
     try:
         turns.take(None)
         if turns.stopped:
             connection.send(Ended(settings.begin, {}))
             return
-        group = Group(settings, seeds)
-        for event in group.run(lambda: turns.stopped):
-            connection.send(event)
-            if isinstance(event, Progress):
-                turns.take(group)
+        with closing(Group(settings, seeds, cores)) as group:
+            for event in group.run(lambda: turns.stopped):
+                connection.send(event)
+                if isinstance(event, Boundary):
+                    turns.take(group)
     except (BrokenPipeError, EOFError, ConnectionResetError):
         return  # the parent is gone, and with it whoever would write this down
     except Exception as error:
@@ -312,20 +341,20 @@ class _Turns:
                 self.stopped = True
             elif order == "save":
                 assert group
-                self.connection.send(_saved(group))
+                self._save(group)
             else:
-                _move_to([int(core) for core in order])
+                move_to([int(core) for core in order])
                 return
 
-
-def _saved(group: Group) -> Saved | NotSaved:
-    try:
-        return group.save()
-    except OSError as error:
-        return NotSaved(error)
-
-
-def _move_to(cores: list[int]) -> None:
-    if hasattr(os, "sched_setaffinity"):
-        for thread in os.listdir("/proc/self/task"):
-            os.sched_setaffinity(int(thread), cores)
+    def _save(self, group: Group) -> None:
+        """Say what the group's files are, or stop where an evaluation has left no seed to save."""
+        for event in group.settle():
+            self.connection.send(event)
+        if not group.environments.alive.any():
+            self.stopped = True
+            return
+        try:
+            saved = group.save()
+        except OSError as error:
+            saved = NotSaved(error)
+        self.connection.send(saved)

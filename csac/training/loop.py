@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from contextlib import closing
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -14,16 +15,19 @@ from csac.training.environments import SeedEnvironments
 from csac.training.evaluation import LONGEST_EPISODE, EvaluationFailure, Evaluator
 from csac.training.learner import Learner
 from csac.training.perturb import values_at
+from csac.training.pool import EvaluationPool, ProcessDied
 from csac.training.snapshots import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterator, Sequence
     from pathlib import Path
 
     from csac.record.run import Table
     from csac.training.checkpoint import Files
     from csac.training.environments import Task
+    from csac.training.evaluation import EvaluationEpisode
     from csac.training.perturb import Perturbation
+    from csac.training.pool import Running
     from csac.types import Algorithm, PolicyNetwork
 
 METRICS_INTERVAL = 1_000
@@ -35,6 +39,7 @@ class Settings(NamedTuple):
 
     `checkpoints` is the folder of the run's checkpoints, None where there are to be none; `begin` is the step of the
     checkpoint there to go on from, 0 to begin anew. `events` are names in the last `info` of an evaluation episode.
+    Each group has `evaluation_processes` that evaluate while it trains on; with 0 it evaluates in line.
     """
 
     algorithm: Algorithm
@@ -48,6 +53,7 @@ class Settings(NamedTuple):
     begin: int = 0
     events: tuple[str, ...] = ()
     perturbations: tuple[Perturbation, ...] = ()
+    evaluation_processes: int = 0
 
 
 class Rows(NamedTuple):
@@ -85,6 +91,12 @@ class Progress(NamedTuple):
     step: int
 
 
+class Boundary(NamedTuple):
+    """So many steps are made: here the group can be saved, once `settle` has told what still waits."""
+
+    step: int
+
+
 class Noted(NamedTuple):
     """Something that the user should know, and that stops nobody."""
 
@@ -109,32 +121,57 @@ class Ended(NamedTuple):
     policies: dict[int, Policy]
 
 
-Event = Rows | Evaluated | Failed | Progress | Noted | Saved | Ended
+Event = Rows | Evaluated | Failed | Progress | Boundary | Noted | Saved | Ended
+
+
+class Evaluation(NamedTuple):
+    """Policies that are to be evaluated: they are being so in other processes (`running`), or will be in this one."""
+
+    step: int
+    policies: dict[int, Policy]
+    running: Running | None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it need not be waited for."""
+        return self.running is None or self.running.is_over
 
 
 def train_group(settings: Settings, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[Event]:
     """Train `seeds` side by side and yield what happens, in order; the caller writes it down."""
-    group = Group(settings, seeds)
-    yield from group.run(should_stop)
-    group.close()
+    with closing(Group(settings, seeds)) as group:
+        yield from group.run(should_stop)
 
 
 class Group:
-    """Seeds that are trained side by side. Between two events of `run` that say how far it is, it can be saved.
+    """Seeds that are trained side by side. At a `Boundary` of `run` it can be saved, after `settle`.
 
     Strict order: each action comes from the policy after the update that followed the step before it.
+
+    Evaluations may be made by processes beside this one while training goes on. What happens meanwhile is told after
+    what they give, so that the order of events and all that they say is the same as with evaluations in line.
+
+    Args:
+        settings: what is trained and how.
+        seeds: the labels of the seeds.
+        cores: the processors for the processes that evaluate; None for those of this one.
 
     Raises:
         Damaged: the checkpoint to go on from cannot be read.
         InputError: it does not fit the algorithm or the task.
     """
 
-    def __init__(self, settings: Settings, seeds: Sequence[int]) -> None:
+    def __init__(self, settings: Settings, seeds: Sequence[int], cores: Sequence[int] | None = None) -> None:
         self.settings, self.seeds, self.step = settings, list(seeds), settings.begin
         self.environments = SeedEnvironments(settings.task, settings.environment_arguments, seeds)
         self.evaluator = Evaluator(
             settings.task, settings.environment_arguments, settings.evaluation_episodes, events=settings.events
         )
+        processes = settings.evaluation_processes
+        self._pool = EvaluationPool(self.evaluator, processes, cores) if processes else None
+        self._evaluation: Evaluation | None = None  # the one on its way
+        self._held: list[Event] = []  # what has happened after it
+        self._info_names: set[str] = set()
         self.learner = Learner(settings.algorithm, self.environments.spec, seeds, settings.steps)
         self._contract = Contract(
             self.environments.task_name,
@@ -159,6 +196,30 @@ class Group:
 
     def run(self, should_stop: Callable[[], bool]) -> Iterator[Event]:
         """Train to the last step and yield what happens; the caller writes it down."""
+        if self._pool:
+            self._pool.start()
+        for event in self._train(should_stop):
+            if self._evaluation and not isinstance(event, Boundary):
+                self._held.append(event)
+            else:
+                yield event
+
+    def settle(self) -> Iterator[Event]:
+        """Wait for the evaluation that is on its way, if there is one; yield what it gives, then what waited for it."""
+        if not self._evaluation:
+            return
+        evaluation, held = self._evaluation, self._held
+        self._evaluation, self._held = None, []
+        failed: set[int] = set()
+        for event in self._outcome(evaluation):
+            if isinstance(event, Failed):
+                failed.add(event.seed)
+            yield event
+        for event in held:
+            if (rest := _without(event, failed)) is not None:
+                yield rest
+
+    def _train(self, should_stop: Callable[[], bool]) -> Iterator[Event]:
         settings, environments = self.settings, self.environments
         while self.step < settings.steps and environments.is_any_alive and not should_stop():
             yield from self._advance()
@@ -170,10 +231,16 @@ class Group:
             boundary = is_boundary(settings, self.step)
             if boundary:
                 yield from self._stop_diverged()
-            if self.step % settings.evaluation_interval == 0 or last:
-                yield from _evaluate(self.evaluator, self.policies(), environments, self.seeds, self.step)
+            due = self.step % settings.evaluation_interval == 0 or last
+            if due:
+                yield from self.settle()  # one at a time
+                self._evaluation = self._begin_evaluation()
+            if self._evaluation and (due or boundary) and self._evaluation.is_over:
+                yield from self.settle()
             if boundary:
                 yield Progress(self.step)
+                yield Boundary(self.step)
+        yield from self.settle()
         yield Ended(self.step, self.policies())
 
     def policies(self) -> dict[int, Policy]:
@@ -207,7 +274,9 @@ class Group:
         return Saved(self.step, files, inexact)
 
     def close(self) -> None:
-        """Close every environment."""
+        """Close every environment, and end the processes that evaluate."""
+        if self._pool:
+            self._pool.close()
         self.environments.close()
         self.evaluator.close()
 
@@ -231,11 +300,48 @@ class Group:
             yield from self._stop_diverged()
 
     def _perturb(self, step: int) -> None:
-        """Have the task as it is in the environment step after the first `step`, in evaluations too."""
+        """Have the task as it is in the environment step after the first `step`."""
         if self._changes:
-            values = values_at(self.settings.perturbations, step)
-            self.environments.perturb(values)
-            self.evaluator.perturb(values)
+            self.environments.perturb(values_at(self.settings.perturbations, step))
+
+    def _begin_evaluation(self) -> Evaluation:
+        """Begin to evaluate the policies of now, on the task as it was in the last step."""
+        policies = self.policies()
+        self.evaluator.perturb(values_at(self.settings.perturbations, self.step - 1))
+        running = self._pool.begin(list(policies.values())) if self._pool else None
+        return Evaluation(self.step, policies, running)
+
+    def _outcome(self, evaluation: Evaluation) -> Iterator[Event]:
+        """Yield what an evaluation gives; stop the seeds that fail in it."""
+        rows, policies, step = [], dict(evaluation.policies), evaluation.step
+        for index, seed in enumerate(evaluation.policies):
+            try:
+                episodes = yield from self._episodes(evaluation, index)
+            except EvaluationFailure as error:
+                self.environments.stop(self.seeds.index(seed))
+                yield Failed(seed, step, f"its evaluation failed: {error}", "", policies.pop(seed))
+                continue
+            rows += [episode.row(seed, step) for episode in episodes]
+        if any(row["length"] >= LONGEST_EPISODE for row in rows):
+            yield Noted(
+                f"step {step}: evaluation episodes were broken off after {LONGEST_EPISODE:,} steps: do they end?"
+            )
+        self._info_names |= self.evaluator.info_names | (evaluation.running.info_names if evaluation.running else set())
+        yield Evaluated(step, rows, policies, frozenset(self._info_names))
+
+    def _episodes(self, evaluation: Evaluation, index: int) -> Generator[Event, None, list[EvaluationEpisode]]:
+        """Return the episodes of one of the policies; those that a dying process took along are made here."""
+        policy = list(evaluation.policies.values())[index]
+        if not evaluation.running:
+            return self.evaluator.run(policy)
+        try:
+            return evaluation.running.episodes(index)
+        except ProcessDied as error:
+            yield Noted(f"step {evaluation.step}: {error}; it is made by the process that trains instead")
+        try:
+            return self.evaluator.run(policy)
+        finally:
+            self.evaluator.close()  # no process is sent open environments
 
     def _stop_diverged(self) -> Iterator[Event]:
         """Stop each seed whose parameters, or what they led to, are not finite. Its last checkpoint stays sound."""
@@ -271,21 +377,12 @@ def is_boundary(settings: Settings, step: int) -> bool:
     return step % PROGRESS_INTERVAL == 0 or step == settings.steps or bool(interval and step % interval == 0)
 
 
-def _evaluate(
-    evaluator: Evaluator, policies: dict[int, Policy], environments: SeedEnvironments, seeds: Sequence[int], step: int
-) -> Iterator[Event]:
-    rows = []
-    for seed, policy in list(policies.items()):
-        try:
-            episodes = evaluator.run(policy)
-        except EvaluationFailure as error:
-            environments.stop(list(seeds).index(seed))
-            yield Failed(seed, step, f"its evaluation failed: {error}", "", policies.pop(seed))
-            continue
-        rows += [episode.row(seed, step) for episode in episodes]
-    if any(row["length"] >= LONGEST_EPISODE for row in rows):
-        yield Noted(f"step {step}: evaluation episodes were broken off after {LONGEST_EPISODE:,} steps: do they end?")
-    yield Evaluated(step, rows, policies, frozenset(evaluator.info_names))
+def _without(event: Event, seeds: set[int]) -> Event | None:
+    """Return the event without what these seeds did, or None where nothing is left of it."""
+    if isinstance(event, Rows):
+        rows = [row for row in event.rows if row["seed"] not in seeds]
+        return Rows(event.table, rows) if rows else None
+    return None if isinstance(event, Failed) and event.seed in seeds else event
 
 
 def _episode_row(seed: int, step: int, episode: Any) -> dict[str, Any]:

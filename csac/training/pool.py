@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from csac.training.evaluation import EvaluationEpisode, EvaluationFailure, Evaluator
-from csac.training.processes import cause_of_death, die_with_parent, usable_cores, worker_surroundings
+from csac.training.processes import cause_of_death, die_with_parent, move_to, usable_cores, worker_surroundings
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from csac.deploy.policy import Policy
     from csac.training.evaluation import OnProgress
 
+Batch = tuple[int, int]  # which policy, number of the first episode
+Work = tuple["Policy", int, bool, dict[str, float]]  # policy, first episode, whether deterministic, how it is perturbed
 Answer = tuple[list[EvaluationEpisode], set[str]] | Exception  # a batch's episodes and what `info` held, or a failure
 
 _BATCHES_THAT_PAY = 2  # for each process: it takes as long to start as a short batch takes
@@ -29,21 +31,26 @@ def choose_processes(evaluator: Evaluator, policies: int) -> int:
     return max(1, min(len(usable_cores()), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
 
 
+class ProcessDied(EvaluationFailure):
+    """A process died in the middle of a batch: this says nothing of the policy."""
+
+
 class EvaluationPool:
     """Does what `Evaluator` does, batch by batch in processes of their own; the numbers are the same to the last bit.
 
     A batch is what one evaluator steps at a time, so that nothing depends on which process takes it. The processes
-    start at the first run and wait for the next until `close`.
+    start at the first run, or at `start`, and wait for the next until `close`.
 
     Args:
-        evaluator: what each process works with; itself, it is not run.
+        evaluator: what each process works with, perturbed as it is when a run begins; itself, it is not run.
         processes: how many, at least one.
+        cores: the processors that they may use; None for those that this process may use when it starts them.
 
     Raises:
         InputError: fewer than one process, or a task that cannot be sent to another process.
     """
 
-    def __init__(self, evaluator: Evaluator, processes: int) -> None:
+    def __init__(self, evaluator: Evaluator, processes: int, cores: Sequence[int] | None = None) -> None:
         if processes < 1:
             raise InputError(f"{processes} processes: use at least one")
         try:
@@ -52,9 +59,13 @@ class EvaluationPool:
             raise InputError(
                 f"the task cannot be sent to another process: make it a module's function ({error})"
             ) from None
-        self._evaluator, self._processes = evaluator, processes
+        self._evaluator, self._processes, self._cores = evaluator, processes, cores
         self._workers: list[_Worker] = []
         self.info_names: set[str] = set()
+
+    def start(self) -> None:
+        """Start every process that is not there, so that a run need not wait for it."""
+        self._start(self._processes)
 
     def run(self, policy: Policy, deterministic: bool = True) -> list[EvaluationEpisode]:
         """Return the episodes in order; as `Evaluator.run`."""
@@ -69,21 +80,30 @@ class EvaluationPool:
             InputError: as `Evaluator.run`.
             EvaluationFailure: as `Evaluator.run`, of the first batch that failed; or a process died.
         """
-        batches = self._evaluator.batches(len(policies))
         try:
-            answers = self._answers(policies, batches, deterministic, on_progress)
+            running = self.begin(policies, deterministic, stop_at_failure=True)
+            running.on_progress = on_progress
+            while not running.is_over:
+                running.wait()
+            episodes = [running.episodes(index) for index in range(len(policies))]
         except BaseException:
             self.close()
             raise
-        finished: list[list[EvaluationEpisode]] = [[] for _ in policies]
-        for index, first in batches:
-            answer = answers[index, first]
-            if isinstance(answer, Exception):
-                self.close()
-                raise answer
-            finished[index] += answer[0]
-            self.info_names |= answer[1]
-        return finished
+        self.info_names |= running.info_names
+        return episodes
+
+    def begin(self, policies: Sequence[Policy], deterministic: bool = True, stop_at_failure: bool = False) -> Running:
+        """Begin to evaluate policies and return. The run before must be over.
+
+        With `stop_at_failure` a failing batch leaves out all that no process has begun, else those of its own policy.
+        """
+        batches = self._evaluator.batches(len(policies))
+        self._start(min(self._processes, len(batches)))
+        tasks = {
+            (index, first): (policies[index], first, deterministic, self._evaluator.perturbed)
+            for index, first in batches
+        }
+        return Running(list(self._workers), tasks, len(policies) * self._evaluator.episodes, stop_at_failure)
 
     def close(self) -> None:
         """End the processes; another run starts new ones."""
@@ -91,45 +111,100 @@ class EvaluationPool:
             worker.kill()
         self._workers = []
 
-    def _answers(
-        self,
-        policies: Sequence[Policy],
-        batches: Sequence[tuple[int, int]],
-        deterministic: bool,
-        on_progress: OnProgress | None,
-    ) -> dict[tuple[int, int], Answer]:
-        """Return what came of each batch, up to the first that failed. Batches are handed out in order."""
-        while len(self._workers) < min(self._processes, len(batches)):
-            self._workers.append(_Worker(self._evaluator))
-        waiting, idle = deque(batches), list(self._workers)
-        busy: dict[_Worker, tuple[int, int]] = {}
-        answers: dict[tuple[int, int], Answer] = {}
-        total, done = len(policies) * self._evaluator.episodes, 0
-        while waiting or busy:
-            while waiting and idle:
-                worker, batch = idle.pop(), waiting.popleft()
-                worker.ask((policies[batch[0]], batch[1], deterministic))
-                busy[worker] = batch
-            ready = wait([worker.connection for worker in busy])
-            for worker in [worker for worker in busy if worker.connection in ready]:
-                answer = answers[busy.pop(worker)] = worker.answer()
-                if isinstance(answer, Exception):
-                    waiting.clear()
-                    continue
-                idle.append(worker)
-                done += len(answer[0])
-                if on_progress:
-                    on_progress(done, total)
-        return answers
+    def _start(self, processes: int) -> None:
+        for worker in [worker for worker in self._workers if not worker.process.is_alive()]:
+            worker.kill()
+            self._workers.remove(worker)
+        while len(self._workers) < processes:
+            self._workers.append(_Worker(self._evaluator, self._cores))
+
+
+class Running:
+    """A run of an `EvaluationPool` that is on its way.
+
+    The processes have a batch each, in order, and are given the next whenever somebody waits here or asks whether it is
+    over. `info_names` are those of the batches that are done.
+    """
+
+    def __init__(self, workers: list[_Worker], tasks: dict[Batch, Work], total: int, stop_at_failure: bool) -> None:
+        self._idle, self._tasks, self._total, self._stop_at_failure = workers, tasks, total, stop_at_failure
+        self.on_progress: OnProgress | None = None
+        self.info_names: set[str] = set()
+        self._waiting, self._done = deque(tasks), 0
+        self._busy: dict[_Worker, Batch] = {}
+        self._answers: dict[Batch, Answer] = {}
+        self._death: ProcessDied | None = None
+        self._hand_out()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether everything has been answered that will be. Does not wait."""
+        self._receive(0.0)
+        return not self._busy
+
+    def wait(self) -> None:
+        """Wait for the next answer."""
+        self._receive(None)
+
+    def episodes(self, index: int) -> list[EvaluationEpisode]:
+        """Wait for the episodes of one of the policies and return them in order.
+
+        Raises:
+            InputError: as `Evaluator.run`.
+            EvaluationFailure: as `Evaluator.run`, of its first batch that failed.
+            ProcessDied: what there is of it, because a process died.
+        """
+        batches = [batch for batch in self._tasks if batch[0] == index]
+        while self._busy and not self._answers.keys() >= set(batches):
+            self.wait()
+        episodes = []
+        for batch in batches:
+            answer = self._answers.get(batch, self._death)
+            if isinstance(answer, Exception):
+                raise answer
+            assert answer
+            episodes += answer[0]
+        return episodes
+
+    def _receive(self, timeout: float | None) -> None:
+        """Take the answers that come within so many seconds, or the next one, and hand out what waits."""
+        ready = wait([worker.connection for worker in self._busy], timeout) if self._busy else []
+        for worker in [worker for worker in self._busy if worker.connection in ready]:
+            batch = self._busy.pop(worker)
+            answer = self._answers[batch] = worker.answer()
+            if isinstance(answer, Exception):
+                self._leave_out(batch, answer)
+            else:
+                self._done += len(answer[0])
+                self.info_names |= answer[1]
+                if self.on_progress:
+                    self.on_progress(self._done, self._total)
+            if not isinstance(answer, ProcessDied):
+                self._idle.append(worker)
+        self._hand_out()
+
+    def _leave_out(self, failed: Batch, reason: Exception) -> None:
+        """Do not begin what nobody needs after a failure, nor anything once a process has died: so might the next."""
+        if isinstance(reason, ProcessDied):
+            self._death = reason
+        if self._death or self._stop_at_failure:
+            self._waiting.clear()
+        self._waiting = deque(batch for batch in self._waiting if batch[0] != failed[0])
+
+    def _hand_out(self) -> None:
+        while self._waiting and self._idle:
+            worker, batch = self._idle.pop(), self._waiting.popleft()
+            worker.ask(self._tasks[batch])
+            self._busy[worker] = batch
 
 
 class _Worker:
     """The parent's end of one process."""
 
-    def __init__(self, evaluator: Evaluator) -> None:
+    def __init__(self, evaluator: Evaluator, cores: Sequence[int] | None) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, evaluator), daemon=True)
+        self.process = context.Process(target=_work, args=(theirs, evaluator, cores), daemon=True)
         try:
             with worker_surroundings():
                 self.process.start()
@@ -139,9 +214,9 @@ class _Worker:
             raise
         theirs.close()
 
-    def ask(self, batch: tuple[Policy, int, bool]) -> None:
+    def ask(self, work: Work) -> None:
         try:
-            self.connection.send(batch)
+            self.connection.send(work)
         except (BrokenPipeError, ConnectionResetError):
             return  # its death is seen when we receive
 
@@ -150,7 +225,7 @@ class _Worker:
             return self.connection.recv()
         except (EOFError, OSError):
             self.kill()
-            return EvaluationFailure(f"the evaluation was broken off: {cause_of_death(self.process.exitcode)}")
+            return ProcessDied(f"the evaluation was broken off: {cause_of_death(self.process.exitcode)}")
 
     def kill(self) -> None:
         if self.process.is_alive():
@@ -159,9 +234,11 @@ class _Worker:
         self.connection.close()
 
 
-def _work(connection: Connection, evaluator: Evaluator) -> None:
+def _work(connection: Connection, evaluator: Evaluator, cores: Sequence[int] | None) -> None:
     """Run the batches that are asked for, until the parent is gone."""
     die_with_parent()
+    if cores:
+        move_to(cores)
     try:
         while True:
             connection.send(_answer(evaluator, *connection.recv()))
@@ -169,8 +246,12 @@ def _work(connection: Connection, evaluator: Evaluator) -> None:
         return
 
 
-def _answer(evaluator: Evaluator, policy: Policy, first: int, deterministic: bool) -> Answer:
+def _answer(
+    evaluator: Evaluator, policy: Policy, first: int, deterministic: bool, perturbed: dict[str, float]
+) -> Answer:
     try:
+        if perturbed != evaluator.perturbed:
+            evaluator.perturb(perturbed)
         return evaluator.run_batch(policy, first, deterministic), evaluator.info_names
     except (EvaluationFailure, InputError) as error:
         return type(error)(str(error))

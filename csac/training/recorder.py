@@ -11,7 +11,7 @@ import numpy as np
 from csac.record.run import Table
 from csac.training.checkpoint import facts_of, link
 from csac.training.groups import GroupCrashed, GroupRestarted, NotSaved
-from csac.training.loop import Ended, Evaluated, Failed, Noted, Progress, Rows, Saved
+from csac.training.loop import Boundary, Ended, Evaluated, Failed, Noted, Progress, Rows, Saved
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -62,6 +62,7 @@ class Recorder:
         self._written = begin  # every row up to this step is in the tables, and none after it
         self._received: list[dict[Table, int]] = [dict.fromkeys(get_args(Table), begin) for _ in groups]
         self._steps = dict.fromkeys((seed for group in groups for seed in group), begin)
+        self._made = dict(self._steps)  # steps of which some may not have been told of yet
         self._pending: dict[Table, list[dict[str, Any]]] = defaultdict(list)
         self._saved: dict[int, dict[int, Files]] = defaultdict(dict)  # step -> group -> its files
         self._best = _best_means(run.evaluations)
@@ -81,6 +82,9 @@ class Recorder:
                 self._failed(message)
             case Progress(step):
                 self._progress(group, step)
+            case Boundary(step):
+                if step > self._passed[group]:  # else it has just been shown
+                    self._show(group, step)
             case Saved():
                 self._progress(group, message.step)
                 self._commit_when_whole(group, message)
@@ -169,6 +173,7 @@ class Recorder:
         row of a later step may reach the tables.
         """
         self._passed[group] = step
+        self._made.update(dict.fromkeys(self.groups[group], step))
         for part in self._saved.values():
             part.pop(group, None)
 
@@ -204,8 +209,15 @@ class Recorder:
         self._passed[group] = max(step, self._passed[group])
         self._steps.update({seed: step for seed in self.groups[group] if seed not in self.failures})
         self._flush()
+        self._show(group, step)
+
+    def _show(self, group: int, step: int) -> None:
+        """Show how far a group is."""
+        self._made.update(
+            {seed: max(step, self._made[seed]) for seed in self.groups[group] if seed not in self.failures}
+        )
         if self.reporter:
-            self.reporter.progress(self._steps)
+            self.reporter.progress(self._made)
 
     def _save(self, policies: dict[int, Policy]) -> None:
         for seed, policy in policies.items():

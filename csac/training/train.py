@@ -23,7 +23,7 @@ from csac.record.run import RunDirectory, StorageFailure, default_directory, is_
 from csac.training.checkpoint import FOLDER, Checkpoints
 from csac.training.compilation import tidy_programs
 from csac.training.environments import Environment, Task
-from csac.training.groups import choose_groups, run_groups, split_seeds
+from csac.training.groups import choose_evaluation_processes, choose_groups, run_groups, split_seeds
 from csac.training.loop import Settings
 from csac.training.perturb import by_step, perturbations_of, refuse_late
 from csac.training.recorder import Recorder
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 # Measured resident size of a worker process with JAX, MuJoCo and the compiled programs, before its replay.
 BYTES_PER_PROCESS = 600 * 2**20
-
+BYTES_PER_EVALUATION_PROCESS = 200 * 2**20  # the same without JAX
 
 _CANNOT_WRITE = (
     errno.ENOSPC,
@@ -86,6 +86,7 @@ def train(
     groups: int | None = 1,
     evaluation_interval: int = 5_000,
     evaluation_episodes: int = 10,
+    evaluation_processes: int | None = 0,
     environment_arguments: dict[str, Any] | None = None,
     perturbations: str | Perturbation | Iterable[str | Perturbation] | None = None,
     device: str = "cpu",
@@ -114,6 +115,9 @@ def train(
             than one, a script needs the usual `if __name__ == "__main__":` guard.
         evaluation_interval: environment steps between evaluations; there is one at the last step as well.
         evaluation_episodes: episodes of each evaluation.
+        evaluation_processes: processes in which each group evaluates while it trains on; 0 evaluates in line, None
+            chooses by the cores. The run is the same to the last bit; `on_evaluation` is called later. A script needs
+            the guard here too. With `stop_when`, which would come too late, evaluation is in line.
         environment_arguments: keyword arguments for the environment.
         perturbations: changes of the task, in training and evaluations, such as `("friction=1.5@300000",)`: see
             `Perturbation`. What a run begins with (`start_from`) keeps what had happened to it; with None also what was
@@ -142,8 +146,13 @@ def train(
     environment_arguments = dict(environment_arguments or {})
     _check(steps=steps, seeds=seeds, evaluation_interval=evaluation_interval, evaluation_episodes=evaluation_episodes)
     _check_not_negative(
-        first_seed=first_seed, checkpoint_interval=checkpoint_interval, keep_checkpoints=keep_checkpoints
+        first_seed=first_seed,
+        checkpoint_interval=checkpoint_interval,
+        keep_checkpoints=keep_checkpoints,
+        evaluation_processes=evaluation_processes or 0,
     )
+    if evaluation_processes and stop_when:
+        raise InputError("stop_when is asked before training goes on: leave out evaluation_processes")
     check_events(events or ())
     _choose_device(device)
     with closing(Environment(task, environment_arguments)) as environment:
@@ -172,10 +181,13 @@ def train(
         checkpoint_interval,
         events=tuple(names),
         perturbations=changes,
+        evaluation_processes=evaluation_processes or 0,
     )
-    if len(parts) > 1:
+    if len(parts) > 1 or evaluation_processes:
         _check_picklable(settings)
-    notes = [_memory_note(algorithm, spec, steps, seeds, len(parts)), *_warmup_note(algorithm, steps)]
+    if evaluation_processes is None and not stop_when and evaluation_interval < steps and _is_picklable(task):
+        settings = settings._replace(evaluation_processes=choose_evaluation_processes(parts, evaluation_episodes))
+    notes = [_memory_note(settings, spec, seeds, len(parts)), *_warmup_note(algorithm, steps)]
     manifest = {
         "task": task_name,
         "task_is_callable": not isinstance(task, str),
@@ -217,12 +229,15 @@ def resume(
     directory: str | Path,
     *,
     steps: int | None = None,
+    evaluation_processes: int | None = 0,
     reporter: Reporter | None = None,
     command: str | None = None,
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
 ) -> RunDirectory:
     """Go on with a run from its newest checkpoint; everything but a larger number of `steps` comes from its manifest.
+
+    `evaluation_processes` and what follows are as in `train`.
 
     Raises:
         InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
@@ -237,6 +252,7 @@ def resume(
         steps=run.manifest["steps"] if steps is None else steps,
         directory=directory,
         groups=None,
+        evaluation_processes=evaluation_processes,
         resume=True,
         tensorboard=(run.path / "tensorboard").exists(),
         reporter=reporter,
@@ -416,10 +432,21 @@ def _check_picklable(settings: Settings) -> None:
     try:
         pickle.dumps(settings)
     except Exception as error:
+        wanted, without = ("evaluation_processes need", "evaluation_processes=0")
+        if not settings.evaluation_processes:
+            wanted, without = ("several groups need", "groups=1")
         raise InputError(
-            "the task cannot be sent to another process, which several groups need: "
-            f"make it a module's function, or train with groups=1 ({error})"
+            f"the task cannot be sent to another process, which {wanted}: "
+            f"make it a module's function, or train with {without} ({error})"
         ) from None
+
+
+def _is_picklable(task: Task) -> bool:
+    try:
+        pickle.dumps(task)
+    except Exception:
+        return False
+    return True
 
 
 def _choose_device(device: str) -> None:
@@ -438,14 +465,16 @@ def _choose_device(device: str) -> None:
     os.environ |= {"JAX_PLATFORMS": platform_name, "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0"}  # for the workers
 
 
-def _memory_note(algorithm: Algorithm, spec: Spec, steps: int, seeds: int, processes: int) -> str:
+def _memory_note(settings: Settings, spec: Spec, seeds: int, groups: int) -> str:
     """Return the line that predicts the memory needed; refuse what cannot fit."""
+    algorithm, steps = settings.algorithm, settings.steps
     shapes = jax.eval_shape(
         lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)),
         jax.ShapeDtypeStruct((2,), "uint32"),
     )
     per_seed = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
-    needed = seeds * per_seed + processes * BYTES_PER_PROCESS
+    evaluating = groups * settings.evaluation_processes
+    needed = seeds * per_seed + groups * BYTES_PER_PROCESS + evaluating * BYTES_PER_EVALUATION_PROCESS
     available = psutil.virtual_memory().available
     text = f"memory: about {needed / 2**30:.1f} GiB of the {available / 2**30:.1f} GiB available"
     if needed > available:
@@ -453,7 +482,9 @@ def _memory_note(algorithm: Algorithm, spec: Spec, steps: int, seeds: int, proce
             f"this run needs about {needed / 2**30:.1f} GiB of memory and {available / 2**30:.1f} GiB are available: "
             f"use fewer seeds, fewer groups or a smaller replay (one seed takes {per_seed / 2**30:.2f} GiB)"
         )
-    return f"{text} ({seeds} x {per_seed / 2**20:.0f} MiB, {processes} process{'es' if processes > 1 else ''})"
+    beside = f", {evaluating} of them to evaluate" if evaluating else ""
+    processes = groups + evaluating
+    return f"{text} ({seeds} x {per_seed / 2**20:.0f} MiB, {processes} process{'es' if processes > 1 else ''}{beside})"
 
 
 def _warmup_note(algorithm: Algorithm, steps: int) -> list[str]:
