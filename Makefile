@@ -44,7 +44,7 @@ check: $(SETUP)  ## Check format, lint, types and the direction of imports
 
 peers: $(PEERS) $(PARL)  ## Install what to measure against: into .venv-peers, and PARL into .venv-parl
 
-bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS)) $(if $(PARL_PYTHON),,$(PARL))  ## Measure speed beside the peers, 20 minutes: make bench ARGS=--quick
+bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS)) $(if $(PARL_PYTHON),,$(PARL))  ## Measure speed beside the peers, 25 minutes: make bench ARGS=--quick
 	.venv/bin/python benchmarks/speed.py --out benchmarks $(ARGS)
 
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml
