@@ -4,6 +4,8 @@ It prints one line of JSON. After each step the trainer looks through everything
 that its steps become slower as the replay fills; the window is early, which favours it.
 """
 
+from collections import deque
+
 import gymnasium
 import numpy as np
 import settings
@@ -79,7 +81,7 @@ def main():
     torch.manual_seed(settings.TASK_SEED)
     environments = DummyVectorEnv([lambda: gymnasium.make(arguments.task)])
     algorithm = make_algorithm(arguments.algorithm, gymnasium.make(arguments.task))
-    window, returns = Window(arguments), []
+    window, returns = Window(arguments), deque(maxlen=100)
     collector = Collector(
         algorithm,
         environments,
