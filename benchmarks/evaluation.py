@@ -71,8 +71,8 @@ def measure(task: str, algorithm: str, seconds: float, episodes: int, environmen
         f"{task}: {1 / step:.1f} steps/s alone, {1 / slower:.1f} while a process evaluates\n"
         f"  an evaluation (episodes of {sum(lengths) / len(lengths):.0f} steps) takes {evaluation:.2f} s in line, "
         f"{duration:.2f} s beside training\n"
-        f"  lost with {episodes} episodes every {INTERVAL:,} steps: {lost_in_line:.1%} in line, {lost_beside:.1%} beside "
-        f"(medians of {len(alone)} turns)",
+        f"  lost with {episodes} episodes every {INTERVAL:,} steps: {lost_in_line:.1%} in line, "
+        f"{lost_beside:.1%} beside (medians of {len(alone)} turns)",
         flush=True,
     )
 
