@@ -66,6 +66,12 @@ class Timed:
             self.seconds += time.perf_counter() - began
 
 
+def _timed(part: Any) -> Timed:
+    """Have the time taken of every `step` of a part of a group."""
+    part.step = Timed(part.step)
+    return part.step
+
+
 def measure(task: str, algorithm: str, steps: int) -> Shares:
     """Train for `steps` after the warm-up, then evaluate once."""
     settings: dict[str, Any] = hyperparameters("paper", algorithm, task)
@@ -76,14 +82,13 @@ def measure(task: str, algorithm: str, steps: int) -> Shares:
     with closing(Group(Settings(learner, task, {}, last + 1, INTERVAL, EPISODES), [0])) as group:
         for _ in group.run(lambda: group.step == 2 * WARMUP):
             pass
-        environment = group.environments.step = Timed(group.environments.step)
-        learning = group.learner.step = Timed(group.learner.step)
+        environment, learning = (_timed(part) for part in (group.environments, group.learner))
         began = time.perf_counter()
         for _ in group.run(lambda: group.step == last):
             pass
         elapsed = time.perf_counter() - began
         policy = group.policies()[0]
-        group.evaluator._make_environments()
+        group.evaluator._make_environments()  # which are made once
         began = time.perf_counter()
         episodes = group.evaluator.run(policy)
         evaluation = time.perf_counter() - began
