@@ -1,11 +1,11 @@
 """What evaluation costs training, in line and in a process beside it: one seed on all cores.
 
-python benchmarks/evaluation.py TASK [--seconds 10] [--env-kwargs JSON]
+python benchmarks/evaluation.py TASK [--seconds 10] [--episodes 10] [--env-kwargs JSON]
 
 In turns: training alone for a hundred steps, training while a process evaluates once, and evaluating once in line. From
-the medians of these the share of time lost at the default cadence, ten episodes every 5,000 steps: in line it is the
-evaluation's own time; beside training, that by which training is slower meanwhile. Episodes last as long as the task
-lets a policy of a few hundred updates.
+the medians of these the share of time lost with so many episodes every 5,000 steps: in line it is the evaluation's own
+time; beside training, that by which training is slower meanwhile. Episodes last as long as the task lets a policy of a
+few hundred updates.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from csac.training.evaluation import Evaluator
 from csac.training.loop import Group, Settings
 from csac.training.pool import EvaluationPool
 
-INTERVAL, EPISODES, WARMUP, STEPS, NEVER = 5_000, 10, 150, 100, 10**9
+INTERVAL, WARMUP, STEPS, NEVER = 5_000, 150, 100, 10**9
 
 
 def train(group: Group, pool: EvaluationPool | None) -> tuple[int, float]:
@@ -40,14 +40,14 @@ def train(group: Group, pool: EvaluationPool | None) -> tuple[int, float]:
     return group.step - first, time.perf_counter() - began
 
 
-def measure(task: str, algorithm: str, seconds: float, environment_arguments: dict[str, Any]) -> None:
+def measure(task: str, algorithm: str, seconds: float, episodes: int, environment_arguments: dict[str, Any]) -> None:
     """Print what was measured."""
     learner = dataclasses.replace(
         ALGORITHMS[algorithm](**hyperparameters("paper", algorithm, task)), replay_size=100_000, warmup_steps=WARMUP
     )
-    settings = Settings(learner, task, environment_arguments, 100_000, NEVER, EPISODES)
+    settings = Settings(learner, task, environment_arguments, 100_000, NEVER, episodes)
     alone, beside, durations, in_line, lengths = [], [], [], [], []
-    pool = EvaluationPool(Evaluator(task, environment_arguments, EPISODES), 1)
+    pool = EvaluationPool(Evaluator(task, environment_arguments, episodes), 1)
     with closing(Group(settings, [0])) as group, closing(pool):
         pool.start()
         for _ in range(3):
@@ -71,8 +71,8 @@ def measure(task: str, algorithm: str, seconds: float, environment_arguments: di
         f"{task}: {1 / step:.1f} steps/s alone, {1 / slower:.1f} while a process evaluates\n"
         f"  an evaluation (episodes of {sum(lengths) / len(lengths):.0f} steps) takes {evaluation:.2f} s in line, "
         f"{duration:.2f} s beside training\n"
-        f"  lost at the default cadence: {lost_in_line:.1%} in line, {lost_beside:.1%} beside "
-        f"(medians of {len(alone)} turns)",
+        f"  lost with {episodes} episodes every {INTERVAL:,} steps: {lost_in_line:.1%} in line, "
+        f"{lost_beside:.1%} beside (medians of {len(alone)} turns)",
         flush=True,
     )
 
@@ -83,10 +83,11 @@ def main() -> None:
     parser.add_argument("task")
     parser.add_argument("--algorithm", choices=[name for name in ALGORITHMS if name != "ppo"], default="csac")
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--env-kwargs", type=json.loads, default={})
     options = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)  # as `csac.train` does
-    measure(options.task, options.algorithm, options.seconds, options.env_kwargs)
+    measure(options.task, options.algorithm, options.seconds, options.episodes, options.env_kwargs)
 
 
 if __name__ == "__main__":

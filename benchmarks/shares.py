@@ -1,6 +1,6 @@
 """Where the time of training goes: in the environment, in the learner, in evaluation. One seed, one process, by task.
 
-python benchmarks/shares.py [--algorithm csac] [--steps 300] [TASK ...]
+python benchmarks/shares.py [--algorithm csac] [--steps 200] [TASK ...]
 
 The parts are timed inside a group as `csac train` has it, at the preset `paper`, after the compilation. An evaluation
 of ten episodes is timed once, with the policy of that moment, and shared among the 5,000 steps that lie between two by
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 TASKS = ("HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4", "PyFlyt/QuadX-Waypoints-v1", "PandaReach-v3")
 INTERVAL, EPISODES = 5_000, 10
-WARMUP = 300  # random steps; the learner's first updates, which are compiled, follow them
+WARMUP = 100  # random steps; as many updates, the compilation among them, follow before the clock starts
 
 
 class Shares(NamedTuple):
@@ -66,6 +66,12 @@ class Timed:
             self.seconds += time.perf_counter() - began
 
 
+def _timed(part: Any) -> Timed:
+    """Have the time taken of every `step` of a part of a group."""
+    part.step = Timed(part.step)
+    return part.step
+
+
 def measure(task: str, algorithm: str, steps: int) -> Shares:
     """Train for `steps` after the warm-up, then evaluate once."""
     settings: dict[str, Any] = hyperparameters("paper", algorithm, task)
@@ -76,19 +82,19 @@ def measure(task: str, algorithm: str, steps: int) -> Shares:
     with closing(Group(Settings(learner, task, {}, last + 1, INTERVAL, EPISODES), [0])) as group:
         for _ in group.run(lambda: group.step == 2 * WARMUP):
             pass
-        watched: Any = group  # whose methods a type checker would not have replaced
-        environment = watched.environments.step = Timed(group.environments.step)
-        learning = watched.learner.step = Timed(group.learner.step)
+        environment, learning = (_timed(part) for part in (group.environments, group.learner))
         began = time.perf_counter()
         for _ in group.run(lambda: group.step == last):
             pass
         elapsed = time.perf_counter() - began
         policy = group.policies()[0]
-        group.evaluator._make_environments()
+        group.evaluator._make_environments()  # which are made once
         began = time.perf_counter()
         episodes = group.evaluator.run(policy)
         evaluation = time.perf_counter() - began
-        limit = getattr(group.environments.environments[0].raw.spec, "max_episode_steps", None)
+        raw = group.environments.environments[0].raw
+        # PyFlyt's tasks end by themselves.
+        limit = getattr(raw.spec, "max_episode_steps", None) or getattr(raw.unwrapped, "max_steps", None)
     lengths = [episode.length for episode in episodes]
     mean = sum(lengths) / len(lengths)
     per_step = 1e6 / steps
@@ -102,7 +108,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", default=TASKS)
     parser.add_argument("--algorithm", choices=ALGORITHMS, default="csac")
-    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--steps", type=int, default=200)
     arguments = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)  # as `train` does
     print("| task | step, ms | environment | evaluation (longest) | the rest | outside the update (longest) |")

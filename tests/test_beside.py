@@ -19,7 +19,7 @@ from csac.training.train import resume, train
 from csac.types import InputError
 
 LEARNER = SAC(actor_hidden_sizes=(8, 8), critic_hidden_sizes=(8, 8), batch_size=8, warmup_steps=40, replay_size=300)
-TIMES = ("created", "process", "history")  # of the manifest
+TIMES = ("created", "process", "history", "commit")  # of the manifest; the code may be committed meanwhile
 INSTEAD = "is made by the process that trains instead"
 
 

@@ -149,7 +149,8 @@ class _Worker:
         self.connection, theirs = context.Pipe()
         # Not a daemon, which could not have processes that evaluate.
         self.process = context.Process(target=_work, args=(theirs, settings, list(seeds)))
-        self.begin = self.step = self.saved = settings.begin
+        self.step = self.saved = settings.begin
+        self.is_starting = True
         self.seeds, self.over = seeds, False
         self.cores: list[int] | None = None
         try:
@@ -229,6 +230,7 @@ class _Scheduler:
             message: Message = worker.connection.recv()
         except (EOFError, OSError):  # the latter where it died in the middle of a message
             return self._died(index, worker)
+        worker.is_starting = False
         if isinstance(message, Boundary):
             worker.step = message.step
             self._take_cores(worker)
@@ -278,7 +280,7 @@ class _Scheduler:
         living = [worker for worker in self.workers if not worker.over]
         if any(worker.step == self.settings.steps for worker in self.workers):
             self.target = self.settings.steps  # one has made all its steps, and the others are close behind
-        elif not self.settings.checkpoints or any(worker.step == worker.begin for worker in living):
+        elif not self.settings.checkpoints or any(worker.is_starting for worker in living):
             self.target = -1  # a group that is still starting would keep the others waiting
         else:
             self.target = max(self._end_of_turn(worker) for worker in living)

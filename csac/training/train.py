@@ -53,7 +53,8 @@ if TYPE_CHECKING:
 
 # Measured resident size of a worker process with JAX, MuJoCo and the compiled programs, before its replay.
 BYTES_PER_PROCESS = 600 * 2**20
-BYTES_PER_EVALUATION_PROCESS = 200 * 2**20  # the same without JAX
+# Likewise of one that evaluates on MuJoCo, without JAX. PyBullet's environments take several times that, in line too.
+BYTES_PER_EVALUATION_PROCESS = 80 * 2**20
 
 _CANNOT_WRITE = (
     errno.ENOSPC,
@@ -185,7 +186,7 @@ def train(
     )
     if len(parts) > 1 or evaluation_processes:
         _check_picklable(settings)
-    if evaluation_processes is None and not stop_when and evaluation_interval < steps and _is_picklable(task):
+    if evaluation_processes is None and not stop_when and evaluation_interval < steps and _is_picklable(settings):
         settings = settings._replace(evaluation_processes=choose_evaluation_processes(parts, evaluation_episodes))
     notes = [_memory_note(settings, spec, seeds, len(parts)), *_warmup_note(algorithm, steps)]
     manifest = {
@@ -441,9 +442,9 @@ def _check_picklable(settings: Settings) -> None:
         ) from None
 
 
-def _is_picklable(task: Task) -> bool:
+def _is_picklable(settings: Settings) -> bool:
     try:
-        pickle.dumps(task)
+        pickle.dumps(settings)
     except Exception:
         return False
     return True
