@@ -157,7 +157,9 @@ class Recorder:
     def _commit(self, step: int) -> None:
         assert self.checkpoints
         self._flush(step)
-        files = {name: facts for part in self._saved[step].values() for name, facts in part.items()}
+        # In order of the groups, not of who was saved first, so that equal runs have equal checkpoints.
+        parts = [part for _, part in sorted(self._saved[step].items())]
+        files = {name: facts for part in parts for name, facts in part.items()}
         failures = {seed: text for seed, text in self.failures.items() if self._failed_at[seed] <= step}
         values = {"sizes": self.run.sync(), "failures": failures, "groups": self.groups}
         # Said before, so that no checkpoint is ever taken for exact that is not.
