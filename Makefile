@@ -44,13 +44,13 @@ check: $(SETUP)  ## Check format, lint, types and the direction of imports
 
 peers: $(PEERS) $(PARL)  ## Install what to measure against: into .venv-peers, and PARL into .venv-parl
 
-bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS)) $(if $(PARL_PYTHON),,$(PARL))  ## Measure speed beside the peers, 25 minutes: make bench ARGS=--quick
+bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS)) $(if $(PARL_PYTHON),,$(PARL))  ## Measure speed beside the peers: make bench ARGS=--quick
 	.venv/bin/python benchmarks/speed.py --out benchmarks $(ARGS)
 
-roofline: $(SETUP)  ## Measure how near training comes to the machine's limit, 25 minutes: make roofline ARGS='--repetitions 1'
+roofline: $(SETUP)  ## Measure how near training comes to the machine's limit: make roofline ARGS='--repetitions 1'
 	.venv/bin/python benchmarks/roofline.py --out benchmarks --page docs/performance.md $(ARGS)
 
-scaling: $(SETUP)  ## Measure what seeds, widths, batches, observations and replays cost, 15 minutes
+scaling: $(SETUP)  ## Measure what seeds, widths, batches, observations and replays cost
 	.venv/bin/python benchmarks/scaling.py --out benchmarks --page docs/performance.md $(ARGS)
 
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml

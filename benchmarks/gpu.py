@@ -1,7 +1,7 @@
 """Training on a GPU: seed-steps per second against seeds, and whether its numbers are those of the CPU.
 
     pip install 'csac[cuda]'
-    python benchmarks/gpu.py --out benchmarks           # ten minutes on one GPU; writes gpu.csv
+    python benchmarks/gpu.py --out benchmarks           # one GPU; writes gpu.csv
     python benchmarks/gpu.py --device cpu --quick       # does it run, without a GPU?
 
 What runs is `csac.train` on HalfCheetah-v4 with evaluation off, at the paper's settings: all seeds in one program, the

@@ -1,6 +1,6 @@
 """How near training comes to what this machine can multiply.
 
-    make roofline                            # 25 minutes on a quiet machine; writes the table of docs/performance.md
+    make roofline                            # on a quiet machine; writes the table of docs/performance.md
     make roofline ARGS='--repetitions 1'     # a look
 
 The limit is the float32 rate of one core at the product that dominates (256 x 256 x 256), times the cores. It is

@@ -1,6 +1,6 @@
 """What an update costs as the run grows: with seeds, width, batch, observation, replay; a table and a log-log picture.
 
-    make scaling          # fifteen minutes; writes scaling.csv, scaling.png and the tables of docs/performance.md
+    make scaling          # writes scaling.csv, scaling.png and the tables of docs/performance.md
 
 Seeds are trained as users train them, in as many processes as csac chooses. Everything else is one learner on all
 cores, without an environment. Every measurement is a process of its own.

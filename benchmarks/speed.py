@@ -1,6 +1,6 @@
 """Measure csac against its peers: environment steps, each with its update, per second.
 
-    make bench                       # everything, in less than half an hour; writes the table of README.md
+    make bench                       # everything; writes the table of README.md
     make bench ARGS=--quick          # does it run? Its numbers mean nothing and are only printed
 
 Every measurement is a process of its own, bound to its processors. README.md says how it is done and what was found.
