@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 import traceback
 from contextlib import closing
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from csac.training.checkpoint import remove_unfinished
 from csac.training.evaluation import ROWS
 from csac.training.loop import Boundary, Ended, Event, Group, Saved, Settings, is_boundary
-from csac.training.processes import cause_of_death, die_with_parent, move_to, usable_cores, worker_surroundings
+from csac.training.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -141,38 +140,16 @@ def is_regular(settings: Settings, step: int) -> bool:
     return settings.checkpoints is not None and (step == settings.steps or bool(interval and step % interval == 0))
 
 
-class _Worker:
-    """The parent's end of one group's process."""
+class _Worker(Child):
+    """The parent's end of one group's process, which is told an `Order`."""
 
     def __init__(self, settings: Settings, seeds: Sequence[int]) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
         # Not a daemon, which could not have processes that evaluate.
-        self.process = context.Process(target=_work, args=(theirs, settings, list(seeds)))
+        super().__init__(_work, settings, list(seeds), daemon=False)
         self.step = self.saved = settings.begin
         self.is_starting = True
         self.seeds, self.over = seeds, False
         self.cores: list[int] | None = None
-        try:
-            with worker_surroundings():
-                self.process.start()
-        except BaseException:  # a Ctrl-C that waited until the worker was there
-            if self.process.pid:
-                self.kill()
-            raise
-        theirs.close()
-
-    def tell(self, order: Order) -> None:
-        try:
-            self.connection.send(order)
-        except (BrokenPipeError, ConnectionResetError):
-            return  # its death is seen when we receive
-
-    def kill(self) -> None:
-        if self.process.is_alive():
-            self.process.kill()
-        self.process.join()
-        self.connection.close()
 
 
 class _Scheduler:

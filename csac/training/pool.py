@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import pickle
 import traceback
 from collections import deque
@@ -10,7 +9,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from csac.training.evaluation import EvaluationEpisode, EvaluationFailure, Evaluator
-from csac.training.processes import cause_of_death, die_with_parent, move_to, usable_cores, worker_surroundings
+from csac.training.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -194,31 +193,15 @@ class Running:
     def _hand_out(self) -> None:
         while self._waiting and self._idle:
             worker, batch = self._idle.pop(), self._waiting.popleft()
-            worker.ask(self._tasks[batch])
+            worker.tell(self._tasks[batch])
             self._busy[worker] = batch
 
 
-class _Worker:
-    """The parent's end of one process."""
+class _Worker(Child):
+    """The parent's end of one process, which is told the `Work` to do."""
 
     def __init__(self, evaluator: Evaluator, cores: Sequence[int] | None) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, evaluator, cores), daemon=True)
-        try:
-            with worker_surroundings():
-                self.process.start()
-        except BaseException:  # a Ctrl-C that waited until the worker was there
-            if self.process.pid:
-                self.kill()
-            raise
-        theirs.close()
-
-    def ask(self, work: Work) -> None:
-        try:
-            self.connection.send(work)
-        except (BrokenPipeError, ConnectionResetError):
-            return  # its death is seen when we receive
+        super().__init__(_work, evaluator, cores, daemon=True)
 
     def answer(self) -> Answer:
         try:
@@ -226,12 +209,6 @@ class _Worker:
         except (EOFError, OSError):
             self.kill()
             return ProcessDied(f"the evaluation was broken off: {cause_of_death(self.process.exitcode)}")
-
-    def kill(self) -> None:
-        if self.process.is_alive():
-            self.process.kill()
-        self.process.join()
-        self.connection.close()
 
 
 def _work(connection: Connection, evaluator: Evaluator, cores: Sequence[int] | None) -> None:

@@ -7,12 +7,12 @@ import multiprocessing
 import os
 import signal
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
 _PR_SET_PDEATHSIG = 1
 
@@ -38,6 +38,35 @@ def die_with_parent() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if parent and os.getppid() != parent.pid:  # it died before it was asked
             os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Child:
+    """A process that runs `work(connection, *arguments)`, and this end of the pipe to it."""
+
+    def __init__(self, work: Callable[..., None], *arguments: Any, daemon: bool) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=work, args=(theirs, *arguments), daemon=daemon)
+        try:
+            with worker_surroundings():
+                self.process.start()
+        except BaseException:  # a Ctrl-C that waited until the process was there
+            if self.process.pid:
+                self.kill()
+            raise
+        theirs.close()
+
+    def tell(self, message: Any) -> None:
+        """Send a message; that the process is dead is seen when one is received."""
+        with suppress(BrokenPipeError, ConnectionResetError):
+            self.connection.send(message)
+
+    def kill(self) -> None:
+        """End the process at once, and wait until it is gone."""
+        if self.process.is_alive():
+            self.process.kill()
+        self.process.join()
+        self.connection.close()
 
 
 @contextmanager
