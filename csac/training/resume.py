@@ -260,8 +260,10 @@ def _restore_best_policies(run: RunDirectory, checkpoint: Checkpoint | None) -> 
 
 def _fixed(manifest: dict[str, Any]) -> dict[str, Any]:
     fixed = {name: manifest.get(name, _BEFORE_THERE_WERE.get(name)) for name in _FIXED}
-    if "updates_per_step" in (hyperparameters := fixed["hyperparameters"] or {}):
-        fixed["hyperparameters"] = {"update_interval": 1, **hyperparameters}  # older runs all learnt in strict order
+    if fixed["algorithm"] in ALGORITHMS and isinstance(fixed["hyperparameters"], dict):
+        # The default of a hyperparameter that an older run has not got is what it did.
+        defaults = {field.name: field.default for field in dataclasses.fields(ALGORITHMS[fixed["algorithm"]])}
+        fixed["hyperparameters"] = {**defaults, **fixed["hyperparameters"]}
     return fixed
 
 
