@@ -39,8 +39,8 @@ def learn() -> None:
         before = learner._buffers
         outcome = Steps(observation * step, np.ones(1, np.float32), ends, ends, observation * step, [], [])
         action = learner.step(observation * (step - 1), action, outcome, step)
-        donated.append(all(buffer.is_deleted() for buffer in before))
-    bits = b"".join(np.asarray(buffer).tobytes() for buffer in learner._buffers)
+        donated.append(all(buffer.is_deleted() for buffer in jax.tree.leaves(before)))
+    bits = b"".join(np.asarray(buffer).tobytes() for buffer in jax.tree.leaves(learner._buffers))
     loaded = events.count("/jax/compilation_cache/cache_hits")
     print(json.dumps({"bits": hashlib.sha256(bits).hexdigest(), "loaded": loaded, "donated": donated}))
 

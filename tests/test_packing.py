@@ -1,0 +1,54 @@
+"""Small arrays in one row, and back."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from csac.training.packing import Packing
+
+
+class Tree(NamedTuple):
+    bias: Any
+    count: Any
+    hidden: Any
+    number: Any
+
+
+def tree(start: float = 0.0) -> Tree:
+    hidden = np.arange(200 * 200, dtype=np.float32).reshape(200, 200)
+    bias = start + np.arange(6, dtype=np.float32).reshape(2, 3)
+    return Tree(bias, np.int32(2**24 + 1), hidden + start, np.float32(7 + start))
+
+
+def test_only_small_floats_are_in_the_row():
+    row, count, hidden = Packing(tree()).pack(tree())
+    np.testing.assert_array_equal(row, [0, 1, 2, 3, 4, 5, 7])
+    assert count.dtype == jnp.int32
+    assert int(count) == 2**24 + 1
+    np.testing.assert_array_equal(hidden, tree().hidden)
+
+
+def test_what_was_packed_is_unpacked():
+    packing = Packing(tree())
+    for given, again in zip(tree(), packing.unpack(packing.pack(tree())), strict=True):
+        assert given.shape == again.shape
+        assert given.dtype == again.dtype
+        np.testing.assert_array_equal(again, given)
+
+
+def test_seeds_side_by_side_are_unpacked_by_seed():
+    packing, seeds = Packing(tree()), [tree(), tree(10.0)]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *seeds)
+    packed = jax.vmap(packing.pack)(stacked)
+    assert packed[0].shape == (2, 7)
+    for given, again in zip(stacked, packing.unpack(packed), strict=True):
+        np.testing.assert_array_equal(again, given)
+
+
+def test_a_tree_without_small_floats_has_an_empty_row():
+    packing = Packing({"count": np.int32(3)})
+    row, count = packing.pack({"count": np.int32(3)})
+    assert row.shape == (0,)
+    assert int(packing.unpack([row, count])["count"]) == 3
