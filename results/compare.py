@@ -13,7 +13,17 @@ import numpy as np
 
 from csac.record.plots import learning_curve
 from csac.record.run import read_rows
-from csac.record.statistics import is_case, last_evaluations, maximum_average_return, mean_and_interval, mean_told
+from csac.record.statistics import (
+    FEWEST_SEEDS,
+    evaluation_matrix,
+    interquartile_mean,
+    is_case,
+    last_evaluations,
+    maximum_average_return,
+    mean_and_interval,
+    mean_told,
+    stratified_bootstrap_interval,
+)
 
 
 def up_to(rows: np.ndarray, step: int | None) -> np.ndarray:
@@ -22,12 +32,18 @@ def up_to(rows: np.ndarray, step: int | None) -> np.ndarray:
 
 
 def table(runs: list[tuple[str, np.ndarray]]) -> str:
-    """Return a Markdown table: each run's last three evaluations, maximum average return, and success if it is told."""
+    """Return a Markdown table: each run's last three evaluations, maximum average return, and success if it is told.
+
+    Where a run has seeds enough for a bootstrap there is the interquartile mean as well.
+    """
     tells = any(is_case(rows["success"]) for _, rows in runs)
+    has_many = any(len(np.unique(rows["seed"])) >= FEWEST_SEEDS for _, rows in runs)
     lines = [
         "| run | seeds | steps | last three evaluations, mean ± std over seeds | 95 % t-interval | to the first "
-        "| maximum average return |" + " success, last three evaluations |" * tells,
-        "|---|---|---|---|---|---|---|" + "---|" * tells,
+        "| maximum average return |"
+        + " IQM, 95 % bootstrap interval |" * has_many
+        + " success, last three evaluations |" * tells,
+        "|---|---|---|---|---|---|---|" + "---|" * (has_many + tells),
     ]
     first = None
     for label, rows in runs:
@@ -40,9 +56,19 @@ def table(runs: list[tuple[str, np.ndarray]]) -> str:
         ratio = f"{mean / first:.2f}" if first > 0 else ""  # of costs, it would be the larger the worse
         lines.append(
             f"| {label} | {len(last)} | {rows['step'].max():,} | {mean:{form}} ± {spread:{form}} "
-            f"| {low:{form}} to {high:{form}} | {ratio} | {best:{form}} at {step:,} |" + f" {success(rows)} |" * tells
+            f"| {low:{form}} to {high:{form}} | {ratio} | {best:{form}} at {step:,} |"
+            + f" {middle(rows, form)} |" * has_many
+            + f" {success(rows)} |" * tells
         )
     return "\n".join(lines)
+
+
+def middle(rows: np.ndarray, form: str, points: int = 3) -> str:
+    """Return the interquartile mean of the last evaluations of all seeds, and its interval where there are enough."""
+    returns = evaluation_matrix(rows)[2][:, -points:]
+    interval = stratified_bootstrap_interval(returns, interquartile_mean)
+    told = f"{interquartile_mean(returns):{form}}"
+    return told + (f" ({interval[0]:{form}} to {interval[1]:{form}})" if interval else "")
 
 
 def success(rows: np.ndarray, points: int = 3) -> str:
