@@ -24,7 +24,7 @@ from report import table
 from update_speed import Driver, make_learner
 
 from csac.algorithms import networks
-from csac.training import packing
+from csac.training import learner
 from csac.types import Spec
 
 OWN_MAKE_CRITICS, OWN_CALL, OWN_NORMAL = networks.make_critics, networks.MLP.__call__, jax.random.normal
@@ -100,7 +100,7 @@ TRIALS: dict[str, tuple[Callable, dict[str, Any]]] = {
     ),
     "bfloat16 operands in forward products": (lambda: with_attribute(networks.MLP, "__call__", bfloat16_call), {}),
     "noise computed once": (lambda: with_attribute(jax.random, "normal", kept_normal), {}),
-    "a buffer for every array": (lambda: with_attribute(packing, "_SMALL", 0), {}),
+    "a buffer for every array": (lambda: with_attribute(learner, "SMALL", 0), {}),
 }
 
 

@@ -23,7 +23,7 @@ def tree(start: float = 0.0) -> Tree:
 
 
 def test_only_small_floats_are_in_the_row():
-    row, count, hidden = Packing(tree()).pack(tree())
+    row, count, hidden = Packing(tree(), 100).pack(tree())
     np.testing.assert_array_equal(row, [0, 1, 2, 3, 4, 5, 7])
     assert count.dtype == jnp.int32
     assert int(count) == 2**24 + 1
@@ -31,7 +31,7 @@ def test_only_small_floats_are_in_the_row():
 
 
 def test_what_was_packed_is_unpacked():
-    packing = Packing(tree())
+    packing = Packing(tree(), 100)
     for given, again in zip(tree(), packing.unpack(packing.pack(tree())), strict=True):
         assert given.shape == again.shape
         assert given.dtype == again.dtype
@@ -39,7 +39,7 @@ def test_what_was_packed_is_unpacked():
 
 
 def test_seeds_side_by_side_are_unpacked_by_seed():
-    packing, seeds = Packing(tree()), [tree(), tree(10.0)]
+    packing, seeds = Packing(tree(), 100), [tree(), tree(10.0)]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *seeds)
     packed = jax.vmap(packing.pack)(stacked)
     assert packed[0].shape == (2, 7)
@@ -48,7 +48,7 @@ def test_seeds_side_by_side_are_unpacked_by_seed():
 
 
 def test_a_tree_without_small_floats_has_an_empty_row():
-    packing = Packing({"count": np.int32(3)})
+    packing = Packing({"count": np.int32(3)}, 100)
     row, count = packing.pack({"count": np.int32(3)})
     assert row.shape == (0,)
     assert int(packing.unpack([row, count])["count"]) == 3

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from csac.training.environments import Steps
     from csac.types import Algorithm, PolicyParameters, Spec
 
+# Elements of an array that travels packed with others. Hidden layers of 256 x 256 have more, since XLA would copy them
+# out of the row at every use.
+SMALL = 2**15
+
 
 class Learner:
     """The compiled programs of one group. Seeds are the leading axis of everything that enters and leaves.
@@ -195,7 +199,11 @@ class Learner:
         state, memory = self.algorithm.init(init_key, self.spec, steps), self.algorithm.memory(self.spec, steps)
         batch = jax.eval_shape(lambda: self._draw(memory, run_key, jnp.int32(1)))
         metrics = jax.eval_shape(self._update, state, batch, run_key, jnp.int32(0))[1]
-        self._metrics, self._packing = list(metrics), Packing(state)
+        # What acts more often than it learns would take its policy out of the row again and again.
+        self._metrics, self._packing = (
+            list(metrics),
+            Packing(state, SMALL if self.algorithm.update_interval == 1 else 0),
+        )
         return self._packing.pack(state), memory, jnp.zeros(len(metrics)), jax.random.key_data(run_key)
 
     def _remember_and_explore(self, carry: tuple, rows: jax.Array, observation: jax.Array, step: jax.Array):

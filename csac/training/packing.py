@@ -11,21 +11,19 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-# Elements. Hidden layers of 256 x 256 stay as they are, since XLA would copy them out of a row at every use.
-_SMALL = 2**15
-
 
 class Packing:
     """How the leaves of a tree become buffers: the small floats in one row, then the other leaves in their order.
 
     Args:
         tree: a tree of arrays, or of their shapes, such as those that will be packed.
+        below: how many elements a leaf has that is no longer small.
     """
 
-    def __init__(self, tree: Any) -> None:
+    def __init__(self, tree: Any, below: int) -> None:
         leaves, self._structure = jax.tree.flatten(tree)
         self._shapes = [leaf.shape for leaf in leaves]
-        self._is_small = [leaf.dtype == jnp.float32 and leaf.size < _SMALL for leaf in leaves]
+        self._is_small = [leaf.dtype == jnp.float32 and leaf.size < below for leaf in leaves]
 
     def pack(self, tree: Any) -> list[jax.Array]:
         """Return the buffers."""
