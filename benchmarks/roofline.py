@@ -187,7 +187,7 @@ def main() -> None:
     settings = [setting for setting in SETTINGS if arguments.only in f"{setting.name} {setting.algorithm}"]
     if not settings:
         sys.exit(f"no setting contains {arguments.only!r}")
-    protocol, measurements = Protocol(), []
+    protocol, measurements = Protocol(seconds_of_five=30), []  # five seeds take turns of a second and more
     for repetition in range(arguments.repetitions):
         before = one_core_rate()
         for setting in settings:
