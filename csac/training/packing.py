@@ -26,7 +26,7 @@ class Packing:
         self._is_small = [leaf.dtype == jnp.float32 and leaf.size < below for leaf in leaves]
 
     def pack(self, tree: Any) -> list[jax.Array]:
-        """Return the buffers."""
+        """Return the buffers: a row of all small floats, [their number], then the other leaves as they are."""
         leaves = jax.tree.leaves(tree)
         small = [leaf.ravel() for leaf, is_small in zip(leaves, self._is_small, strict=True) if is_small]
         others = [leaf for leaf, is_small in zip(leaves, self._is_small, strict=True) if not is_small]
