@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from csac import CSAC
-from csac.training.checkpoint import Checkpoints, Ring, SeedFiles, newest_sound
-from csac.training.environments import Steps
+from csac.tasks.seeds import Steps
+from csac.training.checkpoint import Checkpoints, SeedFiles, newest_sound
 from csac.training.learner import Learner
-from csac.types import Spec
+from csac.types import Ring, Spec
 
 SEEDS, NEW, CAPACITY = 5, 50_000, 1_000_000
 HELD = (50_000, 100_000, 500_000, 1_000_000, 1_500_000)

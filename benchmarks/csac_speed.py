@@ -19,8 +19,8 @@ from rich.console import Console
 
 from csac import train
 from csac.algorithms import ALGORITHMS
+from csac.console.progress import Reporter
 from csac.presets import hyperparameters
-from csac.training.progress import Reporter
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -21,10 +21,11 @@ from typing import Any
 import jax
 
 from csac.algorithms import ALGORITHMS
+from csac.evaluation.evaluator import Evaluator
+from csac.evaluation.pool import EvaluationPool
 from csac.presets import hyperparameters
-from csac.training.evaluation import Evaluator
-from csac.training.loop import Group, Settings
-from csac.training.pool import EvaluationPool
+from csac.training.group import Group
+from csac.training.messages import Settings
 
 INTERVAL, WARMUP, STEPS, NEVER = 5_000, 150, 100, 10**9
 

@@ -20,7 +20,8 @@ import jax
 
 from csac.algorithms import ALGORITHMS
 from csac.presets import hyperparameters
-from csac.training.loop import Group, Settings
+from csac.training.group import Group
+from csac.training.messages import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

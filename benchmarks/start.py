@@ -41,7 +41,7 @@ class FirstUpdate(Exception):
 def train_until_first_update(seeds: str) -> None:
     """Be `csac train` until then, and print the time."""
     from csac.cli import main
-    from csac.training import progress
+    from csac.console import progress
 
     class Watch(progress.Reporter):
         def progress(self, steps_by_seed: Mapping[int, int]) -> None:

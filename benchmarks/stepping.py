@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from csac.training.environments import Environment
+from csac.tasks.environment import Environment
 
 TASKS = ("HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4", "PyFlyt/QuadX-Waypoints-v1", "PandaReach-v3")
 

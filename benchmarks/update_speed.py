@@ -17,7 +17,7 @@ import numpy as np
 
 from csac.algorithms import ALGORITHMS
 from csac.presets import hyperparameters
-from csac.training.environments import Steps
+from csac.tasks.seeds import Steps
 from csac.training.learner import Learner
 from csac.types import Spec
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from csac.algorithms.sd3 import SD3
     from csac.algorithms.td3 import TD3
     from csac.deploy.policy import Policy, load
-    from csac.training.evaluation import evaluate
+    from csac.evaluation.evaluator import evaluate
     from csac.training.train import resume, train
     from csac.types import InputError
 
@@ -50,7 +50,7 @@ _MODULES = {
     "TD3": "csac.algorithms.td3",
     "InputError": "csac.types",
     "Policy": "csac.deploy.policy",
-    "evaluate": "csac.training.evaluation",
+    "evaluate": "csac.evaluation.evaluator",
     "load": "csac.deploy.policy",
     "train": "csac.training.train",
     "resume": "csac.training.train",

@@ -207,7 +207,7 @@ def _train(arguments: list[str]) -> int:
     if options.resume and options.directory is None:
         raise InputError("--resume needs the run's --directory (csac resume DIR does without)")
 
-    from csac.training.progress import Reporter
+    from csac.console.progress import Reporter
     from csac.training.train import train
 
     return _exit_code(
@@ -239,7 +239,7 @@ def _train(arguments: list[str]) -> int:
 
 def _resume(arguments: list[str]) -> int:
     options = parse(Resume, arguments, "csac resume")
-    from csac.training.progress import Reporter
+    from csac.console.progress import Reporter
     from csac.training.train import resume
 
     command = shlex.join(["csac", "resume", *arguments])
@@ -252,8 +252,8 @@ def _resume(arguments: list[str]) -> int:
 
 def _exit_code(training: Callable[[], RunDirectory]) -> int:
     """Train, and turn how it ended into an exit code and, where it did not reach its end, the line to type next."""
+    from csac.console.tables import program
     from csac.record.run import StorageFailure
-    from csac.training.console import program
     from csac.training.train import Interrupted
 
     try:
@@ -286,12 +286,12 @@ def _perturbations(given: tuple[str, ...]) -> tuple[str, ...] | None:
 
 def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
+    from csac.console.progress import told_progress
+    from csac.console.tables import case_table, evaluation_table, make_console, silent_events
+    from csac.evaluation.evaluator import EvaluationFailure
+    from csac.evaluation.play import evaluate_run, told_perturbations
     from csac.record.run import RunDirectory
     from csac.record.tables import COLUMNS, check_new, write_rows
-    from csac.training.console import case_table, evaluation_table, make_console, silent_events
-    from csac.training.evaluation import EvaluationFailure
-    from csac.training.play import evaluate_run, told_perturbations
-    from csac.training.progress import told_progress
 
     console = make_console()
     told = told_perturbations(options.run, options.perturb)
@@ -331,9 +331,9 @@ def _evaluate(arguments: list[str]) -> int:
 
 def _play(arguments: list[str]) -> int:
     options = parse(Play, arguments, "csac play")
-    from csac.training.console import make_console
-    from csac.training.environments import EnvironmentFailure
-    from csac.training.play import play, told_perturbations
+    from csac.console.tables import make_console
+    from csac.evaluation.play import play, told_perturbations
+    from csac.tasks.spaces import EnvironmentFailure
 
     console = make_console()
     for line in told_perturbations(options.run, options.perturb):
@@ -352,8 +352,8 @@ def _play(arguments: list[str]) -> int:
 
 def _runs(arguments: list[str]) -> int:
     options = parse(Runs, arguments, "csac runs")
+    from csac.console.tables import make_console, runs_table
     from csac.record.run import find_runs
-    from csac.training.console import make_console, runs_table
 
     is_default = options.directory == Path("runs")
     runs = [] if is_default and not options.directory.exists() else find_runs(options.directory)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, 
 
 if TYPE_CHECKING:
     import jax
+    import numpy as np
 
 Array: TypeAlias = Any  # a JAX array while learning, a NumPy array in what leaves
 Metrics: TypeAlias = dict[str, Any]  # name -> scalar JAX array
@@ -77,6 +78,26 @@ class PolicyNetwork(NamedTuple):
     parameters: PolicyParameters
     activation: Literal["relu", "tanh"] = "relu"
     head: Literal["tanh_gaussian", "tanh", "clipped_gaussian"] = "tanh_gaussian"
+
+
+class Snapshot(NamedTuple):
+    """Arrays by name, and values that JSON can hold."""
+
+    arrays: dict[str, np.ndarray]
+    values: dict[str, Any]
+
+    def part(self, name: str) -> Snapshot:
+        """Return what was saved under this name: arrays called `name.<their name>`, and one of the values."""
+        prefix = f"{name}."
+        arrays = {key.removeprefix(prefix): array for key, array in self.arrays.items() if key.startswith(prefix)}
+        return Snapshot(arrays, self.values[name])
+
+
+class Ring(NamedTuple):
+    """A seed's memory: transition number i lies in row i % capacity, as far as `count` of them were added."""
+
+    rows: np.ndarray  # [capacity, width]
+    count: int
 
 
 class Algorithm(Protocol):

@@ -13,8 +13,8 @@ import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
 
 from csac.algorithms import SAC
-from csac.training.environments import EVALUATION_SEED
-from csac.training.groups import choose_evaluation_processes
+from csac.tasks.seeds import EVALUATION_SEED
+from csac.training.scheduler import choose_evaluation_processes
 from csac.training.train import resume, train
 from csac.types import InputError
 
@@ -157,7 +157,7 @@ def processes_of(directory: Path) -> set[float]:
     ids=["a core to spare", "none to spare", "a function", "stop_when", "at the end alone"],
 )
 def test_processes_are_used_where_they_pay(tmp_path, monkeypatch, cores, task, settings, here):
-    monkeypatch.setattr("csac.training.groups.usable_cores", lambda: list(range(cores)))
+    monkeypatch.setattr("csac.training.scheduler.usable_cores", lambda: list(range(cores)))
     told = run(
         tmp_path / "run", None, task, environment_arguments={"tell": True}, events=["process", "has_jax"], **settings
     )
@@ -180,7 +180,7 @@ def test_processes_are_used_where_they_pay(tmp_path, monkeypatch, cores, task, s
     ],
 )
 def test_processes_are_as_many_as_cores_are_to_spare(monkeypatch, cores, groups, episodes, processes):
-    monkeypatch.setattr("csac.training.groups.usable_cores", lambda: list(range(cores)))
+    monkeypatch.setattr("csac.training.scheduler.usable_cores", lambda: list(range(cores)))
     assert choose_evaluation_processes(groups, episodes) == processes
 
 

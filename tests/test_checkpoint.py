@@ -24,26 +24,25 @@ from hypothesis.extra import numpy as hnp
 
 from csac import cli
 from csac.algorithms import CSAC
-from csac.deploy.policy import Contract, Policy
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
 from csac.record.run import RunDirectory
+from csac.record.tensorboard import TensorBoardLog
+from csac.tasks.seeds import SeedEnvironments
 from csac.training.checkpoint import (
     Checkpoint,
     Checkpoints,
     Damaged,
-    Ring,
     SeedFiles,
     newest_sound,
     remove_unfinished,
     steps_in,
 )
-from csac.training.environments import SeedEnvironments
-from csac.training.groups import GroupCrashed, GroupRestarted, _Scheduler
-from csac.training.logs import TensorBoardLog
-from csac.training.loop import Ended, Failed, Progress, Rows, Saved, Settings
+from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Rows, Saved, Settings
 from csac.training.recorder import Recorder
-from csac.training.snapshots import Snapshot
+from csac.training.scheduler import _Scheduler
 from csac.training.train import resume, train
-from csac.types import InputError
+from csac.types import InputError, Ring, Snapshot
 
 WIDTH = 3
 few = settings(max_examples=25, deadline=None)

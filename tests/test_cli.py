@@ -16,7 +16,8 @@ import csac.training.train as training
 from csac.algorithms import ALGORITHMS, CSAC, SAC
 from csac.arguments import peek
 from csac.cli import main
-from csac.deploy.policy import Contract, Policy
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
 from csac.record.run import RunDirectory
 from csac.training.checkpoint import Checkpoint
 from csac.training.resume import Source

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from csac.algorithms import CSAC
+from csac.tasks.seeds import Steps
 from csac.training import compilation
-from csac.training.environments import Steps
 from csac.training.learner import Learner
 from csac.training.train import train
 from csac.types import Spec

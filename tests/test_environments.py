@@ -15,14 +15,9 @@ import probes
 import pytest
 from gymnasium import spaces
 
-from csac.training.environments import (
-    EVALUATION_SEED,
-    FRESH_EVALUATION_SEED,
-    Environment,
-    EnvironmentFailure,
-    SeedEnvironments,
-    training_seed,
-)
+from csac.tasks.environment import Environment
+from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED, SeedEnvironments, training_seed
+from csac.tasks.spaces import EnvironmentFailure
 from csac.types import InputError, Spec
 
 UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -448,7 +443,7 @@ def test_a_stopped_seed_steps_no_more():
 
 RUN = """
 import numpy as np
-from csac.training.environments import Environment, SeedEnvironments
+from csac.tasks.environment import Environment, SeedEnvironments
 environments = SeedEnvironments("HalfCheetah-v4", None, [0, 1])
 environments.reset()
 environments.step(np.zeros((2, 6), np.float32))
@@ -476,7 +471,7 @@ def test_missing_mujoco_is_told_with_what_to_install(tmp_path):
     code = """
 import sys
 sys.modules["mujoco"] = None
-from csac.training.environments import Environment
+from csac.tasks.environment import Environment
 from csac.types import InputError
 Environment("Pendulum-v1")
 try:

@@ -10,10 +10,13 @@ import probes
 import pytest
 from gymnasium import spaces
 
-from csac.deploy.policy import Contract, Policy
-from csac.training import evaluation
-from csac.training.environments import EVALUATION_SEED, FRESH_EVALUATION_SEED, Environment, Task
-from csac.training.evaluation import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, evaluate
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
+from csac.evaluation import evaluator
+from csac.evaluation.evaluator import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, evaluate
+from csac.tasks.environment import Environment
+from csac.tasks.making import Task
+from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 
 
@@ -258,6 +261,6 @@ def test_reports_use_other_episodes_than_training():
 
 
 def test_an_episode_that_never_ends_is_broken_off(monkeypatch):
-    monkeypatch.setattr(evaluation, "LONGEST_EPISODE", 30)
+    monkeypatch.setattr(evaluator, "LONGEST_EPISODE", 30)
     episodes = Evaluator(lambda: probes.Endless(length=10**9), episodes=2).run(policy_for(probes.Endless))
     assert [episode.length for episode in episodes] == [30, 30]

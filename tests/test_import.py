@@ -37,7 +37,7 @@ def test_the_help_of_train_imports_no_task_and_no_picture():
 
 
 def test_what_only_the_end_of_a_run_needs_is_not_imported_at_its_start():
-    code = "import csac.training.train, csac.training.progress, csac.training.groups"
+    code = "import csac.training.train, csac.console.progress, csac.training.scheduler"
 
     assert not {"matplotlib", "scipy", "tensorboardX", "imageio_ffmpeg"} & modules_after(code)
 

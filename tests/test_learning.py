@@ -9,7 +9,7 @@ import pytest
 from trainer import run
 
 from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
-from csac.training.loop import Evaluated
+from csac.training.messages import Evaluated
 
 SETTINGS: dict[str, Any] = {
     "discount": 0.95,

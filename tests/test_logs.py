@@ -4,7 +4,7 @@ from collections import defaultdict
 import pytest
 from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
 
-from csac.training.logs import TensorBoardLog
+from csac.record.tensorboard import TensorBoardLog
 
 
 def scalars(directory):

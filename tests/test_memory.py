@@ -15,7 +15,7 @@ from trainer import run
 
 from csac.algorithms import CSAC, SAC
 from csac.algorithms.memory import Replay, Rollout, pack, row_width, unpack
-from csac.training.environments import training_seed
+from csac.tasks.seeds import training_seed
 from csac.types import Layer, PolicyNetwork, PolicyParameters, Spec, Transition
 
 SPEC = Spec(2, 1)

@@ -19,25 +19,19 @@ from gymnasium.envs.mujoco import MujocoEnv
 from test_resume import LEARNERS, Crash, contents, crash_at, run
 from test_snapshots import steps_of
 
-from csac.deploy.policy import Contract, Policy, load
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy, load
+from csac.evaluation.evaluator import Evaluator, evaluate
 from csac.record.run import RunDirectory
-from csac.training import loop
-from csac.training.environments import EVALUATION_SEED, Environment, SeedEnvironments
-from csac.training.evaluation import Evaluator, evaluate
-from csac.training.loop import Progress
-from csac.training.perturb import (
-    Perturbation,
-    by_step,
-    continued,
-    lasting,
-    perturbations_of,
-    refuse_late,
-    values_at,
-)
+from csac.tasks.environment import Environment
+from csac.tasks.perturbations import Perturbation, by_step, continued, lasting, perturbations_of, refuse_late, values_at
+from csac.tasks.seeds import EVALUATION_SEED, SeedEnvironments
+from csac.tasks.snapshots import _mujoco_arrays
+from csac.training import messages
+from csac.training.messages import Progress
 from csac.training.recorder import Recorder
-from csac.training.snapshots import Snapshot, _mujoco_arrays
 from csac.training.train import resume
-from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
+from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters, Snapshot
 
 PAPER_TASKS = ["HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"]
 
@@ -526,18 +520,18 @@ def test_a_foreign_policy_meets_the_same_task():
     assert (ours != evaluate(policy, "Hopper-v4", 3)).all()
 
 
-# In the loop.
+# In the group.
 
 
-def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-v4") -> loop.Group:
-    settings = loop.Settings(
+def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-v4") -> group.Group:
+    settings = messages.Settings(
         LEARNERS[0], task, {}, 400, 30, 1, folder, 0, begin, perturbations=perturbations_of(perturbations)
     )
-    return loop.Group(settings, (3,))
+    return group.Group(settings, (3,))
 
 
-def advance(group: loop.Group, until: int) -> list[loop.Event]:
-    return [event for event in group.run(lambda: group.step == until) if not isinstance(event, loop.Ended)]
+def advance(group: group.Group, until: int) -> list[messages.Event]:
+    return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
 
 
 def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
@@ -546,7 +540,7 @@ def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
     plain = group(tmp_path, ())
     own = model_of(plain.environments.environments[0]).geom_friction.copy()
     at_30 = [advance(one, 30) for one in (perturbed, plain)]
-    rows = [[event.rows for event in events if isinstance(event, loop.Evaluated)] for events in at_30]
+    rows = [[event.rows for event in events if isinstance(event, messages.Evaluated)] for events in at_30]
     assert rows[0] == rows[1]
     assert len(rows[0]) == 1
     training, evaluation = perturbed.environments.environments[0], perturbed.evaluator._environments[0]
@@ -611,7 +605,7 @@ def test_what_a_run_does_not_reach_is_not_told(tmp_path):
     manifest = {"task": "Hopper-v4", "algorithm": "csac", "seeds": [0], "steps": 900}
     record = RunDirectory.create(tmp_path / "run", manifest)
     recorder = Recorder(record, [[0]], None, None, perturbations=[(300, "friction x 2")])
-    recorder.handle(0, loop.Ended(300, {}))
+    recorder.handle(0, messages.Ended(300, {}))
     recorder.close()
     assert not (record.path / "log.txt").exists()
 

@@ -16,7 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from csac.deploy.policy import Activation, Contract, Head, Policy, load
+from csac.deploy.contract import Activation, Contract, Head
+from csac.deploy.policy import Policy, load
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
 
 DICT_PARTS = (("achieved", (2,)), ("position", (1, 2)), ("speed", ()))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from csac.record.run import RunDirectory
-from csac.training.console import (
+from csac.console.progress import Reporter, Speed, sparkline
+from csac.console.tables import (
     duration,
     evaluation_table,
     make_console,
@@ -15,8 +15,8 @@ from csac.training.console import (
     runs_table,
     short,
 )
-from csac.training.evaluation import EvaluationEpisode
-from csac.training.progress import Reporter, Speed, sparkline
+from csac.evaluation.evaluator import EvaluationEpisode
+from csac.record.run import RunDirectory
 
 DIRECTORY = "runs/Hopper-v4/csac/now"
 

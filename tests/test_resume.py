@@ -18,9 +18,9 @@ import trainer  # noqa: F401  (its cache of compiled programs)
 
 from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
 from csac.record.run import RunDirectory
-from csac.training import loop
+from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, steps_in
-from csac.training.groups import run_groups
+from csac.training.scheduler import run_groups
 from csac.training.train import resume, train
 from csac.types import InputError
 
@@ -43,15 +43,15 @@ LEARNERS = [
 SHORT: dict[str, Any] = {"evaluation_interval": 100, "evaluation_episodes": 2, "tensorboard": False}
 
 
-def group(folder: Path, algorithm, seeds, steps: int, begin: int = 0, task: Any = "Hopper-v4") -> loop.Group:
-    return loop.Group(loop.Settings(algorithm, task, {}, steps, 1000, 1, folder, 0, begin), seeds)
+def group(folder: Path, algorithm, seeds, steps: int, begin: int = 0, task: Any = "Hopper-v4") -> group.Group:
+    return group.Group(messages.Settings(algorithm, task, {}, steps, 1000, 1, folder, 0, begin), seeds)
 
 
-def advance(group: loop.Group, until: int) -> list[loop.Event]:
-    return [event for event in group.run(lambda: group.step == until) if not isinstance(event, loop.Ended)]
+def advance(group: group.Group, until: int) -> list[messages.Event]:
+    return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
 
 
-def everything(group: loop.Group) -> list[np.ndarray]:
+def everything(group: group.Group) -> list[np.ndarray]:
     """What a group has learnt, remembers and does next."""
     leaves = jax.tree.leaves(group.learner._carry)
     return [np.asarray(leaf) for leaf in leaves] + [group._actions, group._observations, group.learner._waiting]
@@ -261,7 +261,7 @@ def test_a_failed_seed_stays_failed_and_the_others_go_on(tmp_path):
 
 
 def probes_seed(seed: int, episode: int) -> int:
-    from csac.training.environments import training_seed
+    from csac.tasks.seeds import training_seed
 
     return training_seed(seed, episode)
 
@@ -403,9 +403,9 @@ def test_a_manifest_that_lacks_something_is_refused(tmp_path, finished):
 
 def test_a_diverged_seed_names_its_first_bad_array_and_is_not_saved(tmp_path):
     wild = replace(LEARNERS[0], critic_learning_rate=1e30, actor_learning_rate=1e30)
-    settings = loop.Settings(wild, "Hopper-v4", {}, 300, 1000, 1, tmp_path / "checkpoint", 50)
-    messages = [message for _, message in run_groups(settings, [[0]], lambda: False)]
-    (failed,) = [message for message in messages if isinstance(message, loop.Failed)]
+    settings = messages.Settings(wild, "Hopper-v4", {}, 300, 1000, 1, tmp_path / "checkpoint", 50)
+    told = [message for _, message in run_groups(settings, [[0]], lambda: False)]
+    (failed,) = [message for message in told if isinstance(message, messages.Failed)]
     assert "actor.layers[0].weight is not finite" in failed.reason
     assert 40 <= failed.step <= 50
-    assert not [message for message in messages if isinstance(message, loop.Saved) and message.step >= failed.step]
+    assert not [message for message in told if isinstance(message, messages.Saved) and message.step >= failed.step]

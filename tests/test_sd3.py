@@ -14,7 +14,8 @@ import pytest
 from csac.algorithms import sd3 as file
 from csac.algorithms.networks import MLP
 from csac.algorithms.sd3 import SD3, Pair, State, actor_loss, critic_loss, log_density, softmax_operator
-from csac.deploy.policy import Contract, Policy
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
 from csac.types import InputError, Layer, Spec, Transition
 
 ONE = Spec(1, 1)

@@ -9,8 +9,10 @@ import numpy as np
 import probes
 import pytest
 
-from csac.training.environments import Environment, EnvironmentFailure, SeedEnvironments
-from csac.training.snapshots import Snapshot
+from csac.tasks.environment import Environment
+from csac.tasks.seeds import SeedEnvironments
+from csac.tasks.spaces import EnvironmentFailure
+from csac.types import Snapshot
 
 PAPER_TASKS = ["HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"]
 OTHERS = ["Ant-v5", "Humanoid-v5", "Reacher-v5", "Pusher-v5", "InvertedDoublePendulum-v5"]

@@ -21,16 +21,18 @@ import trainer  # noqa: F401  (its cache of compiled programs)
 
 from csac.algorithms import SAC
 from csac.cli import main
-from csac.deploy.policy import Contract, Policy
+from csac.console.progress import Reporter
+from csac.console.tables import case_table
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
+from csac.evaluation.evaluator import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, _number
+from csac.evaluation.play import evaluate_run
+from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.run import RunDirectory, read_rows
-from csac.training import tasks
-from csac.training.console import case_table
-from csac.training.environments import EVALUATION_SEED, Environment
-from csac.training.evaluation import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, _number
-from csac.training.play import evaluate_run
-from csac.training.pool import EvaluationPool, choose_processes
-from csac.training.progress import Reporter
-from csac.training.silence import quietly
+from csac.tasks import known
+from csac.tasks.environment import Environment
+from csac.tasks.seeds import EVALUATION_SEED
+from csac.tasks.silence import quietly
 from csac.training.train import resume, train
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 
@@ -108,7 +110,7 @@ def test_the_quadrotor_flies_to_flattened_waypoints_with_its_own_bounds(quad):
     quad.step(np.zeros(4, np.float32))
     np.testing.assert_allclose(raw.action, [0, 0, 0, 0.4], atol=1e-6)
     assert not terminated
-    assert set(info) == set(QUAD_EVENTS) == set(tasks.events_of(QUAD))
+    assert set(info) == set(QUAD_EVENTS) == set(known.events_of(QUAD))
 
 
 def test_the_flat_waypoints_are_pyflyts_own(quad):
@@ -178,23 +180,23 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, task, blocked
 
 
 def test_another_release_of_a_package_is_said(monkeypatch):
-    tasks.register(QUAD)
+    known.register(QUAD)
     monkeypatch.delitem(gymnasium.registry, QUAD)
     with pytest.raises(InputError, match=r"^the PyFlyt that is installed has no .*: pip install 'csac\[robots\]'$"):
         Environment(QUAD)
 
 
 def test_only_known_tasks_get_arguments_for_pictures():
-    known, foreign = tasks.adapter_of("PandaPush-v3"), tasks.adapter_of("PandaDoor-v0")
-    assert known
-    assert known.picture_arguments
-    assert foreign == tasks.Adapter("panda_gym")
+    panda, foreign = known.adapter_of("PandaPush-v3"), known.adapter_of("PandaDoor-v0")
+    assert panda
+    assert panda.picture_arguments
+    assert foreign == known.Adapter("panda_gym")
 
 
 ROBOTS = """
 import sys
 import numpy as np
-from csac.training.environments import Environment
+from csac.tasks.environment import Environment
 if __name__ == "__main__":
     for task in sys.argv[1:]:
         environments = [Environment(task), Environment(task)]
@@ -218,7 +220,7 @@ def test_pybullet_prints_nothing(tmp_path):
 
 CHATTER = r"""
 import ctypes, os, sys, threading
-from csac.training.silence import quietly
+from csac.tasks.silence import quietly
 c = ctypes.CDLL(None)
 print("before")
 try:
@@ -265,7 +267,7 @@ def test_silence_reaches_streams_that_are_not_the_process_s_own(capsys):
 
 
 def test_silence_survives_a_closed_output(tmp_path):
-    code = "import os; from csac.training.silence import quietly; os.close(1)\nwith quietly(): pass\nos._exit(7)"
+    code = "import os; from csac.tasks.silence import quietly; os.close(1)\nwith quietly(): pass\nos._exit(7)"
     assert run_python(code, tmp_path).returncode == 7
 
 
@@ -276,7 +278,7 @@ def test_silence_is_not_asked_of_other_tasks():
 @pytest.mark.parametrize(("task", "inputs"), [(QUAD, 27), (REACH, 12)])
 def test_a_robots_run_is_stopped_and_goes_on(tmp_path, task, inputs):
     run = train(TINY, task, steps=40, directory=tmp_path / "run", **SHORT)
-    assert run.manifest["events"] == list(tasks.events_of(task))
+    assert run.manifest["events"] == list(known.events_of(task))
     assert run.manifest["inexact_seeds"] == [0]
     assert {"pybullet"} <= run.manifest["versions"].keys()
     before = run.evaluations
@@ -293,7 +295,7 @@ def test_a_robots_run_is_stopped_and_goes_on(tmp_path, task, inputs):
     for name in before.dtype.names or ():  # one by one: the NaN of a record equals nothing
         np.testing.assert_array_equal(rows[name][: len(before)], before[name])
     assert sorted(set(rows["step"].tolist())) == [20, 40, 60]
-    columns = rows[["success", *tasks.events_of(task)]].tolist()
+    columns = rows[["success", *known.events_of(task)]].tolist()
     assert not np.isnan(np.array(columns)[:, 1 if task == QUAD else 0 :]).any()
     contract = Contract.load(tmp_path / "run" / "policy" / "contract.json")
     assert contract.spec.observation_size == inputs
@@ -368,7 +370,7 @@ def test_the_command_line_refuses_it_in_one_line(capsys, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def known(number: int) -> tuple[bool, int]:
+def story(number: int) -> tuple[bool, int]:
     """What an episode of `Cases` says at its end."""
     generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence(EVALUATION_SEED + number)))
     return bool(generator.random() < 0.5), int(generator.integers(5))
@@ -378,7 +380,7 @@ def known(number: int) -> tuple[bool, int]:
 def test_an_episode_says_what_its_last_info_holds(number):
     evaluator = Evaluator("probes:Cases-v0", episodes=13, events=("stops", "crashed", "phase", "nothing"))
     episode = evaluator.run(policy_for("probes:Cases-v0"))[number]
-    crashed, stops = known(number)
+    crashed, stops = story(number)
     assert episode.events == {"stops": stops, "crashed": crashed, "phase": None, "nothing": None}
     assert list(episode.events) == ["stops", "crashed", "phase", "nothing"]
     assert type(episode.events["crashed"]) is bool
@@ -408,19 +410,19 @@ def test_events_are_columns_after_success(cases):
     expected = []
     for step in (20, 40):
         for number in range(2):
-            crashed, stops = known(number)
+            crashed, stops = story(number)
             expected.append(f"0,{step},{number},3.0,3,{float(not crashed)},{int(crashed)},{stops},")
     assert lines[1:] == expected
     rows = run.evaluations
     assert np.isnan(rows["nothing"]).all()
-    assert rows["stops"].tolist() == [known(number)[1] for number in (0, 1)] * 2
+    assert rows["stops"].tolist() == [story(number)[1] for number in (0, 1)] * 2
 
 
 def test_events_are_curves_of_tensorboard(cases):
     from test_logs import scalars
 
     found = scalars(cases[0].path / "tensorboard" / "seed_0")
-    mean = (known(0)[1] + known(1)[1]) / 2
+    mean = (story(0)[1] + story(1)[1]) / 2
     assert found["eval/stops"] == [(20, mean), (40, mean)]
     assert {"eval/crashed", "eval/success_rate"} <= found.keys()
     assert "eval/nothing" not in found
@@ -459,7 +461,7 @@ def test_the_report_says_how_the_last_episodes_ended(cases, capsys):
     reporter = Reporter()
     reporter.finish(cases[0])
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    mean = (known(0)[1] + known(1)[1]) / 2
+    mean = (story(0)[1] + story(1)[1]) / 2
     assert f"stops {mean:.3f}" in lines
     assert "nothing" in lines
     assert any(line.startswith("success ") for line in lines)

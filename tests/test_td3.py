@@ -13,7 +13,8 @@ import pytest
 
 from csac.algorithms.networks import MLP
 from csac.algorithms.td3 import TD3, actor_loss, critic_loss
-from csac.deploy.policy import Contract, Policy
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
 from csac.types import InputError, Layer, Spec, Transition
 
 ONE = Spec(1, 1)

@@ -9,7 +9,7 @@ from unittest.mock import patch
 import jax
 import numpy as np
 
-from csac.training import loop
+from csac.training import group, messages
 
 if TYPE_CHECKING:
     from csac.types import Algorithm
@@ -26,22 +26,22 @@ class Outcome(NamedTuple):
 
     states: list[Any]
     memories: list[np.ndarray]  # [steps, width] packed transitions, in the order of the steps
-    events: list[loop.Event]
+    events: list[messages.Event]
 
 
 def run(
     algorithm: Algorithm, task: Any, steps: int, seeds: tuple[int, ...] = (0,), episodes: int = 1, **arguments: Any
 ) -> Outcome:
     """Train `seeds` together, evaluating at the end alone, and return what there is to look at."""
-    learners: list[loop.Learner] = []
+    learners: list[group.Learner] = []
 
-    class Kept(loop.Learner):
+    class Kept(group.Learner):
         def __init__(self, *arguments: Any) -> None:
             super().__init__(*arguments)
             learners.append(self)
 
-    settings = loop.Settings(algorithm, task, arguments, steps, steps, episodes)
-    with patch.object(loop, "Learner", Kept):
-        events = list(loop.train_group(settings, seeds, lambda: False))
+    settings = messages.Settings(algorithm, task, arguments, steps, steps, episodes)
+    with patch.object(group, "Learner", Kept):
+        events = list(group.train_group(settings, seeds, lambda: False))
     carries = learners[0]._by_seed(jax.tree.map(np.asarray, learners[0]._carry))
     return Outcome([carry[0] for carry in carries], [carry[1].rows for carry in carries], events)

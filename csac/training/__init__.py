@@ -1,1 +1,1 @@
-"""How it is learnt: the only room that steps environments and that batches over seeds."""
+"""How it is learnt: the only room that knows about several seeds, processes and resuming."""

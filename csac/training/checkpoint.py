@@ -16,14 +16,13 @@ import json
 import os
 import re
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import safetensors.numpy
 
 from csac.record.run import write_atomically
-from csac.training.snapshots import Snapshot
-from csac.types import InputError
+from csac.types import InputError, Ring, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -42,13 +41,6 @@ Files = dict[str, dict[str, Any]]  # name below the folder -> {"bytes": size, "s
 
 class Damaged(InputError):
     """A checkpoint's file is missing, cut off or changed. The message names it."""
-
-
-class Ring(NamedTuple):
-    """A seed's memory: transition number i lies in row i % capacity, as far as `count` of them were added."""
-
-    rows: np.ndarray  # [capacity, width]
-    count: int
 
 
 class SeedFiles:

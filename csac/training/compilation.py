@@ -17,7 +17,7 @@ from typing import Any
 
 import jax
 
-from csac.training.processes import usable_cores
+from csac.processes import usable_cores
 
 MOST_BYTES = 256 * 2**20  # of all programs together; those of one algorithm, task and preset take half a MiB
 SECONDS_WORTH_KEEPING = 0.1  # of compilation; loading takes a tenth of it or less

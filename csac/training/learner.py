@@ -9,16 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac.algorithms.memory import pack, row_width
-from csac.training.checkpoint import Ring
 from csac.training.compilation import keep_programs
 from csac.training.packing import Packing
-from csac.training.snapshots import Snapshot
-from csac.types import InputError, PolicyNetwork, Transition
+from csac.types import InputError, PolicyNetwork, Ring, Snapshot, Transition
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from csac.training.environments import Steps
+    from csac.tasks.seeds import Steps
     from csac.types import Algorithm, PolicyParameters, Spec
 
 # Arrays with fewer elements travel packed. Hidden layers of 256 x 256 have more: XLA would copy them out of the row at

@@ -10,19 +10,30 @@ import numpy as np
 
 from csac.record.run import Table
 from csac.training.checkpoint import facts_of, link
-from csac.training.groups import GroupCrashed, GroupRestarted, NotSaved
-from csac.training.loop import Boundary, Ended, Evaluated, Failed, Noted, Progress, Rows, Saved
+from csac.training.messages import (
+    Boundary,
+    Ended,
+    Evaluated,
+    Failed,
+    GroupCrashed,
+    GroupRestarted,
+    Noted,
+    NotSaved,
+    Progress,
+    Rows,
+    Saved,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from csac.console.progress import Reporter
     from csac.deploy.policy import Policy
     from csac.record.run import RunDirectory
+    from csac.record.tensorboard import TensorBoardLog
     from csac.training.checkpoint import Checkpoints, Files
-    from csac.training.groups import Message
-    from csac.training.logs import TensorBoardLog
-    from csac.training.progress import Reporter
+    from csac.training.messages import Message
 
 OVER = np.iinfo(np.int64).max  # the step of a group that is over: it holds nobody back
 

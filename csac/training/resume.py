@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.algorithms import ALGORITHMS
 from csac.record.run import GROWING_FILES, RunDirectory
+from csac.tasks.perturbations import continued, perturbations_of
 from csac.training.checkpoint import FOLDER, Checkpoint, Checkpoints, link, newest_sound, sound_at, taken_back
 from csac.training.learner import misfit
-from csac.training.perturb import continued, perturbations_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from csac.training.perturb import Perturbation
+    from csac.tasks.perturbations import Perturbation
     from csac.types import Algorithm, Spec
 
 # What a run cannot change: with any other value it would be another run.

@@ -20,12 +20,13 @@ import psutil
 
 from csac import __version__
 from csac.record.run import RunDirectory, StorageFailure, default_directory, is_run
+from csac.tasks.environment import Environment
+from csac.tasks.known import adapter_of, check_events, events_of
+from csac.tasks.making import Task
+from csac.tasks.perturbations import by_step, perturbations_of, refuse_late
 from csac.training.checkpoint import FOLDER, Checkpoints
 from csac.training.compilation import tidy_programs
-from csac.training.environments import Environment, Task
-from csac.training.groups import choose_evaluation_processes, choose_groups, run_groups, split_seeds
-from csac.training.loop import Settings
-from csac.training.perturb import by_step, perturbations_of, refuse_late
+from csac.training.messages import Settings
 from csac.training.recorder import Recorder
 from csac.training.resume import (
     BEGINNING,
@@ -37,15 +38,15 @@ from csac.training.resume import (
     roll_back,
     with_past,
 )
-from csac.training.tasks import adapter_of, check_events, events_of
+from csac.training.scheduler import choose_evaluation_processes, choose_groups, run_groups, split_seeds
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from csac.training.logs import TensorBoardLog
-    from csac.training.perturb import Perturbation
-    from csac.training.progress import Reporter
+    from csac.console.progress import Reporter
+    from csac.record.tensorboard import TensorBoardLog
+    from csac.tasks.perturbations import Perturbation
     from csac.types import Algorithm, Spec
 
     OnEvaluation = Callable[[int, dict[int, float]], Any]
@@ -336,7 +337,7 @@ def _run(run: RunDirectory, settings: Settings, notes: list[str], watchers: _Wat
 
 
 def _tensorboard_log(run: RunDirectory, labels: list[int], begin: int) -> TensorBoardLog:
-    from csac.training.logs import TensorBoardLog  # slow to import, and some runs do without
+    from csac.record.tensorboard import TensorBoardLog  # slow to import, and some runs do without
 
     return TensorBoardLog(run.path / "tensorboard", labels, begin)
 

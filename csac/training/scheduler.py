@@ -7,12 +7,24 @@ import traceback
 from contextlib import closing
 from itertools import count
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING
 
+from csac.evaluation.evaluator import ROWS
+from csac.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
 from csac.training.checkpoint import remove_unfinished
-from csac.training.evaluation import ROWS
-from csac.training.loop import Boundary, Ended, Event, Group, Saved, Settings, is_boundary
-from csac.training.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
+from csac.training.group import Group, is_boundary
+from csac.training.messages import (
+    Boundary,
+    Ended,
+    Event,
+    GroupCrashed,
+    GroupRestarted,
+    Message,
+    NotSaved,
+    Order,
+    Saved,
+    Settings,
+)
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -29,31 +41,6 @@ LONGEST_LEAD = 1_000
 
 # A checkpoint is made at least this often, whatever the interval in steps.
 SECONDS_BETWEEN_CHECKPOINTS = 600.0
-
-Order = Literal["save", "stop"] | list[int]  # to a worker: what to do, or the cores to take its next turn on
-
-
-class GroupCrashed(NamedTuple):
-    """A group's process ended without a word, or with an error of ours."""
-
-    reason: str
-    details: str
-
-
-class GroupRestarted(NamedTuple):
-    """A group's process died; another goes on from the newest checkpoint, at this step."""
-
-    reason: str
-    step: int
-
-
-class NotSaved(NamedTuple):
-    """A group could not write its files of a checkpoint."""
-
-    error: OSError
-
-
-Message = Event | GroupCrashed | GroupRestarted | NotSaved
 
 
 def split_seeds(seeds: Sequence[int], groups: int) -> list[list[int]]:

@@ -15,7 +15,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from csac.training.console import (
+from csac.console.tables import (
     duration,
     events_table,
     make_console,

@@ -26,14 +26,14 @@ from csac.record.statistics import (
     recovery,
 )
 from csac.record.tables import COLUMNS
-from csac.training.perturb import by_step, perturbations_of
+from csac.tasks.perturbations import by_step, perturbations_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from csac.evaluation.evaluator import EvaluationEpisode
     from csac.record.run import RunDirectory
-    from csac.training.evaluation import EvaluationEpisode
 
 STATE_STYLES = {"running": "cyan", "finished": "green", "failed": "red", "interrupted": "yellow", "killed": "red"}
 ROLLOUTS = 1_000  # that the cases of `csac evaluate` are counted in, as in the paper

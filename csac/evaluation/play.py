@@ -11,19 +11,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.deploy.policy import load
+from csac.evaluation.evaluator import EvaluationEpisode, Evaluator
+from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.run import RunDirectory
-from csac.training.environments import FRESH_EVALUATION_SEED, Environment
-from csac.training.evaluation import EvaluationEpisode, Evaluator
-from csac.training.perturb import lasting, perturbations_of, values_at
-from csac.training.pool import EvaluationPool, choose_processes
-from csac.training.tasks import adapter_of
+from csac.tasks.environment import Environment
+from csac.tasks.known import adapter_of
+from csac.tasks.perturbations import lasting, perturbations_of, values_at
+from csac.tasks.seeds import FRESH_EVALUATION_SEED
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator
 
-    from csac.training.evaluation import OnProgress
-    from csac.training.perturb import Perturbation
+    from csac.evaluation.evaluator import OnProgress
+    from csac.tasks.perturbations import Perturbation
 
 DEFAULT_FRAMES_PER_SECOND = 30
 SECONDS_ON_SCREEN = 1.0  # that an episode has at least: its last picture stays for as long as it takes

@@ -9,119 +9,26 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from csac.deploy.policy import Contract, Policy
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
+from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
+from csac.evaluation.pool import EvaluationPool, ProcessDied
+from csac.tasks.perturbations import values_at
+from csac.tasks.seeds import SeedEnvironments
 from csac.training.checkpoint import Checkpoint, SeedFiles, taken_back
-from csac.training.environments import SeedEnvironments
-from csac.training.evaluation import LONGEST_EPISODE, EvaluationFailure, Evaluator
 from csac.training.learner import Learner
-from csac.training.perturb import values_at
-from csac.training.pool import EvaluationPool, ProcessDied
-from csac.training.snapshots import Snapshot
+from csac.training.messages import Boundary, Ended, Evaluated, Event, Failed, Noted, Progress, Rows, Saved, Settings
+from csac.types import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
-    from pathlib import Path
 
-    from csac.record.run import Table
-    from csac.training.checkpoint import Files
-    from csac.training.environments import Task
-    from csac.training.evaluation import EvaluationEpisode
-    from csac.training.perturb import Perturbation
-    from csac.training.pool import Running
-    from csac.types import Algorithm, PolicyNetwork
+    from csac.evaluation.evaluator import EvaluationEpisode
+    from csac.evaluation.pool import Running
+    from csac.types import PolicyNetwork
 
 METRICS_INTERVAL = 1_000
 PROGRESS_INTERVAL = 250
-
-
-class Settings(NamedTuple):
-    """What a group needs to know to train its seeds; picklable, so that a group can be another process.
-
-    `checkpoints` is the folder of the run's checkpoints, None where there are to be none; `begin` is the step of the
-    checkpoint there to go on from, 0 to begin anew. `events` are names in the last `info` of an evaluation episode.
-    Each group has `evaluation_processes` that evaluate while it trains on; with 0 it evaluates in line.
-    """
-
-    algorithm: Algorithm
-    task: Task
-    environment_arguments: dict[str, Any]
-    steps: int
-    evaluation_interval: int
-    evaluation_episodes: int
-    checkpoints: Path | None = None
-    checkpoint_interval: int = 0
-    begin: int = 0
-    events: tuple[str, ...] = ()
-    perturbations: tuple[Perturbation, ...] = ()
-    evaluation_processes: int = 0
-
-
-class Rows(NamedTuple):
-    """Rows for one of the run's tables, "episodes" or "metrics"."""
-
-    table: Table
-    rows: list[dict[str, Any]]
-
-
-class Evaluated(NamedTuple):
-    """Every living seed of the group was evaluated at this step; `policies` are those evaluated.
-
-    `info_names` are the names of numbers that the episodes held in their last `info`.
-    """
-
-    step: int
-    rows: list[dict[str, Any]]
-    policies: dict[int, Policy]
-    info_names: frozenset[str] = frozenset()
-
-
-class Failed(NamedTuple):
-    """A seed stopped for a reason of its own; the others go on. `policy` is what it had learnt, where that is sound."""
-
-    seed: int
-    step: int
-    reason: str
-    details: str
-    policy: Policy | None
-
-
-class Progress(NamedTuple):
-    """Everything up to this step has been yielded."""
-
-    step: int
-
-
-class Boundary(NamedTuple):
-    """So many steps are made: here the group can be saved, once `settle` has told what still waits."""
-
-    step: int
-
-
-class Noted(NamedTuple):
-    """Something that the user should know, and that stops nobody."""
-
-    text: str
-
-
-class Saved(NamedTuple):
-    """What a checkpoint at this step needs of the group is on disk, in these files.
-
-    `inexact` are the seeds whose environment cannot be saved in the middle of an episode.
-    """
-
-    step: int
-    files: Files
-    inexact: list[int]
-
-
-class Ended(NamedTuple):
-    """The group is over: all its steps, no seed left alive, or it was asked to stop. The newest policies."""
-
-    step: int
-    policies: dict[int, Policy]
-
-
-Event = Rows | Evaluated | Failed | Progress | Boundary | Noted | Saved | Ended
 
 
 class Evaluation(NamedTuple):

@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from csac.deploy.policy import Policy
-from csac.training.environments import EVALUATION_SEED, FRESH_EVALUATION_SEED, Environment, EnvironmentFailure
-from csac.training.perturb import lasting, values_at
+from csac.tasks.environment import Environment
+from csac.tasks.perturbations import lasting, values_at
+from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
+from csac.tasks.spaces import EnvironmentFailure
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from csac.training.environments import Parts, Task
-    from csac.training.perturb import Perturbation
+    from csac.tasks.making import Task
+    from csac.tasks.perturbations import Perturbation
+    from csac.tasks.spaces import Parts
 
     OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
 

@@ -8,15 +8,15 @@ from collections import deque
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
-from csac.training.evaluation import EvaluationEpisode, EvaluationFailure, Evaluator
-from csac.training.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
+from csac.evaluation.evaluator import EvaluationEpisode, EvaluationFailure, Evaluator
+from csac.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from csac.deploy.policy import Policy
-    from csac.training.evaluation import OnProgress
+    from csac.evaluation.evaluator import OnProgress
 
 Batch = tuple[int, int]  # which policy, number of the first episode
 Work = tuple["Policy", int, bool, dict[str, float]]  # policy, first episode, whether deterministic, how it is perturbed

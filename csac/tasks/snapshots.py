@@ -7,10 +7,12 @@ random generator are taken care of here.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+
+from csac.types import Snapshot
 
 if TYPE_CHECKING:
     import gymnasium
@@ -18,19 +20,6 @@ if TYPE_CHECKING:
 # MuJoCo makes these anew in every step, in sizes that depend on the contacts of the moment.
 _MADE_ANEW = ("efc_", "iefc_", "island_", "iacc", "ifrc_", "map_")
 _KNOWN_WRAPPERS = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
-
-
-class Snapshot(NamedTuple):
-    """Arrays by name, and values that JSON can hold."""
-
-    arrays: dict[str, np.ndarray]
-    values: dict[str, Any]
-
-    def part(self, name: str) -> Snapshot:
-        """Return what was saved under this name: arrays called `name.<their name>`, and one of the values."""
-        prefix = f"{name}."
-        arrays = {key.removeprefix(prefix): array for key, array in self.arrays.items() if key.startswith(prefix)}
-        return Snapshot(arrays, self.values[name])
 
 
 def snapshot(environment: gymnasium.Env) -> Snapshot | None:

@@ -1,0 +1,176 @@
+"""Gymnasium in, arrays out: flat observations, actions in [-1, 1], both end flags, the true final observation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import nullcontext
+from typing import Any
+
+import numpy as np
+
+from csac.deploy.contract import ActionBounds
+from csac.tasks import known
+from csac.tasks.making import Task, check_render_mode, make, task_name
+from csac.tasks.physics import NOISES, PHYSICS, Noise, Physics
+from csac.tasks.silence import quietly
+from csac.tasks.snapshots import restore, snapshot
+from csac.tasks.spaces import (
+    ContractParts,
+    EnvironmentFailure,
+    action_parts,
+    check_finite,
+    dict_part,
+    observation_parts,
+    one_line,
+    part,
+    scalar,
+    size,
+)
+from csac.types import InputError, Snapshot, Spec
+
+
+class Environment:
+    """One Gymnasium environment with flat float32 observations and actions in [-1, 1].
+
+    Args:
+        task: a Gymnasium id, `module:Id` (the module is imported first), or a callable that makes an environment.
+        environment_arguments: keyword arguments for the environment.
+        render_mode: Gymnasium's; None where nothing is drawn.
+
+    Raises:
+        InputError: no such task, arguments that it refuses, or observations or actions that csac cannot learn.
+    """
+
+    def __init__(
+        self, task: Task, environment_arguments: dict[str, Any] | None = None, render_mode: str | None = None
+    ) -> None:
+        arguments = dict(environment_arguments or {})
+        if render_mode is not None:
+            arguments["render_mode"] = render_mode
+        self.raw = make(task, arguments)
+        self.task_name = task_name(task, self.raw)
+        self._quietly = quietly if known.is_pybullet(self.raw) else nullcontext
+        self.has_memory = known.has_memory(task, self.raw)
+        try:
+            check_render_mode(self.raw, render_mode)
+            parts = observation_parts(self.raw.observation_space)
+            self.contract_parts = ContractParts(parts, *action_parts(self.raw.action_space))
+        except InputError as error:
+            self.close()
+            raise InputError(f"{self.task_name}: {error}") from None
+        self.spec = Spec(size(parts), math.prod(self.contract_parts.action_shape))
+        self.bounds = ActionBounds(self.contract_parts.action_low, self.contract_parts.action_high)
+        self.raw_observation: Any = None  # the last one, as the environment gave it
+        self._parts = parts
+        self._action_shape = self.contract_parts.action_shape
+        self._physics: Physics | None = None
+        self._noise: Noise | None = None
+        self._seed: int | None = None  # of the last reset
+
+    def perturb(self, values: Mapping[str, float]) -> None:
+        """Change the task from its next step on, for good: a value for each kind of `perturb.KINDS`, 1 or 0 for none.
+
+        Raises:
+            InputError: the task has no such physics.
+        """
+        physics = {kind: values[kind] for kind in PHYSICS if kind in values}
+        noise = {kind: values[kind] for kind in NOISES if kind in values}
+        if physics or self._physics:
+            self._physics = self._physics or Physics(self.raw, self.task_name)
+            self._physics.set(physics)
+        if noise or self._noise:
+            self._noise = self._noise or Noise()
+            self._noise.set(noise, self._seed)
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Start an episode and return its first observation, float32 [observation].
+
+        Raises:
+            EnvironmentFailure: the environment raised, or the observation is not finite or misshapen.
+        """
+        self._seed = seed
+        if self._noise:
+            self._noise.begin(seed)
+        try:
+            with self._quietly():
+                observation, _ = self.raw.reset(seed=seed)
+        except Exception as error:
+            raise EnvironmentFailure(f"reset raised {one_line(error)}") from error
+        try:
+            return self._flatten(observation)
+        except EnvironmentFailure as error:
+            raise EnvironmentFailure(f"{error} after reset") from error.__cause__
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply an action in [-1, 1], [action]: observation [observation], reward, terminated, truncated, info.
+
+        Raises:
+            EnvironmentFailure: as `step_environment_scale`.
+        """
+        return self.step_environment_scale(self.bounds.scale(action).reshape(self._action_shape))
+
+    def step_environment_scale(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply an action of the environment's own shape and scale; returns the same as `step`.
+
+        `info` is a copy: PyFlyt gives the same dict at every step of an episode.
+
+        Raises:
+            EnvironmentFailure: the environment raised, or action, observation or reward is not finite or misshapen.
+        """
+        action = part(action, self._action_shape, "action")
+        if self._noise:
+            action = self._noise.on_action(action, self.contract_parts.action_low, self.contract_parts.action_high)
+        action = action.reshape(self._action_shape)
+        try:
+            observation, reward, terminated, truncated, info = self.raw.step(action)
+            terminated, truncated, info = bool(terminated), bool(truncated), dict(info)
+        except Exception as error:
+            raise EnvironmentFailure(f"step raised {one_line(error)}") from error
+        return self._flatten(observation), scalar(reward), terminated, truncated, info
+
+    def snapshot(self) -> Snapshot | None:
+        """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell."""
+        saved = snapshot(self.raw)
+        if saved and self._noise:
+            saved.values["noise"] = self._noise.state()
+        return saved
+
+    def restore(self, seed: int, saved: Snapshot) -> None:
+        """Go on where `saved` was taken, in an episode that was reset with `seed`.
+
+        Raises:
+            EnvironmentFailure: the environment does not take it back.
+        """
+        self.reset(seed)
+        try:
+            restore(self.raw, saved)
+            if self._noise:
+                self._noise.take_back(saved.values.get("noise", {}))
+        except Exception as error:
+            raise EnvironmentFailure(f"the environment does not take its snapshot back: {one_line(error)}") from error
+
+    def close(self) -> None:
+        """Close the Gymnasium environment."""
+        with self._quietly():
+            self.raw.close()
+
+    def _flatten(self, observation: Any) -> np.ndarray:
+        """Copy the observation, since environments may reuse their array."""
+        self.raw_observation = observation
+        key, shape = self._parts[0]
+        if key is None:
+            flat = part(observation, shape, "observation")
+        else:
+            flat = np.concatenate([dict_part(observation, key, shape) for key, shape in self._parts])
+        return self._with_noise(flat) if self._noise else flat
+
+    def _with_noise(self, flat: np.ndarray) -> np.ndarray:
+        """Return the flat observation with its noise, and let `raw_observation` be the same in the task's own shape."""
+        assert self._noise
+        noisy = self._noise.on_observation(flat)
+        check_finite(noisy, noisy.shape, "the observation with its noise")
+        ends = np.cumsum([math.prod(shape) for _, shape in self._parts])[:-1]
+        raw = {key: part.reshape(shape) for (key, shape), part in zip(self._parts, np.split(noisy, ends), strict=True)}
+        self.raw_observation = raw.get(None, raw)
+        return noisy

@@ -1,0 +1,130 @@
+"""From a task's spaces and values to flat, finite float32 arrays; what does not become one is refused here."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from csac.types import InputError
+
+Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
+
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+
+
+class EnvironmentFailure(RuntimeError):
+    """An environment raised, or gave what is not a finite number of the right shape. The message is one line."""
+
+
+class ContractParts(NamedTuple):
+    """What a `Contract` records of an environment, in the order in which it takes them."""
+
+    observation_parts: Parts
+    action_shape: tuple[int, ...]
+    action_low: np.ndarray  # [action] float32
+    action_high: np.ndarray  # [action] float32
+
+
+def observation_parts(space: spaces.Space) -> Parts:
+    """Return the parts of a Box or Dict of Boxes in their flat order. Raises InputError for any other space."""
+    named = sorted(space.spaces.items()) if isinstance(space, spaces.Dict) else [(None, space)]
+    for key, part in named:
+        name = "the observation" if key is None else f"observation[{key!r}]"
+        if not isinstance(part, spaces.Box):
+            raise InputError(
+                f"{name} is a {type(part).__name__} and csac takes Boxes, or one Dict of Boxes: "
+                "wrap the environment in gymnasium.wrappers.FlattenObservation"
+            )
+        if part.dtype == np.uint8 and part.low.ndim == 3:
+            raise InputError(
+                f"{name} is an image {part.low.shape}, which csac does not learn from: choose a vector of states"
+            )
+    parts = tuple((key, tuple(part.shape or ())) for key, part in named)
+    if not size(parts):
+        raise InputError("the observation is empty: there is nothing to learn from")
+    return parts
+
+
+def action_parts(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+    """Return shape and flat float32 bounds of a bounded Box of floats. Raises InputError for any other space."""
+    if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
+        raise InputError(f"the action space is {space} and csac takes continuous actions, a Box of floats")
+    low, high = _inner_float32(space.low, 1), _inner_float32(space.high, -1)
+    if not low.size:
+        raise InputError("the action space is empty: there is nothing to learn")
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise InputError("the action space has no bounds: wrap the environment in gymnasium.wrappers.RescaleAction")
+    return space.low.shape, low, high
+
+
+def _inner_float32(bound: np.ndarray, direction: int) -> np.ndarray:
+    """Round a bound to float32 towards the inside, so that a float64 Box holds what we send."""
+    exact = bound.reshape(-1)
+    with np.errstate(over="ignore"):
+        rounded = exact.astype(np.float32)
+    outside = rounded < exact if direction > 0 else rounded > exact
+    return np.where(outside & np.isfinite(rounded), np.nextafter(rounded, np.float32(direction * np.inf)), rounded)
+
+
+def size(parts: Parts) -> int:
+    """Return how many numbers all parts have together."""
+    return sum(math.prod(shape) for _, shape in parts)
+
+
+def dict_part(observation: Any, key: str | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Return one part of a Dict observation, as `part`. Raises EnvironmentFailure."""
+    if not isinstance(observation, dict) or key not in observation:
+        raise EnvironmentFailure(f"observation has no {key!r}")
+    return part(observation[key], shape, f"observation[{key!r}]")
+
+
+def part(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Return a float32 copy of one part of an observation, flat and finite. Raises EnvironmentFailure."""
+    try:
+        array = np.asarray(value)
+        flat = array.reshape(-1)
+        # One product finds a nan, an inf or what float32 cannot hold in a third of the time of np.isfinite().all().
+        if array.shape == shape and float(flat.dot(flat)) <= FLOAT32_MAX:
+            return flat.astype(np.float32)
+        with np.errstate(over="ignore"):
+            flat = flat.astype(np.float32)
+    except (TypeError, ValueError) as error:
+        raise EnvironmentFailure(f"{name} is not an array of numbers: {one_line(error)}") from error
+    if array.shape != shape:
+        raise EnvironmentFailure(f"{name} has shape {array.shape} where its space has {shape}")
+    check_finite(flat, shape, name)
+    return flat
+
+
+def check_finite(flat: np.ndarray, shape: tuple[int, ...], name: str) -> None:
+    """Raise EnvironmentFailure, with its place in an array of this shape, for the first number that is not finite."""
+    bad = np.flatnonzero(~np.isfinite(flat))
+    if bad.size:
+        place = ", ".join(str(i) for i in np.unravel_index(bad[0], shape))
+        raise EnvironmentFailure(f"{name}{f'[{place}]' if place else ''} is {flat[bad[0]]}")
+
+
+def scalar(reward: Any) -> float:
+    """Return a reward as a float. Raises EnvironmentFailure where it is not one finite number."""
+    if isinstance(reward, np.ndarray) and reward.ndim:
+        raise EnvironmentFailure(f"reward has shape {reward.shape} and is to be one number")
+    try:
+        reward = float(reward)
+    except (TypeError, ValueError):
+        raise EnvironmentFailure(f"reward is a {type(reward).__name__} and is to be one number") from None
+    if not abs(reward) <= FLOAT32_MAX:
+        raise EnvironmentFailure(f"reward is {reward}")
+    return reward
+
+
+def message(error: Exception) -> str:
+    """Return what an error says, in one line."""
+    return " ".join(str(error).split())
+
+
+def one_line(error: Exception) -> str:
+    """Return an error's type and what it says, in one line."""
+    return f"{type(error).__name__}: {message(error)}" if str(error) else type(error).__name__
