@@ -34,7 +34,7 @@ test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
 	.venv/bin/pytest --numprocesses logical --dist loadfile $(ARGS)
 
 chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave, 20 minutes: make chaos ARGS='--kills 12'
-	.venv/bin/python tests/chaos.py --out results/reliability $(ARGS)
+	.venv/bin/python tests/support/chaos.py --out results/reliability $(ARGS)
 
 check: $(SETUP)  ## Check format, lint, types and the direction of imports
 	.venv/bin/ruff format --check --exclude '*.md' .

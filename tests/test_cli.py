@@ -23,7 +23,7 @@ from csac.training.checkpoint import Checkpoint
 from csac.training.resume import Source
 from csac.types import Layer, PolicyNetwork, PolicyParameters
 
-TESTS = Path(__file__).parent
+SUPPORT = Path(__file__).parent / "support"
 TINY = "--batch-size 8 --actor-hidden-sizes 8 --critic-hidden-sizes 8"
 
 
@@ -62,7 +62,7 @@ if "Pictures-v0" not in gymnasium.registry:
 @pytest.fixture(autouse=True)
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(TESTS)
+    monkeypatch.syspath_prepend(SUPPORT)
 
 
 @pytest.fixture
@@ -362,7 +362,7 @@ def trained(tmp_path_factory):
     """A run of two seeds, trained by the command line on a task of constant reward: (exit code, its directory)."""
     directory = tmp_path_factory.mktemp("trained") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(TESTS)
+        patch.syspath_prepend(SUPPORT)
         code = csac(
             f"train probes:Endless-v0 --directory {directory} --steps 40 --warmup-steps 20 --seeds 2 --groups 1 "
             f"--evaluation-interval 20 {TINY}"
@@ -498,7 +498,7 @@ def test_a_signal_saves_what_was_learnt(tmp_path, number, groups):
     process = subprocess.Popen(
         [sys.executable, "-m", "csac", *shlex.split(line)],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(TESTS)},
+        env={**os.environ, "PYTHONPATH": str(SUPPORT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import probes
 import pytest
+from trajectories import steps_of
 
 from csac.tasks.environment import Environment
 from csac.tasks.seeds import SeedEnvironments
@@ -114,15 +115,6 @@ def test_a_snapshot_of_another_physics_is_refused():
     assert saved
     with pytest.raises(EnvironmentFailure, match="has other arrays"):
         hopper.restore(0, saved)
-
-
-def steps_of(environments: SeedEnvironments, count: int) -> list[tuple]:
-    generator, outcomes = np.random.default_rng(5), []
-    for _ in range(count):
-        shape = (len(environments.seeds), environments.spec.action_size)
-        outcome = environments.step(generator.uniform(-1, 1, shape).astype(np.float32))
-        outcomes.append((outcome.next_observation.tolist(), outcome.reward.tolist(), outcome.episodes))
-    return outcomes
 
 
 def test_seeds_go_on_with_their_episodes_and_their_counts():

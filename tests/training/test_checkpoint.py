@@ -473,7 +473,7 @@ def test_a_group_that_merely_stopped_makes_no_checkpoint_whole(recorder):
 
 
 def test_the_environment_of_the_documentation_can_be_saved(tmp_path):
-    text = (Path(__file__).parents[1] / "docs" / "reliability.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text()
     shown: dict[str, Any] = {}
     exec(text.split("```python\n")[1].split("```")[0], shown)
     first, second = (SeedEnvironments(shown["Walk"], None, [3]) for _ in range(2))

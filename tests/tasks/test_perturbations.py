@@ -16,8 +16,8 @@ import probes
 import pytest
 from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
-from test_resume import LEARNERS, Crash, contents, crash_at, run
-from test_snapshots import steps_of
+from resuming import LEARNERS, Crash, contents, crash_at, run
+from trajectories import steps_of
 
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy, load
@@ -28,6 +28,7 @@ from csac.tasks.perturbations import Perturbation, by_step, continued, lasting, 
 from csac.tasks.seeds import EVALUATION_SEED, SeedEnvironments
 from csac.tasks.snapshots import _mujoco_arrays
 from csac.training import messages
+from csac.training.group import Group
 from csac.training.messages import Progress
 from csac.training.recorder import Recorder
 from csac.training.train import resume
@@ -523,14 +524,14 @@ def test_a_foreign_policy_meets_the_same_task():
 # In the group.
 
 
-def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-v4") -> group.Group:
+def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-v4") -> Group:
     settings = messages.Settings(
         LEARNERS[0], task, {}, 400, 30, 1, folder, 0, begin, perturbations=perturbations_of(perturbations)
     )
-    return group.Group(settings, (3,))
+    return Group(settings, (3,))
 
 
-def advance(group: group.Group, until: int) -> list[messages.Event]:
+def advance(group: Group, until: int) -> list[messages.Event]:
     return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
 
 
@@ -758,7 +759,7 @@ def test_several_runs_are_told_side_by_side(tmp_path, monkeypatch, capsys):
             f"{seed},{10 * (t + 1)},0,{value},5," for seed, line in enumerate(seeds) for t, value in enumerate(line)
         ]
         (tmp_path / f"{name}.csv").write_text("\n".join(["seed,step,episode,return,length,success", *rows, ""]))
-    script = Path(__file__).parents[1] / "results" / "recovery.py"
+    script = Path(__file__).parents[2] / "results" / "recovery.py"
     files = [f"{name.upper()}={tmp_path / name}.csv" for name in returns]
     out = tmp_path / "picture.png"
     monkeypatch.setattr(sys, "argv", [str(script), "--step", "20", "--out", str(out), *files])

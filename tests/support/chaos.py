@@ -1,6 +1,6 @@
 """Kill real runs at random moments, let them go on, and compare what they leave with an uninterrupted run.
 
-    python tests/chaos.py --kills 100 --seed 0 --out results/reliability
+    python tests/support/chaos.py --kills 100 --seed 0 --out results/reliability
 
 A run is two seeds in two processes beside their parent: 2,000 steps of Hopper with tiny networks, a checkpoint every
 300. Each is killed several times. What is killed and when comes from a seeded generator; what the processes are doing

@@ -22,7 +22,7 @@ from csac.training.learner import Learner
 from csac.training.train import train
 from csac.types import Spec
 
-TESTS = Path(__file__).parent
+HERE = Path(__file__).parent
 TINY: dict[str, Any] = {"actor_hidden_sizes": (8,), "critic_hidden_sizes": (8,)}
 CHOICES = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")
 
@@ -50,7 +50,7 @@ def learnt(home: Path, **settings: str) -> dict[str, Any]:
     surroundings = {name: value for name, value in os.environ.items() if name not in CHOICES}
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", "import test_compilation; test_compilation.learn()"],
-        cwd=TESTS,
+        cwd=HERE,
         env={**surroundings, "XDG_CACHE_HOME": str(home), **settings},
         capture_output=True,
         text=True,

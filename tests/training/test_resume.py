@@ -15,43 +15,26 @@ import numpy as np
 import probes
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
+from resuming import LEARNERS, ROLLOUT, Crash, contents, crash_at, run
 
-from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
 from csac.record.run import RunDirectory
 from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, steps_in
+from csac.training.group import Group
 from csac.training.scheduler import run_groups
-from csac.training.train import resume, train
+from csac.training.train import resume
 from csac.types import InputError
 
-SMALL: dict[str, Any] = {
-    "actor_hidden_sizes": (8, 8),
-    "critic_hidden_sizes": (8, 8),
-    "batch_size": 8,
-    "warmup_steps": 40,
-    "replay_size": 150,
-}
-ROLLOUT = PPO(rollout_steps=64, minibatches=4, epochs=2, hidden_sizes=(8, 8), learning_rate_schedule="constant")
-LEARNERS = [
-    CSAC(reference_period=30, **SMALL),
-    SAC(**SMALL),
-    TD3(**SMALL),
-    SD3(noise_samples=4, **SMALL),
-    ROLLOUT,
-    SAC(update_interval=7, **SMALL),
-]
-SHORT: dict[str, Any] = {"evaluation_interval": 100, "evaluation_episodes": 2, "tensorboard": False}
+
+def group(folder: Path, algorithm, seeds, steps: int, begin: int = 0, task: Any = "Hopper-v4") -> Group:
+    return Group(messages.Settings(algorithm, task, {}, steps, 1000, 1, folder, 0, begin), seeds)
 
 
-def group(folder: Path, algorithm, seeds, steps: int, begin: int = 0, task: Any = "Hopper-v4") -> group.Group:
-    return group.Group(messages.Settings(algorithm, task, {}, steps, 1000, 1, folder, 0, begin), seeds)
-
-
-def advance(group: group.Group, until: int) -> list[messages.Event]:
+def advance(group: Group, until: int) -> list[messages.Event]:
     return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
 
 
-def everything(group: group.Group) -> list[np.ndarray]:
+def everything(group: Group) -> list[np.ndarray]:
     """What a group has learnt, remembers and does next."""
     leaves = jax.tree.leaves(group.learner._carry)
     return [np.asarray(leaf) for leaf in leaves] + [group._actions, group._observations, group.learner._waiting]
@@ -109,32 +92,6 @@ def test_seeds_may_be_grouped_otherwise(tmp_path):
 
 
 # Whole runs.
-
-
-FILES = ("evaluations.csv", "episodes.csv", "metrics.csv", "log.txt", "policy/seed_0.safetensors")
-
-
-def run(directory: Path, algorithm=LEARNERS[0], steps: int = 500, task: Any = "Hopper-v4", **settings: Any):
-    settings = {"checkpoint_interval": 120, **SHORT, **settings}
-    return train(algorithm, task, steps=steps, directory=directory, **settings)
-
-
-def contents(directory: Path) -> dict[str, bytes]:
-    """The files that an uninterrupted run would have too."""
-    files = [*FILES, *(path.relative_to(directory).as_posix() for path in directory.glob("policy/*"))]
-    return {name: (directory / name).read_bytes() for name in files if (directory / name).exists()}
-
-
-class Crash(Exception):
-    pass
-
-
-def crash_at(step: int):
-    def on_evaluation(evaluated: int, _: Any) -> None:
-        if evaluated >= step:
-            raise Crash
-
-    return on_evaluation
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 """A change that is not meant to alter learning alters no number of a fixed-seed run.
 
 `digests.json` holds what these runs gave on processors at hand; its keys say what the last bits depend on.
-After a change that is meant to alter numbers, and only then: python tests/test_nothing_changed.py
+After a change that is meant to alter numbers, and only then: python tests/training/test_nothing_changed.py
 """
 
 from __future__ import annotations

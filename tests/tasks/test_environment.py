@@ -443,7 +443,8 @@ def test_a_stopped_seed_steps_no_more():
 
 RUN = """
 import numpy as np
-from csac.tasks.environment import Environment, SeedEnvironments
+from csac.tasks.environment import Environment
+from csac.tasks.seeds import SeedEnvironments
 environments = SeedEnvironments("HalfCheetah-v4", None, [0, 1])
 environments.reset()
 environments.step(np.zeros((2, 6), np.float32))

@@ -18,6 +18,7 @@ import probes
 import psutil
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
+from scalars import scalars
 
 from csac.algorithms import SAC
 from csac.cli import main
@@ -36,7 +37,7 @@ from csac.tasks.silence import quietly
 from csac.training.train import resume, train
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 
-TESTS = Path(__file__).parent
+SUPPORT = Path(__file__).parents[1] / "support"
 QUAD, REACH = "PyFlyt/QuadX-Waypoints-v1", "PandaReach-v3"
 QUAD_EVENTS = ("out_of_bounds", "collision", "env_complete", "num_targets_reached")
 TINY = SAC(actor_hidden_sizes=(8,), critic_hidden_sizes=(8,), batch_size=8, warmup_steps=20, replay_size=200)
@@ -47,7 +48,7 @@ def run_python(code: str, folder: Path, *options: str) -> subprocess.CompletedPr
     return subprocess.run(
         [sys.executable, *options, "-c", code],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(TESTS)},
+        env={**os.environ, "PYTHONPATH": str(SUPPORT)},
         capture_output=True,
         text=True,
         check=False,
@@ -82,8 +83,8 @@ def make_run(path: Path, task: str, events: tuple[str, ...] = (), seeds: tuple[i
 
 @pytest.fixture(autouse=True)
 def _probes_are_found(monkeypatch):
-    monkeypatch.syspath_prepend(TESTS)  # by spawned processes as well, which are given the path
-    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+    monkeypatch.syspath_prepend(SUPPORT)  # by spawned processes as well, which are given the path
+    monkeypatch.setenv("PYTHONPATH", str(SUPPORT))
 
 
 # The robots' tasks
@@ -393,7 +394,7 @@ def cases(tmp_path_factory):
     """A run with an event that there is and one that there is not: (the run, what its reporter was told)."""
     reporter = Notes()
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(TESTS)
+        patch.syspath_prepend(SUPPORT)
         folder = tmp_path_factory.mktemp("cases")
         events = ["crashed", "stops", "nothing", "stops"]
         run = train(
@@ -419,8 +420,6 @@ def test_events_are_columns_after_success(cases):
 
 
 def test_events_are_curves_of_tensorboard(cases):
-    from test_logs import scalars
-
     found = scalars(cases[0].path / "tensorboard" / "seed_0")
     mean = (story(0)[1] + story(1)[1]) / 2
     assert found["eval/stops"] == [(20, mean), (40, mean)]
@@ -519,7 +518,7 @@ def test_the_command_finds_modules_of_the_folder_that_it_is_called_in(tmp_path):
     make_run(tmp_path / "run", "probes:Cases-v0")
     ended = subprocess.run(
         [Path(sys.executable).with_name("csac"), "evaluate", tmp_path / "run", "--episodes", "2"],
-        cwd=TESTS,
+        cwd=SUPPORT,
         env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
         capture_output=True,
         text=True,
@@ -678,7 +677,7 @@ def test_control_c_ends_an_evaluation_and_its_processes(tmp_path):
 
 
 def test_the_example_of_the_documentation_runs(tmp_path, capsys, monkeypatch):
-    example = runpy.run_path(str(TESTS.parent / "examples" / "own_task.py"))
+    example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "own_task.py"))
     example["main"](tmp_path / "run", 600)
     run = RunDirectory.open(tmp_path / "run")
     assert run.manifest["events"] == ["off_the_rail", "reversals"]

@@ -1,6 +1,6 @@
 """Real processes are killed, and what they leave in the end is what an uninterrupted run leaves.
 
-`python tests/chaos.py` does the same at random moments, a hundred times.
+`python tests/support/chaos.py` does the same at random moments, a hundred times.
 """
 
 from __future__ import annotations
