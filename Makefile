@@ -19,7 +19,7 @@ define require_python
 @test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
 endef
 
-.PHONY: help setup train test chaos check lock clean peers bench roofline scaling
+.PHONY: help setup train test slow chaos check lock clean peers bench roofline scaling
 
 help:  ## List the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
@@ -31,7 +31,10 @@ train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=2 S
 	.venv/bin/csac train $(TASK) --algorithm $(ALGORITHM) --seeds $(SEEDS) --steps $(STEPS) $(ARGS)
 
 test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
-	.venv/bin/pytest --numprocesses logical --dist loadfile $(ARGS)
+	.venv/bin/pytest --numprocesses logical --dist loadfile -m 'not slow' $(ARGS)
+
+slow: $(SETUP)  ## Run the tests that need longer: processes that are killed, clusters, browsers
+	.venv/bin/pytest -m slow $(ARGS)
 
 chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave, 20 minutes: make chaos ARGS='--kills 12'
 	.venv/bin/python tests/support/chaos.py --out results/reliability $(ARGS)

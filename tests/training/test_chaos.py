@@ -22,7 +22,7 @@ from csac.training.checkpoint import FOLDER, steps_in
 # A hundred updates at each step, so that a run takes seconds and is still on its way when its kill comes.
 SHORTER = ["--steps", "800", "--evaluation-interval", "200", "--updates-per-step", "100"]
 ALONE = [*TRAIN, *SHORTER]
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="POSIX signals")]
 
 
 class Csac:
