@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from csac.record.plots import learning_curve
-from csac.record.run import read_rows
 from csac.record.statistics import (
     FEWEST_SEEDS,
     evaluation_matrix,
@@ -24,6 +23,7 @@ from csac.record.statistics import (
     mean_told,
     stratified_bootstrap_interval,
 )
+from csac.record.tables import read_rows
 
 
 def up_to(rows: np.ndarray, step: int | None) -> np.ndarray:

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from csac.record.plots import learning_curve
-from csac.record.run import read_rows
 from csac.record.statistics import Recovery, recovery
+from csac.record.tables import read_rows
 
 
 def table(runs: list[tuple[str, np.ndarray]], step: int, until: int | None = None) -> str:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from csac.record.run import write_atomically
+from csac.record.files import write_atomically
 from csac.record.statistics import evaluation_matrix, mean_and_interval
 
 if TYPE_CHECKING:

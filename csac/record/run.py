@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import numpy as np
 
+from csac.record.files import create_atomically, write_atomically
 from csac.record.tables import COLUMNS, append_rows, read_rows, structured
 from csac.types import InputError
 
@@ -21,8 +22,6 @@ except ImportError:  # Windows: nothing keeps two processes apart there
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-
-__all__ = ["RunDirectory", "Table", "default_directory", "find_runs", "read_rows", "write_atomically"]
 
 Table = Literal["episodes", "metrics", "evaluations"]
 
@@ -198,19 +197,6 @@ def default_directory(task_name: str, algorithm: str) -> Path:
     return path
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write beside `path`, sync, rename: a reader meets the old file or the whole new one, never a part."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with open(aside, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
-
-
 def _claim(path: Path, manifest: dict[str, Any]) -> None:
     """Make `path` a run, or raise and leave it as it was."""
     _refuse_occupied(path)
@@ -218,7 +204,7 @@ def _claim(path: Path, manifest: dict[str, Any]) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
         # Of two processes that found the same empty directory, only one gets past this line.
-        _create_atomically(path / MANIFEST, _encode(manifest))
+        create_atomically(path / MANIFEST, _encode(manifest))
     except FileExistsError:
         _refuse_occupied(path)
         raise
@@ -227,22 +213,6 @@ def _claim(path: Path, manifest: dict[str, Any]) -> None:
             with suppress(OSError):
                 folder.rmdir()
         raise
-
-
-def _create_atomically(path: Path, data: bytes) -> None:
-    """As `write_atomically`, but raise FileExistsError where the name is taken."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
-        write_atomically(aside, data)
-        try:
-            os.link(aside, path)
-        except FileExistsError:
-            raise
-        except OSError:  # a file system without links
-            path.touch(exist_ok=False)
-            os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
 
 
 def _is_left_over(path: Path) -> bool:

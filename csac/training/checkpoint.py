@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import safetensors.numpy
 
-from csac.record.run import write_atomically
+from csac.record.files import write_atomically
 from csac.types import InputError, Ring, Snapshot
 
 if TYPE_CHECKING:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from csac.record import run as record
-from csac.record.run import RunDirectory, default_directory, find_runs, read_rows, write_atomically
+from csac.record.files import write_atomically
+from csac.record.run import RunDirectory, default_directory, find_runs
+from csac.record.tables import read_rows
 from csac.types import InputError
 
 MANIFEST = {

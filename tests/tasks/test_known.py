@@ -29,7 +29,8 @@ from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, _number
 from csac.evaluation.play import evaluate_run
 from csac.evaluation.pool import EvaluationPool, choose_processes
-from csac.record.run import RunDirectory, read_rows
+from csac.record.run import RunDirectory
+from csac.record.tables import read_rows
 from csac.tasks import known
 from csac.tasks.environment import Environment
 from csac.tasks.seeds import EVALUATION_SEED

@@ -1,0 +1,38 @@
+"""Files that are whole or not there, whenever the process that writes them is killed."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write beside `path`, sync, rename: a reader meets the old file or the whole new one, never a part."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with open(aside, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def create_atomically(path: Path, data: bytes) -> None:
+    """As `write_atomically`, but raise FileExistsError where the name is taken."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        write_atomically(aside, data)
+        try:
+            os.link(aside, path)
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without links
+            path.touch(exist_ok=False)
+            os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
