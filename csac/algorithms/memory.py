@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac.types import Transition
+from csac.types import Cadence, Transition
 
 if TYPE_CHECKING:
     from csac.types import Spec
@@ -59,6 +59,11 @@ class Rollout(NamedTuple):
     def draw(self, key: jax.Array, count: jax.Array, batch_size: int, spec: Spec) -> Transition:
         """Return all of it: transitions with a leading axis of time."""
         return jax.vmap(unpack, in_axes=(0, None))(self.rows, spec)
+
+
+def replay_cadence(warmup_steps: int, update_interval: int, updates_per_step: int, transitions: int) -> Cadence:
+    """Return when an algorithm learns that draws `transitions` from a replay for each of its updates."""
+    return Cadence(warmup_steps, update_interval, updates_per_step * update_interval, transitions)
 
 
 def row_width(spec: Spec) -> int:

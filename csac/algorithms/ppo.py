@@ -13,7 +13,7 @@ from csac.algorithms.distributions import Gaussian
 from csac.algorithms.hyperparameters import check_hyperparameters
 from csac.algorithms.memory import Rollout
 from csac.algorithms.networks import MLP, begin_descent, descend, make_optimiser, make_orthogonal_mlp
-from csac.types import InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
+from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
 
 # Added to variances and to the spread of advantages, as in SB3 and CleanRL: what never varies is divided by little.
 EPSILON = 1e-8
@@ -126,29 +126,15 @@ class PPO:
             )
 
     @property
-    def warmup_steps(self) -> int:
-        """None: a policy can only learn from what it did itself."""
-        return 0
-
-    @property
-    def updates_per_interval(self) -> int:
-        """One call of `update` for each rollout."""
-        return 1
-
-    @property
-    def update_interval(self) -> int:
-        """Environment steps from one update to the next."""
-        return self.rollout_steps
-
-    @property
-    def transitions_per_update(self) -> int:
-        """Transitions that one call of `update` is given."""
-        return self.rollout_steps
-
-    @property
-    def has_schedule(self) -> bool:
-        """Whether the run's length is part of the algorithm."""
-        return self.learning_rate_schedule == "linear"
+    def cadence(self) -> Cadence:
+        """One update for each rollout and no warm-up: a policy can only learn from what it did itself."""
+        return Cadence(
+            warmup_steps=0,
+            update_interval=self.rollout_steps,
+            updates_per_interval=1,
+            transitions_per_update=self.rollout_steps,
+            has_schedule=self.learning_rate_schedule == "linear",
+        )
 
     def memory(self, spec: Spec, steps: int) -> Rollout:
         """Return a rollout yet to be made."""

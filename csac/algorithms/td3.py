@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 
 from csac.algorithms.hyperparameters import check_hyperparameters
-from csac.algorithms.memory import Replay
+from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import (
     MLP,
     begin_descent,
@@ -22,7 +22,7 @@ from csac.algorithms.networks import (
     polyak,
     q_values,
 )
-from csac.types import Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
+from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
 class State(NamedTuple):
@@ -74,21 +74,15 @@ class TD3:
     max_gradient_norm: float = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
-    has_schedule = False
     name: ClassVar[str] = "td3"
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
 
     @property
-    def updates_per_interval(self) -> int:
-        """Calls of `update` after every `update_interval` environment steps."""
-        return self.updates_per_step * self.update_interval
-
-    @property
-    def transitions_per_update(self) -> int:
-        """Transitions that one call of `update` is given."""
-        return self.batch_size
+    def cadence(self) -> Cadence:
+        """When it learns, and from how much."""
+        return replay_cadence(self.warmup_steps, self.update_interval, self.updates_per_step, self.batch_size)
 
     def memory(self, spec: Spec, steps: int) -> Replay:
         """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""

@@ -80,7 +80,7 @@ def refuse_differences(run: RunDirectory, wanted: dict[str, Any], algorithm: Alg
     before, now = run.manifest["steps"], wanted["steps"]
     if now < before:
         raise InputError(f"{run.path} is a run of {before:,} steps, which {now:,} would shorten: give at least as many")
-    if now > before and algorithm.has_schedule:
+    if now > before and algorithm.cadence.has_schedule:
         raise InputError(
             f"{run.path} cannot go on beyond its {before:,} steps: its learning rate was planned for them (a schedule)"
         )
@@ -222,7 +222,7 @@ class Source(NamedTuple):
             raise InputError(
                 f"steps counts from the beginning: give more than the {self.checkpoint.step:,} made already"
             )
-        if algorithm.has_schedule and wanted["steps"] != before["steps"]:
+        if algorithm.cadence.has_schedule and wanted["steps"] != before["steps"]:
             raise InputError(
                 f"{self.run.path} was planned for {before['steps']:,} steps, and its learning rate with it "
                 "(a schedule): give as many"

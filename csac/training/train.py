@@ -490,11 +490,10 @@ def _memory_note(settings: Settings, spec: Spec, seeds: int, groups: int) -> str
 
 
 def _warmup_note(algorithm: Algorithm, steps: int) -> list[str]:
-    if steps >= algorithm.warmup_steps:
+    warmup = algorithm.cadence.warmup_steps
+    if steps >= warmup:
         return []
-    return [
-        f"note: nothing will be learnt, since all {steps:,} steps are warm-up (warmup_steps={algorithm.warmup_steps:,})"
-    ]
+    return [f"note: nothing will be learnt, since all {steps:,} steps are warm-up (warmup_steps={warmup:,})"]
 
 
 def _versions(task: Task) -> dict[str, str]:

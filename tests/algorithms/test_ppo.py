@@ -228,7 +228,7 @@ def test_linear_learning_rate():
     assert float(update(SMALL, state, rollout(range(8)), 5)[1]["learning_rate"]) == pytest.approx(1.5e-4)
     constant = replace(SMALL, learning_rate_schedule="constant")
     assert float(constant.learning_rate_at(jnp.int32(9), state.total_updates)) == pytest.approx(3e-4)
-    assert (SMALL.has_schedule, constant.has_schedule) == (True, False)
+    assert (SMALL.cadence.has_schedule, constant.cadence.has_schedule) == (True, False)
 
 
 def test_a_step_is_as_long_as_the_learning_rate_says():

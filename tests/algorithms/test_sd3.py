@@ -181,8 +181,8 @@ def test_the_second_pair_sees_the_new_target_of_the_first():
 
 def test_an_update_is_given_a_batch_for_each_pair():
     algorithm = SD3(batch_size=32, **LINEAR)
-    assert algorithm.transitions_per_update == 64
-    assert SD3().transitions_per_update == 512
+    assert algorithm.cadence.transitions_per_update == 64
+    assert SD3().cadence.transitions_per_update == 512
 
 
 def test_targets_in_groups_are_in_their_places(monkeypatch):
