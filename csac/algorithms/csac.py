@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from csac.algorithms.distributions import kl, log_ratio, policy_at
-from csac.algorithms.hyperparameters import check_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    WIDTHS,
+    accept_hyperparameters,
+)
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import (
     MLP,
@@ -52,47 +60,47 @@ def critic_loss(critics: tuple[MLP, MLP], transition: Transition, target: jax.Ar
 class CSAC:
     """Conservative Soft Actor-Critic (the paper's Algorithm 1)."""
 
-    entropy_weight: float = 0.2
+    entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.2
     """Weight of the entropy (the paper's sigma)."""
-    relative_entropy_weight: float = 0.5
+    relative_entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.5
     """Weight of the relative entropy towards the reference policy (the paper's tau); 0 is SAC."""
     reference_policy: Literal["algorithm1", "previous", "periodic", "average"] = "periodic"
     """The reference: the actor before the gradients or before the last update, a periodic copy, or an average."""
-    reference_period: int = 1000
+    reference_period: Annotated[int, COUNT] = 1000
     """Updates between two copies of the actor, with `periodic`."""
-    reference_rate: float = 0.005
+    reference_rate: Annotated[float, RATE] = 0.005
     """Step of the running average towards the actor, with `average`."""
     relative_entropy_estimator: Literal["closed_form", "sampled"] = "closed_form"
     """The exact KL of the two policies, or the paper's log-ratio at the sampled action."""
-    discount: float = 0.99
+    discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
-    target_rate: float = 0.005
+    target_rate: Annotated[float, RATE] = 0.005
     """Soft update rate of the target critics (the paper's rho)."""
-    actor_learning_rate: float = 3e-4
+    actor_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the actor."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the critics."""
-    actor_hidden_sizes: tuple[int, ...] = (256, 256)
+    actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of the actor's hidden layers."""
-    critic_hidden_sizes: tuple[int, ...] = (256, 256)
+    critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
-    batch_size: int = 256
+    batch_size: Annotated[int, COUNT] = 256
     """Transitions in one update (the paper's M)."""
-    replay_size: int = 1_000_000
+    replay_size: Annotated[int, COUNT] = 1_000_000
     """Transitions that the replay keeps."""
-    warmup_steps: int = 10_000
+    warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts (the paper's T_initial)."""
-    updates_per_step: int = 1
+    updates_per_step: Annotated[int, COUNT] = 1
     """Updates for each environment step."""
-    update_interval: int = 1
+    update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
-    max_gradient_norm: float = 0.0
+    max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
     name: ClassVar[str] = "csac"
 
     def __post_init__(self) -> None:
-        check_hyperparameters(self)
+        accept_hyperparameters(self)
 
     @property
     def cadence(self) -> Cadence:

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from csac.algorithms.distributions import Gaussian
-from csac.algorithms.hyperparameters import check_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHARE,
+    WIDTHS,
+    accept_hyperparameters,
+)
 from csac.algorithms.memory import Rollout
 from csac.algorithms.networks import MLP, begin_descent, descend, make_optimiser, make_orthogonal_mlp
 from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
@@ -78,47 +86,47 @@ class Sample(NamedTuple):
 class PPO:
     """Proximal Policy Optimisation."""
 
-    learning_rate: float = 3e-4
+    learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the one optimiser, at the start or throughout."""
     learning_rate_schedule: Literal["linear", "constant"] = "linear"
     """Whether the learning rate falls linearly to zero over the run or stays as it starts."""
-    discount: float = 0.99
+    discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
-    trace_decay: float = 0.95
+    trace_decay: Annotated[float, SHARE] = 0.95
     """How far an advantage looks past the critic: 0 one step, 1 to the end of the episode (GAE's lambda)."""
-    clip_range: float = 0.2
+    clip_range: Annotated[float, POSITIVE] = 0.2
     """How far the probability ratio may leave 1 before its gradient stops (epsilon)."""
     clip_value_loss: bool = True
     """Whether a value earns nothing by moving further than `clip_range` from what it was."""
-    value_loss_weight: float = 0.5
+    value_loss_weight: Annotated[float, NOT_NEGATIVE] = 0.5
     """Weight of the value loss beside the policy's."""
-    entropy_weight: float = 0.0
+    entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.0
     """Weight of the policy's entropy."""
-    max_gradient_norm: float = 0.5
+    max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.5
     """Bound on the norm of the gradient of all parameters together; 0 leaves gradients alone."""
-    adam_epsilon: float = 1e-5
+    adam_epsilon: Annotated[float, POSITIVE] = 1e-5
     """Added to the root of Adam's second moment (its epsilon)."""
-    rollout_steps: int = 2048
+    rollout_steps: Annotated[int, COUNT] = 2048
     """Environment steps from one update to the next, all of which it learns from."""
-    minibatches: int = 32
+    minibatches: Annotated[int, COUNT] = 32
     """Parts into which each epoch divides the rollout; they must be equal."""
-    epochs: int = 10
+    epochs: Annotated[int, COUNT] = 10
     """Passes over the rollout in one update."""
     normalise_advantages: bool = True
     """Whether the advantages of each minibatch are brought to mean 0 and standard deviation 1."""
-    hidden_sizes: tuple[int, ...] = (64, 64)
+    hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (64, 64)
     """Widths of the hidden layers, with tanh, of the actor and of the critic."""
     normalise_observations: bool = True
     """Whether observations are brought to mean 0 and standard deviation 1 by running statistics."""
     normalise_rewards: bool = True
     """Whether rewards are divided by the running standard deviation of the discounted return."""
-    normalisation_limit: float = 10.0
+    normalisation_limit: Annotated[float, POSITIVE] = 10.0
     """Bound on the magnitude of normalised observations and rewards."""
 
     name: ClassVar[str] = "ppo"
 
     def __post_init__(self) -> None:
-        check_hyperparameters(self)
+        accept_hyperparameters(self)
         if self.rollout_steps % self.minibatches:
             raise InputError(
                 f"minibatches must divide rollout_steps into equal parts: {self.rollout_steps} steps make no "

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from csac.algorithms.distributions import policy_at
-from csac.algorithms.hyperparameters import check_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    WIDTHS,
+    accept_hyperparameters,
+)
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import (
     MLP,
@@ -44,41 +52,41 @@ class SAC:
 
     temperature: Literal["automatic", "fixed"] = "automatic"
     """Whether the entropy's weight is learnt, to hold the policy's entropy at its target, or stays as it starts."""
-    entropy_weight: float = 1.0
+    entropy_weight: Annotated[float, NOT_NEGATIVE] = 1.0
     """Weight of the entropy, to begin with or throughout (SAC's alpha, the paper's sigma)."""
     target_entropy: float | None = None
     """Entropy that the automatic temperature aims at, in nats; by default minus the number of action dimensions."""
-    discount: float = 0.99
+    discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
-    target_rate: float = 0.005
+    target_rate: Annotated[float, RATE] = 0.005
     """Soft update rate of the target critics (the paper's rho)."""
-    actor_learning_rate: float = 3e-4
+    actor_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the actor."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the critics."""
-    temperature_learning_rate: float = 3e-4
+    temperature_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the automatic temperature."""
-    actor_hidden_sizes: tuple[int, ...] = (256, 256)
+    actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of the actor's hidden layers."""
-    critic_hidden_sizes: tuple[int, ...] = (256, 256)
+    critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
-    batch_size: int = 256
+    batch_size: Annotated[int, COUNT] = 256
     """Transitions in one update."""
-    replay_size: int = 1_000_000
+    replay_size: Annotated[int, COUNT] = 1_000_000
     """Transitions that the replay keeps."""
-    warmup_steps: int = 10_000
+    warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts."""
-    updates_per_step: int = 1
+    updates_per_step: Annotated[int, COUNT] = 1
     """Updates for each environment step."""
-    update_interval: int = 1
+    update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
-    max_gradient_norm: float = 0.0
+    max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
     name: ClassVar[str] = "sac"
 
     def __post_init__(self) -> None:
-        check_hyperparameters(self)
+        accept_hyperparameters(self)
         if self.temperature == "automatic" and self.entropy_weight == 0:
             raise InputError("entropy_weight must be more than 0 to begin an automatic temperature")
 

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from csac.algorithms.hyperparameters import check_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    WIDTHS,
+    accept_hyperparameters,
+)
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import (
     MLP,
@@ -50,47 +58,47 @@ class State(NamedTuple):
 class SD3:
     """Softmax Deep Double Deterministic policy gradients (its Algorithm 1)."""
 
-    inverse_temperature: float = 0.05
+    inverse_temperature: Annotated[float, NOT_NEGATIVE] = 0.05
     """How far the value of a state leans to its best sampled action (the paper's beta): 0 is the mean."""
-    noise_samples: int = 50
+    noise_samples: Annotated[int, COUNT] = 50
     """Actions sampled around the target actor's to value a state (the paper's K)."""
     importance_sampling: bool = False
     """Whether to divide each sample's weight by its density (as the paper derives it); its authors' code does not."""
-    exploration_noise: float = 0.1
+    exploration_noise: Annotated[float, NOT_NEGATIVE] = 0.1
     """Standard deviation of the noise on the actions that explore."""
-    target_noise: float = 0.2
+    target_noise: Annotated[float, NOT_NEGATIVE] = 0.2
     """Standard deviation of the noise on the target actors' actions (the paper's sigma)."""
-    target_noise_clip: float = 0.5
+    target_noise_clip: Annotated[float, NOT_NEGATIVE] = 0.5
     """Bound on that noise (the paper's c)."""
-    discount: float = 0.99
+    discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
-    target_rate: float = 0.005
+    target_rate: Annotated[float, RATE] = 0.005
     """Soft update rate of the targets (the paper's tau)."""
-    actor_learning_rate: float = 1e-3
+    actor_learning_rate: Annotated[float, POSITIVE] = 1e-3
     """Learning rate of the actors."""
-    critic_learning_rate: float = 1e-3
+    critic_learning_rate: Annotated[float, POSITIVE] = 1e-3
     """Learning rate of the critics."""
-    actor_hidden_sizes: tuple[int, ...] = (256, 256)
+    actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each actor's hidden layers."""
-    critic_hidden_sizes: tuple[int, ...] = (256, 256)
+    critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
-    batch_size: int = 256
+    batch_size: Annotated[int, COUNT] = 256
     """Transitions for each of the two pairs in one update."""
-    replay_size: int = 1_000_000
+    replay_size: Annotated[int, COUNT] = 1_000_000
     """Transitions that the replay keeps."""
-    warmup_steps: int = 10_000
+    warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts."""
-    updates_per_step: int = 1
+    updates_per_step: Annotated[int, COUNT] = 1
     """Updates for each environment step."""
-    update_interval: int = 1
+    update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
-    max_gradient_norm: float = 0.0
+    max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
     name: ClassVar[str] = "sd3"
 
     def __post_init__(self) -> None:
-        check_hyperparameters(self)
+        accept_hyperparameters(self)
 
     @property
     def cadence(self) -> Cadence:

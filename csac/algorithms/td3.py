@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from csac.algorithms.hyperparameters import check_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    WIDTHS,
+    accept_hyperparameters,
+)
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import (
     MLP,
@@ -41,43 +49,43 @@ class State(NamedTuple):
 class TD3:
     """Twin Delayed DDPG (its Algorithm 1)."""
 
-    exploration_noise: float = 0.1
+    exploration_noise: Annotated[float, NOT_NEGATIVE] = 0.1
     """Standard deviation of the noise on the actions that explore (the paper's sigma)."""
-    target_noise: float = 0.2
+    target_noise: Annotated[float, NOT_NEGATIVE] = 0.2
     """Standard deviation of the noise on the target actor's actions (the paper's sigma tilde)."""
-    target_noise_clip: float = 0.5
+    target_noise_clip: Annotated[float, NOT_NEGATIVE] = 0.5
     """Bound on that noise (the paper's c)."""
-    policy_delay: int = 2
+    policy_delay: Annotated[int, COUNT] = 2
     """Updates of the critics for each update of the actor and of the targets (the paper's d)."""
-    discount: float = 0.99
+    discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
-    target_rate: float = 0.005
+    target_rate: Annotated[float, RATE] = 0.005
     """Soft update rate of the targets (the paper's tau)."""
-    actor_learning_rate: float = 3e-4
+    actor_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the actor."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the critics."""
-    actor_hidden_sizes: tuple[int, ...] = (256, 256)
+    actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of the actor's hidden layers."""
-    critic_hidden_sizes: tuple[int, ...] = (256, 256)
+    critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
-    batch_size: int = 256
+    batch_size: Annotated[int, COUNT] = 256
     """Transitions in one update."""
-    replay_size: int = 1_000_000
+    replay_size: Annotated[int, COUNT] = 1_000_000
     """Transitions that the replay keeps."""
-    warmup_steps: int = 10_000
+    warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts."""
-    updates_per_step: int = 1
+    updates_per_step: Annotated[int, COUNT] = 1
     """Updates for each environment step."""
-    update_interval: int = 1
+    update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
-    max_gradient_norm: float = 0.0
+    max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
     name: ClassVar[str] = "td3"
 
     def __post_init__(self) -> None:
-        check_hyperparameters(self)
+        accept_hyperparameters(self)
 
     @property
     def cadence(self) -> Cadence:
