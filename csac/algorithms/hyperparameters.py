@@ -34,8 +34,8 @@ WIDTHS = Limit(
 )
 
 
-def accept_hyperparameters(algorithm: Any) -> None:
-    """Take an algorithm's fields as plain Python values, or refuse one outside its range or its choices.
+def take_hyperparameters(algorithm: Any) -> None:
+    """Take an algorithm's fields as plain Python values, and refuse one outside its range or its choices.
 
     NumPy's scalars become Python's, and lists tuples, so that what is recorded does not depend on how it was given.
 

@@ -15,7 +15,8 @@ import scipy.stats
 
 from csac.algorithms import PPO
 from csac.algorithms.distributions import Gaussian
-from csac.algorithms.ppo import Sample, State, Statistics, explained_variance, policy_at
+from csac.algorithms.ppo import Sample, State, explained_variance, policy_at
+from csac.algorithms.statistics import Statistics
 from csac.types import InputError, Normaliser, Spec, Transition
 
 if TYPE_CHECKING:
