@@ -44,7 +44,7 @@ def _bytes_per_seed(plan: Plan, spec: Spec) -> int:
     """
     algorithm, steps, key = plan.algorithm, plan.steps, jax.ShapeDtypeStruct((2,), "uint32")
     state, memory = jax.eval_shape(lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), key)
-    transitions = algorithm.transitions_per_update
+    transitions = algorithm.cadence.transitions_per_update
     units = sum(leaf.size for leaf in jax.tree.leaves(state) if len(leaf.shape) == 1)
     kept = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((state, memory)))
     return kept + 4 * transitions * (memory.rows.shape[1] + units)

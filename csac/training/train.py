@@ -108,7 +108,7 @@ def train(
     plan, spec = make_plan(algorithm, task, options, before, may_evaluate_beside=stop_when is None)
     notes = [memory_needed(plan, spec), *_warmup_note(plan)]
     wanted = plan.manifest(**surroundings(task, command))
-    has_schedule, defaults = algorithm.has_schedule, _defaults(algorithm)
+    has_schedule, defaults = algorithm.cadence.has_schedule, _defaults(algorithm)
     if before.existing:
         run = before.existing
         refuse_differences(run, wanted, has_schedule, defaults)
@@ -388,7 +388,7 @@ def _defaults(algorithm: Algorithm) -> dict[str, Any]:
 
 
 def _warmup_note(plan: Plan) -> list[str]:
-    steps, warmup = plan.steps, plan.algorithm.warmup_steps
+    steps, warmup = plan.steps, plan.algorithm.cadence.warmup_steps
     if steps >= warmup:
         return []
     return [f"note: nothing will be learnt, since all {steps:,} steps are warm-up (warmup_steps={warmup:,})"]

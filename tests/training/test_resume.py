@@ -41,7 +41,7 @@ def everything(group: Group) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in leaves] + [group._actions, group._observations, group.learner._waiting]
 
 
-@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda learner: f"{learner.name}-{learner.update_interval}")
+@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda learner: f"{learner.name}-{learner.cadence.update_interval}")
 def test_a_group_goes_on_bit_for_bit(tmp_path, algorithm):
     check_that_a_group_goes_on(tmp_path, algorithm, (3,))
 
