@@ -87,6 +87,7 @@ class Learner:
             self._updates_summed += self.algorithm.updates_per_interval
         given = (self._axis.strip(self._waiting), self._axis.strip(outcome.observation), np.int32(step))
         next_actions, self._carry = program(self._carry, *given)
+        self._waiting = np.zeros_like(self._waiting)  # JAX reads an argument where it lies, as long as the program runs
         return self._axis.restore(np.asarray(next_actions))
 
     def networks(self) -> list[PolicyNetwork]:

@@ -74,6 +74,25 @@ def test_what_was_saved_of_each_seed_is_taken_back(seeds):
     np.testing.assert_array_equal(advance(again, len(seeds), 11, 14), advance(learner, len(seeds), 11, 14))
 
 
+@pytest.mark.parametrize("interval", [1, 3])
+def test_nothing_that_a_program_was_given_is_written_over(monkeypatch, interval):
+    """JAX does not copy NumPy's arrays where they are aligned, and may still read them when a dispatch returns."""
+    learner = Learner(TD3(**TINY, update_interval=interval), SPEC, [0], 100)
+    given: list[tuple[np.ndarray, np.ndarray]] = []
+    for name in ("_explore", "_learn"):
+        own = getattr(learner, name)
+
+        def program(carry, *arguments, own=own):
+            given.extend((array, np.array(array)) for array in arguments)
+            return own(carry, *arguments)
+
+        monkeypatch.setattr(learner, name, program)
+    advance(learner, 1, 1, 12)
+    assert len(given) == 3 * 12 // interval
+    for array, then in given:
+        np.testing.assert_array_equal(array, then)
+
+
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_an_algorithm_is_traced_once(monkeypatch, seeds):
     """Its shapes are asked for before it runs; tracing takes a good part of the start."""
