@@ -41,7 +41,7 @@ class Part:
     """Something that is measured: `results/NAME.csv` has its rows, NAME.txt what they depend on, `page` its table.
 
     `measure` gives the rows of a case. A case is its name, or has one; where its `repeated` is false, it is measured in
-    the first repetition alone.
+    the first repetition alone. Only where `repetitions` is more than one can the command line choose another number.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Part:
     def run(self, options: Options) -> list[Row]:
         """Measure the cases in turns, A B C A B C, and say what comes out."""
         chosen = [case for case in self.cases if options.only in getattr(case, "name", case)]
-        repetitions = options.repetitions or self.repetitions
+        repetitions = options.repetitions or self.repetitions if self.repetitions > 1 else 1
         if options.quick:
             chosen, repetitions = chosen[: self.quick_cases], 1
         rows = []

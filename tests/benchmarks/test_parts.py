@@ -31,6 +31,8 @@ def test_cases_take_turns_and_some_come_once():
     rows = part(cases=cases, measure=lambda case, _: [{"case": case.name}], repetitions=2).run(Options())
 
     assert [(row["repetition"], row["case"]) for row in rows] == [(0, "a"), (0, "b"), (0, "c"), (1, "a"), (1, "c")]
+    once = part(repetitions=2).run(Options(repetitions=1))
+    assert [(row["repetition"], row["case"]) for row in once] == [(0, "a"), (0, "b")]
 
 
 @pytest.mark.parametrize(
@@ -40,7 +42,7 @@ def test_cases_take_turns_and_some_come_once():
         (Options(only="b"), ["b"]),
         (Options(only="nothing"), []),
         (Options(quick=True), ["a"]),
-        (Options(repetitions=2, only="a"), ["a", "a"]),
+        (Options(repetitions=2), ["a", "b"]),  # what is measured once has no column for more
     ],
 )
 def test_which_cases_are_measured(options, expected):
