@@ -32,10 +32,10 @@ def make_learner(algorithm: str, spec: Spec = HALF_CHEETAH, seeds: int = 1, **ch
 class Driver:
     """Gives a learner the same transition again and again."""
 
-    def __init__(self, learner: Learner, seeds: int = 1) -> None:
+    def __init__(self, learner: Learner, seeds: int = 1, interval: int = 1) -> None:
         observation_size, action_size = learner.spec
         generator = np.random.default_rng(0)
-        self.learner, self.step, self.interval = learner, 0, learner.algorithm.update_interval
+        self.learner, self.step, self.interval = learner, 0, interval
         self.observations = generator.standard_normal((seeds, observation_size), dtype=np.float32)
         self.actions = np.zeros((seeds, action_size), np.float32)
         none = np.zeros(seeds, bool)

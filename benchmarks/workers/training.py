@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import multiprocessing
 import os
 import time
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Console
 
-from benchmarks.measuring import Window
+from benchmarks.measuring import ROLLOUT_STEPS, Window
 from csac import train
 from csac.algorithms import ALGORITHMS
 from csac.console.progress import Reporter
@@ -93,19 +92,20 @@ def measure(
         algorithm: its name; it has the settings of the preset `paper`, but for the warm-up.
         task: a Gymnasium id.
         seeds: how many are trained, in groups as csac chooses them.
-        interval: environment steps, and updates, in one dispatch.
+        interval: environment steps, and updates, in one dispatch; PPO's is its rollout.
         device: cpu or gpu.
         launched: `time.monotonic()` when this process was started.
         counted: the fields of `Window`.
     """
     window, paper = Window(**counted), hyperparameters("paper", algorithm, task)
-    learner = ALGORITHMS[algorithm](**paper)
-    if learner.warmup_steps:
-        learner = dataclasses.replace(learner, warmup_steps=window.warmup, update_interval=interval)
-    clock = Clock(window, launched, seeds, learner.update_interval)
+    if algorithm == "ppo":
+        interval = ROLLOUT_STEPS
+    else:
+        paper |= {"warmup_steps": window.warmup, "update_interval": interval}
+    clock = Clock(window, launched, seeds, interval)
     try:
         train(
-            learner,
+            ALGORITHMS[algorithm](**paper),
             task,
             steps=STEPS,
             seeds=seeds,

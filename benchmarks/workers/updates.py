@@ -28,7 +28,7 @@ def measure(
         replay_size=replay,
         update_interval=interval,
     )
-    driver = Driver(learner)
+    driver = Driver(learner, interval=interval)
     driver.run(min(seconds, 0.5))
     speed = driver.run(seconds)
     return {"updates_per_second": speed, "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
