@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from argparse import Namespace
 from pathlib import Path
 
-import csac_speed
 import pytest
-from cases import CASES, HERE, LIBRARIES, REACHES, Case
 from measuring import Window, argument_parser, parse
-from products import Network, Product, operations, update_products
-from report import Measurement, markdown, ratios, write_between_markers
-from speed import Protocol, command
+
+from benchmarks.contenders import CASES, LIBRARIES, REACHES, Case, Reach
+from benchmarks.parts import Options
+from benchmarks.suites.peers import command, measure, ratios, render, window
+from benchmarks.workers import training
+from csac.types import InputError
 
 
-def measurement(repetition: int, contender: str, steps_per_second: float) -> Measurement:
-    return Measurement(repetition, "one seed", contender, "XLA, 2 cores", steps_per_second, 500, 5.0, 9.0, 600.0, 0.0)
+def measured(repetition: int, contender: str, steps_per_second: float) -> dict:
+    row = {"repetition": repetition, "setting": "one seed", "contender": contender, "allowed": "XLA, 2 cores"}
+    return {**row, "steps_per_second": steps_per_second, "start_seconds": 9.0, "peak_mib": 600.0}
 
 
 MEASURED = [
-    measurement(0, "ours", 120.0),
-    measurement(0, "theirs", 100.0),
-    measurement(1, "ours", 90.0),
-    measurement(1, "theirs", 60.0),
-    measurement(2, "ours", 500.0),
+    measured(0, "ours", 120.0),
+    measured(0, "theirs", 100.0),
+    measured(1, "ours", 90.0),
+    measured(1, "theirs", 60.0),
+    measured(2, "ours", 500.0),
 ]
 
 
@@ -33,16 +36,18 @@ def test_a_ratio_is_of_one_repetition():
     assert ratios(MEASURED, "one seed", "ours", "theirs") == [1.2, 1.5]
 
 
-def test_the_table_says_what_each_was_allowed(tmp_path):
-    path = tmp_path / "README.md"
-    path.write_text("before\n<!-- measured: begin -->\nold\n<!-- measured: end -->\nafter\n")
+def test_the_table_says_what_each_was_allowed():
+    lines = render(MEASURED, []).splitlines()
 
-    write_between_markers(path, markdown(MEASURED, [], ["a machine"]))
-
-    lines = path.read_text().splitlines()
-    assert [lines[0], lines[-1]] == ["before", "after"]
-    assert "old" not in lines
     assert "| one seed | theirs | XLA, 2 cores | 80 (60 to 100) | 1.35 (1.20 to 1.50) | 9.0 | 600 |" in lines
+
+
+def test_what_was_to_be_reached_is_said_of_the_median():
+    wanted = [Reach("one seed", "ours", "theirs", 1.3), Reach("one seed", "ours", "theirs", 1.4)]
+    lines = render(MEASURED, wanted).splitlines()
+
+    assert "| one seed | ours / theirs | >= 1.3 | 1.35 (1.20 to 1.50) | yes |" in lines
+    assert "| one seed | ours / theirs | >= 1.4 | 1.35 (1.20 to 1.50) | **no** |" in lines
 
 
 def test_each_contender_is_once_in_a_setting_and_the_first_is_ours():
@@ -60,23 +65,34 @@ def test_what_is_to_be_reached_is_measured_in_every_repetition():
         assert {(reach.setting, reach.contender), (reach.setting, reach.peer)} <= repeated
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.setting}: {case.contender}")
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_the_scripts_understand_what_they_are_given(case: Case):
     library = LIBRARIES[case.library]
-    arguments = command(case, Protocol(), [0, 1])
-    script = arguments.index(str(HERE / library.script))
-
+    arguments = command(case, window(case, Options()))
     if case.library == "csac":
-        known, unknown = csac_speed.parse(arguments[script + 1 :]), []
+        *_, module, name, given = arguments
+        known = Namespace(**inspect.signature(training.measure).bind(**json.loads(given)).arguments)
+        counted, unknown = Namespace(**known.counted), []
+        assert (module, name) == ("benchmarks.worker", "training")
     else:
-        algorithms = ("sac", "td3", "ppo")
-        known, unknown = argument_parser("", algorithms).parse_known_args(arguments[script + 1 :])
+        script = next(argument for argument in arguments if argument.endswith(library.script))
+        parser = argument_parser("", ("sac", "td3", "ppo"))
+        known, unknown = parser.parse_known_args(arguments[arguments.index(script) + 1 :])
+        counted = known
+        assert Path(script).is_file()
         assert known.threads == (case.threads_each if library.has_threads else None)
 
-    assert Path(arguments[script]).is_file()
     assert unknown == list(library.options)
     assert (known.algorithm, known.seeds) == (case.algorithm, case.seeds)
-    assert bool(known.evaluation_interval) == case.evaluated
+    assert bool(counted.evaluation_interval) == case.evaluated
+    assert counted.warmup == (2048 if case.algorithm == "ppo" else 250)
+
+
+def test_without_the_peers_nothing_is_measured_and_their_places_are_not_left_empty(monkeypatch):
+    monkeypatch.setattr("benchmarks.suites.peers.PEERS_PYTHON", "/no/such/python")
+
+    with pytest.raises(InputError, match="run `make peers` first"):
+        measure(CASES[0], Options())
 
 
 @pytest.mark.parametrize(
@@ -120,31 +136,3 @@ def test_a_peer_that_cannot_evaluate_says_so(capsys):
 
     assert stopped.value.code == 2
     assert "without evaluation" in capsys.readouterr().err
-
-
-def test_the_products_of_a_small_network_by_hand():
-    network = Network((3, 5, 2))
-    assert network.forward(7) == {Product(7, 3, 5): 1, Product(7, 5, 2): 1}
-    assert network.weight_gradient(7) == {Product(3, 7, 5): 1, Product(5, 7, 2): 1}
-    assert network.input_gradient(7) == {Product(7, 2, 5): 1}  # the network's own inputs are data
-    assert network.input_gradient(7, 1) == {Product(7, 2, 5): 1, Product(7, 5, 1): 1}
-    assert operations(dict(network.forward(7))) == 2 * 7 * (3 * 5 + 5 * 2)
-
-
-@pytest.mark.parametrize(("algorithm", "hidden"), [("csac", 18), ("sac", 16), ("td3", 11.5)])
-def test_the_products_of_an_update(algorithm, hidden):
-    # By hand, in hidden products of one network: forward 1, learning 3, a gradient through a critic 2.
-    # CSAC: target 1 + 1 + 2, critics 3 + 3, actor 3 + 1 + 2 + 2. SAC has no reference, twice 1.
-    # TD3: target 1 + 2, critics 3 + 3, and every other time actor 3 and one critic 2.
-    counts = update_products(algorithm)
-    assert counts[Product(256, 256, 256)] == hidden
-    assert 1 < operations(counts) / (hidden * Product(256, 256, 256).operations) < 1.1  # the edges are small
-
-
-def test_a_table_goes_between_its_own_markers(tmp_path):
-    path = tmp_path / "page.md"
-    path.write_text("<!-- a: begin -->\n<!-- a: end -->\n<!-- b: begin -->\nold\n<!-- b: end -->\n")
-    write_between_markers(path, "new\n", "b")
-    assert path.read_text() == "<!-- a: begin -->\n<!-- a: end -->\n<!-- b: begin -->\nnew\n<!-- b: end -->\n"
-    with pytest.raises(SystemExit, match="lacks the lines <!-- c: begin -->"):
-        write_between_markers(path, "new\n", "c")

@@ -9,11 +9,10 @@ import sysconfig
 from pathlib import Path
 from typing import NamedTuple
 
-from report import Reach
+from benchmarks.measuring import ROOT
 
-HERE = Path(__file__).resolve().parent
-PEERS_PYTHON = os.environ.get("PEERS_PYTHON") or str(HERE.parent / ".venv-peers" / "bin" / "python")
-PARL_PYTHON = os.environ.get("PARL_PYTHON") or str(HERE.parent / ".venv-parl" / "bin" / "python")
+PEERS_PYTHON = os.environ.get("PEERS_PYTHON") or str(ROOT / ".venv-peers" / "bin" / "python")
+PARL_PYTHON = os.environ.get("PARL_PYTHON") or str(ROOT / ".venv-parl" / "bin" / "python")
 
 SINGLE, SINGLE_ONE_CORE = "one seed, 2 cores", "one seed, 1 core"
 FIVE, FIVE_ONE_CORE = "five seeds, 2 cores", "five seeds, 1 core"
@@ -24,7 +23,7 @@ TD3, PPO = "TD3, one seed, 2 cores", "PPO, one seed, 2 cores"
 class Library(NamedTuple):
     """How one measurement of a library is launched, and what does its arithmetic."""
 
-    script: str
+    script: str  # in benchmarks/peers; none for csac's own worker
     python: str
     engine: str
     options: tuple[str, ...] = ()
@@ -46,13 +45,13 @@ class Library(NamedTuple):
 
 
 LIBRARIES = {
-    "csac": Library("csac_speed.py", sys.executable, "XLA"),
-    "sbx": Library("peers/sb3_speed.py", PEERS_PYTHON, "XLA", ("--library=sbx",)),
-    "sb3": Library("peers/sb3_speed.py", PEERS_PYTHON, "PyTorch", ("--library=sb3",)),
-    "eager": Library("peers/cleanrl_speed.py", PEERS_PYTHON, "PyTorch"),
-    "compiled": Library("peers/cleanrl_speed.py", PEERS_PYTHON, "torch.compile", ("--compile",)),
-    "tianshou": Library("peers/tianshou_speed.py", PEERS_PYTHON, "PyTorch"),
-    "parl": Library("peers/parl_speed.py", PARL_PYTHON, "Paddle"),
+    "csac": Library("", sys.executable, "XLA"),
+    "sbx": Library("sb3_speed.py", PEERS_PYTHON, "XLA", ("--library=sbx",)),
+    "sb3": Library("sb3_speed.py", PEERS_PYTHON, "PyTorch", ("--library=sb3",)),
+    "eager": Library("cleanrl_speed.py", PEERS_PYTHON, "PyTorch"),
+    "compiled": Library("cleanrl_speed.py", PEERS_PYTHON, "torch.compile", ("--compile",)),
+    "tianshou": Library("tianshou_speed.py", PEERS_PYTHON, "PyTorch"),
+    "parl": Library("parl_speed.py", PARL_PYTHON, "Paddle"),
 }
 
 
@@ -67,10 +66,13 @@ class Case(NamedTuple):
     cores: int = 2
     together: int = 1  # processes side by side, the cores divided among them
     threads: int = 0  # of a library that is told, 0 for one on each core
-    interval: int = 1  # of csac: environment steps, and their updates, in one dispatch
-    device: str = "cpu"  # of csac
     evaluated: bool = False
     repeated: bool = False  # measured in every repetition, and not only in the first
+
+    @property
+    def name(self) -> str:
+        """What --only looks in."""
+        return f"{self.setting}: {self.contender}"
 
     @property
     def threads_each(self) -> int:
@@ -84,6 +86,15 @@ class Case(NamedTuple):
         count = self.threads_each if library.has_threads else self.cores // self.together
         unit = ("thread" if library.has_threads else "core") + "s" * (count > 1)
         return f"{library.engine}, {count} {unit}" + " each" * (self.together > 1)
+
+
+class Reach(NamedTuple):
+    """A ratio that is to be reached between two contenders of one setting."""
+
+    setting: str
+    contender: str
+    peer: str
+    ratio: float
 
 
 CASES = [

@@ -1,4 +1,4 @@
-"""The matrix products that one update needs, counted from the equations, and how fast this machine multiplies.
+"""The matrix products that one update needs, counted from the equations.
 
 What is counted is what has to be: forward passes, gradients of weights, and gradients of inputs where something learns
 from them. It is not what a compiled program happens to do, which would reward waste. Everything else that an update
@@ -7,20 +7,14 @@ does (activations, Adam, noise, the draw from the replay) counts as nothing.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import time
 from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
 OBSERVATION, ACTION = 17, 6  # of HalfCheetah-v4
 BATCH = 256
-
-TOGETHER = 20  # products in one dispatch: a single one would be over before the clock can tell
 
 
 class Product(NamedTuple):
@@ -34,6 +28,9 @@ class Product(NamedTuple):
     def operations(self) -> int:
         """Multiplications and additions."""
         return 2 * self.rows * self.inner * self.columns
+
+
+DOMINANT = Product(256, 256, 256)
 
 
 class Network(NamedTuple):
@@ -99,55 +96,3 @@ def operations(counts: dict[Product, float]) -> float:
 
 def _times(number: int, counts: Counter[Product]) -> Counter[Product]:
     return Counter({product: number * times for product, times in counts.items()})
-
-
-def rates(sizes: Sequence[Product], seconds: float) -> dict[str, float]:
-    """Return operations per second of each product on the processors that this process may use.
-
-    It is a limit, so everything is in its favour: the same operands again and again, which stay in the caches, and of
-    ten windows the best, for what one loses to others on a shared machine does not count.
-    """
-    import jax
-    import jax.numpy as jnp
-
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
-    found = {}
-    for size in sizes:
-        left = jax.random.normal(jax.random.key(0), (size.rows, size.inner))
-        right = jax.random.normal(jax.random.key(1), (size.inner, size.columns))
-
-        @jax.jit
-        def multiply(left: jax.Array, right: jax.Array) -> jax.Array:
-            def again(_: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-                operand, product = carry
-                operand = operand.at[0, 0].set(product[0, 0])  # so that each has to wait for the one before it
-                return operand, operand @ right
-
-            return jax.lax.fori_loop(0, TOGETHER, again, (left, jnp.zeros((len(left), right.shape[1]))))[1]
-
-        multiply(left, right)
-        windows = []
-        for _ in range(10):
-            calls, began = 0, time.perf_counter()
-            while (elapsed := time.perf_counter() - began) < seconds / 10:
-                multiply(left, right)
-                calls += 1
-            windows.append(calls * TOGETHER * size.operations / elapsed)
-        found[",".join(map(str, size))] = max(windows)
-    return found
-
-
-def main() -> None:
-    """Print the rates as one line of JSON: what `roofline.py` runs, bound to processors, in a process of its own."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cores", required=True, help="processors to run on, such as 0,1")
-    parser.add_argument("--seconds", type=float, default=1.0, help="for each product")
-    parser.add_argument("sizes", nargs="+", help="such as 256,256,256")
-    arguments = parser.parse_args()
-    os.sched_setaffinity(0, [int(core) for core in arguments.cores.split(",")])
-    sizes = [Product(*map(int, size.split(","))) for size in arguments.sizes]
-    print(json.dumps(rates(sizes, arguments.seconds)), flush=True)
-
-
-if __name__ == "__main__":
-    main()
