@@ -11,7 +11,6 @@ from contextlib import closing
 from statistics import median
 from typing import Any
 
-from benchmarks.driver import
 from csac.algorithms import ALGORITHMS
 from csac.evaluation.evaluator import Evaluator
 from csac.evaluation.pool import EvaluationPool

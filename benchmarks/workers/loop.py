@@ -10,7 +10,6 @@ import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.driver import
 from csac.algorithms import ALGORITHMS
 from csac.presets import hyperparameters
 from csac.training.group import Group

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 
-from benchmarks.driver import
 from benchmarks.operations import Product
 
 if TYPE_CHECKING:
