@@ -132,26 +132,29 @@ class Recorder:
         self._received[group][table] = rows[0]["step"]
         self._pending[table] += rows
 
-    def _evaluated(self, group: int, event: Evaluated) -> None:
-        self._take(group, "evaluations", event.rows)
-        self._info_names |= event.info_names
-        self._save(event.policies)
-        for seed, value in _mean_returns(event.rows).items():
+    def _evaluated(self, group: int, message: Evaluated) -> None:
+        self._take(group, "evaluations", message.rows)
+        self._info_names |= message.info_names
+        self._save(message.policies)
+        for seed, value in _mean_returns(message.rows).items():
             if value > self._best.get(seed, -np.inf):
                 self._best[seed] = value
-                event.policies[seed].save(self._policy_file(seed, ".best"))
+                message.policies[seed].save(self._policy_file(seed, ".best"))
 
-    def _commit_when_whole(self, group: int, event: Saved) -> None:
+    def _commit_when_whole(self, group: int, message: Saved) -> None:
         """Keep a group's best policies with its files; with the last living group's files there is a checkpoint."""
         assert self.checkpoints
-        files = dict(event.files)
+        files = dict(message.files)
         for seed in self.groups[group]:
             if self._policy_file(seed, ".best").exists():
-                name = f"step_{event.step}.seed_{seed}.best.safetensors"
+                name = f"step_{message.step}.seed_{seed}.best.safetensors"
                 link(self._policy_file(seed, ".best"), self.checkpoints.folder / name)
                 files[name] = facts_of(self.checkpoints.folder / name)
-        self.inexact.update(event.inexact)
-        self._saved[event.step][group] = files
+        for seed, problem in message.inexact.items():
+            if problem and seed not in self.inexact:
+                self._note(f"seed {seed}: {problem}; after a stop its episode begins anew")
+        self.inexact.update(message.inexact)
+        self._saved[message.step][group] = files
         self._commit_whole()
 
     def _commit_whole(self) -> None:
@@ -190,16 +193,16 @@ class Recorder:
         for part in self._saved.values():
             part.pop(group, None)
 
-    def _failed(self, event: Failed) -> None:
-        if event.seed in self.failures:
+    def _failed(self, message: Failed) -> None:
+        if message.seed in self.failures:
             return  # a restarted group meets the same failure again
-        if event.policy is not None:
-            self._save({event.seed: event.policy})
-        self._note_failure(event.seed, event.step, event.reason, event.details)
+        if message.policy is not None:
+            self._save({message.seed: message.policy})
+        self._note_failure(message.seed, message.step, message.reason, message.details)
 
-    def _crashed(self, group: int, event: GroupCrashed) -> None:
+    def _crashed(self, group: int, message: GroupCrashed) -> None:
         for seed in self.groups[group]:
-            self._note_failure(seed, self._steps[seed], event.reason, event.details)
+            self._note_failure(seed, self._steps[seed], message.reason, message.details)
         self._passed[group] = OVER
         self._commit_whole()
         self._flush()

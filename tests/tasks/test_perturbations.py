@@ -531,7 +531,7 @@ def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-
     return Group(settings, (3,))
 
 
-def advance(group: Group, until: int) -> list[messages.Event]:
+def advance(group: Group, until: int) -> list[messages.GroupMessage]:
     return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
 
 

@@ -391,7 +391,7 @@ def saves(recorder: Recorder, group: int, step: int) -> None:
     episode = {"seed": group, "step": step - 10, "return": 1.0, "length": 5}
     recorder.handle(group, Rows("episodes", [episode]))
     place = recorder.run.path / "checkpoint"
-    recorder.handle(group, Saved(step, SeedFiles(place, group, {}).write(step, Snapshot({}, {}), ring(9, step)), []))
+    recorder.handle(group, Saved(step, SeedFiles(place, group, {}).write(step, Snapshot({}, {}), ring(9, step)), {}))
 
 
 def rows_in(recorder: Recorder, step: int) -> list[int]:
@@ -449,8 +449,8 @@ class DeadWorker:
     def recv(self) -> None:
         raise OSError("got end of file during message")
 
-    def kill(self) -> None:
-        pass
+    def cause_of_death(self) -> str:
+        return "its process was killed by SIGKILL"
 
 
 @pytest.mark.parametrize(("stopping", "before", "kind"), [(True, set(), Ended), (True, {0}, GroupCrashed)])

@@ -30,7 +30,7 @@ def group(folder: Path, algorithm, seeds, steps: int, begin: int = 0, task: Any 
     return Group(messages.Settings(algorithm, task, {}, steps, 1000, 1, folder, 0, begin), seeds)
 
 
-def advance(group: Group, until: int) -> list[messages.Event]:
+def advance(group: Group, until: int) -> list[messages.GroupMessage]:
     return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
 
 
