@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 Table = Literal["episodes", "metrics", "evaluations"]
 
 SCHEMA_VERSION = 1
-GROWING_FILES = ("evaluations.csv", "episodes.csv", "metrics.csv", "log.txt")
 LOCK = ".lock"
 MANIFEST = "manifest.json"
 REQUIRED_FIELDS: dict[str, type] = {
@@ -115,28 +114,6 @@ class RunDirectory:
         """Add one line to log.txt."""
         with open(self.path / "log.txt", "a", encoding="utf-8") as file:
             file.write(line.rstrip("\n") + "\n")
-
-    def sync(self) -> dict[str, int]:
-        """Push what was appended so far to the disk and return the size of each growing file in bytes."""
-        sizes = {}
-        for name in GROWING_FILES:
-            with suppress(FileNotFoundError), open(self.path / name, "rb") as file:
-                os.fsync(file.fileno())
-                sizes[name] = file.seek(0, os.SEEK_END)
-        return sizes
-
-    def cut_back(self, sizes: Mapping[str, int]) -> None:
-        """Undo what was appended after `sync` returned these sizes.
-
-        Raises InputError, and changes nothing, where a file is shorter than it was.
-        """
-        for name, size in sizes.items():
-            path = self.path / name
-            if not path.exists() or path.stat().st_size < size:
-                raise InputError(f"{path} has lost rows since the checkpoint: restore it from a copy")
-        for name in GROWING_FILES:
-            with suppress(FileNotFoundError):
-                os.truncate(self.path / name, sizes[name]) if name in sizes else (self.path / name).unlink()
 
     @contextmanager
     def locked(self) -> Iterator[None]:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from csac.record.run import Table
-from csac.training.checkpoint import facts_of, link
 from csac.training.messages import (
     Boundary,
     Ended,
@@ -23,6 +22,7 @@ from csac.training.messages import (
     Rows,
     Saved,
 )
+from csac.training.restore import LOG, keep_best_policies, keep_tables
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -76,7 +76,8 @@ class Recorder:
         self._made = dict(self._steps)  # steps of which some may not have been told of yet
         self._pending: dict[Table, list[dict[str, Any]]] = defaultdict(list)
         self._saved: dict[int, dict[int, Files]] = defaultdict(dict)  # step -> group -> its files
-        self._best = _best_means(run.evaluations)
+        # One that was lost is followed by the best of later evaluations.
+        self._best = {k: v for k, v in _best_means(run.evaluations).items() if self._policy_file(k, ".best").exists()}
         # Told once, after the first evaluation of the run.
         self._unheard = set() if len(run.evaluations) else set(run.manifest.get("events", ()))
         self._info_names: set[str] = set()
@@ -144,17 +145,12 @@ class Recorder:
     def _commit_when_whole(self, group: int, message: Saved) -> None:
         """Keep a group's best policies with its files; with the last living group's files there is a checkpoint."""
         assert self.checkpoints
-        files = dict(message.files)
-        for seed in self.groups[group]:
-            if self._policy_file(seed, ".best").exists():
-                name = f"step_{message.step}.seed_{seed}.best.safetensors"
-                link(self._policy_file(seed, ".best"), self.checkpoints.folder / name)
-                files[name] = facts_of(self.checkpoints.folder / name)
+        best = keep_best_policies(self.run.path, self.groups[group], message.step)
         for seed, problem in message.inexact.items():
             if problem and seed not in self.inexact:
                 self._note(f"seed {seed}: {problem}; after a stop its episode begins anew")
         self.inexact.update(message.inexact)
-        self._saved[message.step][group] = files
+        self._saved[message.step][group] = {**message.files, **best}
         self._commit_whole()
 
     def _commit_whole(self) -> None:
@@ -175,7 +171,10 @@ class Recorder:
         parts = [part for _, part in sorted(self._saved[step].items())]
         files = {name: facts for part in parts for name, facts in part.items()}
         failures = {seed: text for seed, text in self.failures.items() if self._failed_at[seed] <= step}
-        values = {"sizes": self.run.sync(), "failures": failures, "groups": self.groups}
+        files |= keep_tables(self.run.path, step)
+        log = self.run.path / LOG
+        log_bytes = log.stat().st_size if log.exists() else 0
+        values = {"log_bytes": log_bytes, "failures": failures, "groups": self.groups}
         # Said before, so that no checkpoint is ever taken for exact that is not.
         self.run.update_manifest(steps_done=step, inexact_seeds=sorted(self.inexact))
         self.checkpoints.commit(step, files, values)

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.algorithms import ALGORITHMS
-from csac.record.run import GROWING_FILES, RunDirectory
+from csac.record.run import RunDirectory
 from csac.tasks.perturbations import continued, perturbations_of
-from csac.training.checkpoint import FOLDER, Checkpoint, Checkpoints, link, newest_sound, sound_at, taken_back
+from csac.training.checkpoint import FOLDER, Checkpoint, Checkpoints, newest_sound, sound_at, taken_back
 from csac.training.learner import misfit
+from csac.training.restore import copy, restore
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -40,12 +41,12 @@ class Point(NamedTuple):
 
     step: int
     failures: dict[int, str]
-    complaints: list[str]  # what was wrong with newer checkpoints
+    complaints: list[str]  # what was wrong with newer checkpoints, and what was mended
     pinned: list[int]  # steps of checkpoints to keep for good
 
     def notes(self, before: dict[str, Any], now: dict[str, Any]) -> list[str]:
         """Return what the user should know of this continuation, a line each."""
-        lines = [f"warning: {complaint}; an earlier checkpoint is used" for complaint in self.complaints]
+        lines = [f"warning: {complaint}" for complaint in self.complaints]
         lines.append(f"going on from step {self.step:,}" if self.step else "no checkpoint yet: it begins anew")
         if changes := _machine_changes(before, now):
             lines.append(f"note: not the same to the last bit from here on, because {' and '.join(changes)}")
@@ -125,10 +126,10 @@ def roll_back(run: RunDirectory) -> Point:
     if checkpoint is None and "forked_from" in run.manifest:
         raise InputError(f"{run.path} was stopped before it had its first checkpoint: remove it and train --from again")
     step = checkpoint.step if checkpoint else 0
-    run.cut_back(checkpoint.values["sizes"] if checkpoint else {})
+    complaints = [f"{complaint}; an earlier checkpoint is used" for complaint in complaints]
+    complaints += restore(run.path, checkpoint)
     for unfinished in [*run.path.glob(".*.*"), *run.path.glob("policy/*.tmp")]:
         unfinished.unlink()
-    _restore_best_policies(run, checkpoint)
     values = checkpoint.values if checkpoint else {"failures": {}, "pinned": []}
     if folder.exists():
         keep = run.manifest.get("checkpoints", {}).get("keep", 0)
@@ -235,27 +236,11 @@ class Source(NamedTuple):
 
     def copy_to(self, run: RunDirectory, keep: int) -> None:
         """Give a new run the tables up to the checkpoint, and the checkpoint."""
-        sizes = {name: size for name, size in self.checkpoint.values["sizes"].items() if name in GROWING_FILES}
-        for name, size in sizes.items():
-            with open(self.run.path / name, "rb") as source, open(run.path / name, "wb") as target:
-                target.write(source.read(size))
-        for name in self.checkpoint.files:
-            link(self.checkpoint.folder / name, run.path / FOLDER / name)
+        files = copy(self.checkpoint, run.path)
         if (self.run.path / "policy" / "contract.json").exists():
             (run.path / "policy").mkdir()
             shutil.copyfile(self.run.path / "policy" / "contract.json", run.path / "policy" / "contract.json")
-        values = {**self.checkpoint.values, "sizes": sizes}
-        Checkpoints(run.path / FOLDER, keep).commit(self.checkpoint.step, self.checkpoint.files, values)
-
-
-def _restore_best_policies(run: RunDirectory, checkpoint: Checkpoint | None) -> None:
-    """Undo what later evaluations found best."""
-    for path in run.path.glob("policy/seed_*.best.safetensors"):
-        path.unlink()
-    for name in checkpoint.files if checkpoint else ():
-        if name.endswith(".best.safetensors"):
-            assert checkpoint
-            link(checkpoint.folder / name, run.path / "policy" / name.partition(".")[2])
+        Checkpoints(run.path / FOLDER, keep).commit(self.checkpoint.step, files, self.checkpoint.values)
 
 
 def _fixed(manifest: dict[str, Any]) -> dict[str, Any]:

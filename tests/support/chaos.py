@@ -209,8 +209,7 @@ def _checkpoint_differences(ours: Path, theirs: Path) -> list[str]:
 
 
 def _checkpoint_contents(checkpoint: Checkpoint) -> dict[str, Any]:
-    sizes = {name: size for name, size in checkpoint.values["sizes"].items() if name != "log.txt"}
-    contents: dict[str, Any] = {"values": {**checkpoint.values, "sizes": sizes}}
+    contents: dict[str, Any] = {"values": {**checkpoint.values, "log_bytes": None}}
     for seed in [seed for group in checkpoint.values["groups"] for seed in group]:
         saved = checkpoint.seed(seed)
         rows = np.zeros((700, saved.arrays["learner.waiting"].shape[-1]), np.float32)
@@ -219,7 +218,7 @@ def _checkpoint_contents(checkpoint: Checkpoint) -> dict[str, Any]:
         contents[f"transitions of seed {seed}"] = rows.tobytes()
         contents |= {f"seed {seed}: {name}": (str(a.dtype), a.shape, a.tobytes()) for name, a in saved.arrays.items()}
     for name in checkpoint.files:
-        if name.endswith(".best.safetensors"):
+        if name.endswith((".best.safetensors", ".csv")):
             contents[name] = (checkpoint.folder / name).read_bytes()
     return contents
 
