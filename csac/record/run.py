@@ -111,9 +111,10 @@ class RunDirectory:
         return self.rows("evaluations")
 
     def log(self, line: str) -> None:
-        """Add one line to log.txt."""
+        """Add a line to log.txt, after the time of now."""
+        moment = datetime.now().astimezone().isoformat(timespec="seconds")
         with open(self.path / "log.txt", "a", encoding="utf-8") as file:
-            file.write(line.rstrip("\n") + "\n")
+            file.write(f"{moment} {line.rstrip()}\n")
 
     @contextmanager
     def locked(self) -> Iterator[None]:

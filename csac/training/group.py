@@ -155,8 +155,9 @@ class Group:
                 self._evaluation = self._begin_evaluation()
             if self._evaluation and (due or boundary) and self._evaluation.is_over:
                 yield from self.settle()
-            if boundary:
+            if boundary or (due and not self._evaluation):  # so that who watches hears of an evaluation at once
                 yield Progress(self.step)
+            if boundary:
                 yield Boundary(self.step)
         yield from self.settle()
         yield Ended(self.step, self.policies())
