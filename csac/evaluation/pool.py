@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from csac.evaluation.evaluator import EvaluationEpisode, EvaluationFailure, Evaluator
-from csac.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
+from csac.processes import Child, die_with_parent, move_to, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -207,8 +207,7 @@ class _Worker(Child):
         try:
             return self.connection.recv()
         except (EOFError, OSError):
-            self.kill()
-            return ProcessDied(f"the evaluation was broken off: {cause_of_death(self.process.exitcode)}")
+            return ProcessDied(f"the evaluation was broken off: {self.cause_of_death()}")
 
 
 def _work(connection: Connection, evaluator: Evaluator, cores: Sequence[int] | None) -> None:

@@ -15,7 +15,7 @@ import gymnasium
 
 from csac.tasks import known
 from csac.tasks.silence import quietly
-from csac.tasks.spaces import message, one_line
+from csac.tasks.spaces import RAISED, message, one_line
 from csac.types import InputError
 
 Task = str | Callable[..., gymnasium.Env]
@@ -40,7 +40,7 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
             if adapter:
                 raise InputError(known.missing(name, error)) from error
             raise InputError(f"{name} needs a package that is not installed: {message(error)}") from error
-        except Exception as error:
+        except RAISED as error:
             given = f" with the arguments {arguments}" if arguments else ""
             raise InputError(f"{name} could not be made{given}: {one_line(error)}") from error
     if not isinstance(environment, gymnasium.Env):
@@ -54,7 +54,7 @@ def _registered(task: str) -> str:
     if module:
         try:
             importlib.import_module(module)
-        except Exception as error:
+        except RAISED as error:
             raise InputError(f"{task}: the module {module} cannot be imported: {one_line(error)}") from error
     known.register(name)
     if name in gymnasium.registry and not _is_gone(gymnasium.registry[name]):

@@ -2,6 +2,7 @@ import json
 import os
 import tempfile
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -339,4 +340,8 @@ def test_what_is_no_table_at_all_is_refused(tmp_path):
 def test_log_lines_follow_each_other(run):
     run.log("first")
     run.log("second\n")
-    assert (run.path / "log.txt").read_text() == "first\nsecond\n"
+    lines = (run.path / "log.txt").read_text().splitlines()
+    assert [line.split(" ", 1)[1] for line in lines] == ["first", "second"]
+    moments = [datetime.fromisoformat(line.split(" ")[0]) for line in lines]
+    assert moments[0] >= datetime.fromisoformat(run.manifest.created)
+    assert moments[1] >= moments[0]

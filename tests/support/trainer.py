@@ -23,11 +23,11 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 class Outcome(NamedTuple):
-    """`states` and `memories` hold one entry per seed; `events` is everything that the loop yielded."""
+    """`states` and `memories` hold one entry per seed; `messages` is everything that the loop yielded."""
 
     states: list[Any]
     memories: list[np.ndarray]  # [steps, width] packed transitions, in the order of the steps
-    events: list[messages.Event]
+    messages: list[messages.GroupMessage]
 
 
 def run(
@@ -43,6 +43,6 @@ def run(
 
     settings = messages.Settings(algorithm, task, arguments, steps, steps, episodes)
     with patch.object(group, "Learner", Kept):
-        events = list(group.train_group(settings, seeds, lambda: False))
+        told = list(group.train_group(settings, seeds, lambda: False))
     carries = [learners[0].carry(index) for index in range(len(seeds))]
-    return Outcome([carry.state for carry in carries], [carry.memory.rows for carry in carries], events)
+    return Outcome([carry.state for carry in carries], [carry.memory.rows for carry in carries], told)

@@ -497,3 +497,47 @@ def test_warnings_of_the_users_own_environment_are_shown():
     with pytest.warns(UserWarning, match="the user's own") as shown:
         Environment(task)
     assert len(shown) == 1
+
+
+# What an environment does to the process that it is in.
+
+
+@pytest.mark.parametrize("where", ["step", "reset"])
+def test_an_environment_that_exits_has_failed_like_one_that_raises(where):
+    environments = SeedEnvironments(probes.Failing, {"where": where, "exits": True, "at": 2}, [0, 1])
+    environments.reset()
+    steps = [environments.step(np.zeros((2, 1), np.float32)) for _ in range(4)]
+    failures = [failure.reason for step in steps for failure in step.failures]
+    assert failures == [f"{where} raised SystemExit: 7"] * 2
+    assert not environments.is_any_alive
+
+
+def test_a_task_that_exits_while_it_is_made_is_refused():
+    with pytest.raises(InputError, match="could not be made: SystemExit: 7"):
+        Environment(lambda: sys.exit(7))
+
+
+@pytest.mark.parametrize(("exits", "error"), [(False, "RuntimeError: the simulator broke"), (True, "SystemExit: 7")])
+def test_an_error_while_closing_is_logged_and_keeps_nobody(caplog, exits, error):
+    Environment("probes:Failing-v0", {"where": "close", "exits": exits}).close()
+    assert caplog.messages == [f"probes:Failing-v0: close raised {error}"]
+
+
+@pytest.mark.parametrize(
+    ("gives", "problem"),
+    [
+        ("error", "get_snapshot raised KeyError: 'position'"),
+        ("exit", "get_snapshot raised SystemExit: 7"),
+        ("nothing", "get_snapshot raised TypeError"),
+        ("objects", "get_snapshot gave 'bodies', which is no array of numbers"),
+        ("values", "get_snapshot gave values that JSON cannot hold: TypeError"),
+    ],
+)
+def test_an_episode_that_cannot_be_saved_says_why_and_begins_anew(gives, problem):
+    first, second = (SeedEnvironments(probes.Unsavable, {"gives": gives}, [3]) for _ in range(2))
+    first.reset()
+    first.step(np.zeros((1, 1), np.float32))
+    saved = first.save(0)
+    assert saved.values["problem"].startswith(problem)
+    assert second.take_back(0, saved) is False
+    np.testing.assert_array_equal(second.observations, SeedEnvironments(probes.Unsavable, {}, [3]).reset())
