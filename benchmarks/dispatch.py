@@ -1,7 +1,7 @@
 """Which ways to hand work to XLA pay: variants in turns, each in a process of its own that waits while others work.
 
-    python benchmarks/dispatch.py                                    # all, about half an hour on a quiet machine
-    python benchmarks/dispatch.py asynchronous --rounds 5 --only "sac, 2 cores"
+    python -m benchmarks.dispatch                                    # all, about half an hour on a quiet machine
+    python -m benchmarks.dispatch asynchronous --rounds 5 --only "sac, 2 cores"
 
 `asynchronous`  updates alone, with JAX's asynchronous dispatch on and off
 `training`      the same with HalfCheetah-v4, without evaluation
@@ -20,15 +20,14 @@ import time
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
-from report import table
-
+from benchmarks.measuring import TASK
+from benchmarks.tables import table
 from csac.processes import Child, die_with_parent, move_to
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from multiprocessing.connection import Connection
 
-TASK = "HalfCheetah-v4"
 WARMUP = 500
 Rates = dict[str, list[float]]
 
@@ -79,13 +78,11 @@ def work(connection: Connection, variant: Variant) -> None:
 
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_cpu_enable_async_dispatch", variant.asynchronous)
-    from update_speed import Driver, make_learner
-
+    from benchmarks.driver import Driver, make_learner
     from csac.training.group import Group
     from csac.training.messages import Settings
-    from csac.types import Spec
 
-    learner = make_learner(variant.algorithm, Spec(17, 6), variant.seeds, update_interval=variant.interval)
+    learner = make_learner(variant.algorithm, seeds=variant.seeds, update_interval=variant.interval)
     if variant.evaluation:
         algorithm = dataclasses.replace(learner.algorithm, warmup_steps=WARMUP)  # pyright: ignore[reportArgumentType]
         interval, beside = 10**6 if variant.evaluation == "off" else 5_000, int(variant.evaluation == "beside")
@@ -93,7 +90,7 @@ def work(connection: Connection, variant: Variant) -> None:
         events = trained.run(lambda: False)
     else:
         trained = Driver(learner, variant.seeds)
-        events = (trained.run(0.0) for _ in count())
+        events = (trained.make(1) for _ in count())
 
     def advance(steps: int) -> None:
         until = trained.step + steps

@@ -1,6 +1,6 @@
 """Five seeds on two cores: turns of other lengths, a core for each, fewer processes. Updates alone, no environment.
 
-    python benchmarks/turns.py                # about half an hour on a quiet machine
+    python -m benchmarks.turns                # about half an hour on a quiet machine
 
 As csac's scheduler does it, a core goes to the process that is furthest behind, for so many steps.
 """
@@ -12,7 +12,7 @@ import time
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING
 
-from dispatch import Rates, Variant, start, summary
+from benchmarks.dispatch import Rates, Variant, start, summary
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
