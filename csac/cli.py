@@ -255,8 +255,8 @@ def _perturbations(given: tuple[str, ...]) -> tuple[str, ...] | None:
 
 def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
-    from csac.console.progress import told_progress
     from csac.console.tables import case_table, evaluation_table, make_console, silent_events
+    from csac.console.waiting import progress_shown
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.play import evaluate_run, told_perturbations
     from csac.record.run import RunDirectory
@@ -268,8 +268,7 @@ def _evaluate(arguments: list[str]) -> int:
         check_new(options.csv)
     results = {}
     try:
-        with _waiting(console, "evaluating") as status:
-            progress = told_progress(status, "evaluating", "episodes") if status else None
+        with progress_shown(console, "evaluating", "episodes") as on_progress:
             results.update(
                 evaluate_run(
                     options.run,
@@ -278,7 +277,7 @@ def _evaluate(arguments: list[str]) -> int:
                     not options.stochastic,
                     options.perturb,
                     processes=options.processes,
-                    on_progress=progress,
+                    on_progress=on_progress,
                 )
             )
     except EvaluationFailure as error:
@@ -321,13 +320,13 @@ def _play(arguments: list[str]) -> int:
 
 def _runs(arguments: list[str]) -> int:
     options = parse(Runs, arguments, "csac runs")
-    from csac.console.tables import make_console, runs_table
+    from csac.console.tables import make_console, print_runs
     from csac.record.run import find_runs
 
     is_default = options.directory == Path("runs")
     runs = [] if is_default and not options.directory.exists() else find_runs(options.directory)
     if runs:
-        make_console().print(runs_table(runs))
+        print_runs(make_console(), runs)
     else:
         _say(f"no runs in {options.directory} yet; csac train HalfCheetah-v4 starts one")
     return 0

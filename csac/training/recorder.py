@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from csac.record.run import Table
+from csac.record.statistics import best_returns, mean_returns
 from csac.training.checkpoint import facts_of, link
 from csac.training.messages import (
     Boundary,
@@ -25,7 +26,7 @@ from csac.training.messages import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from csac.console.progress import Reporter
@@ -76,7 +77,7 @@ class Recorder:
         self._made = dict(self._steps)  # steps of which some may not have been told of yet
         self._pending: dict[Table, list[dict[str, Any]]] = defaultdict(list)
         self._saved: dict[int, dict[int, Files]] = defaultdict(dict)  # step -> group -> its files
-        self._best = _best_means(run.evaluations)
+        self._best = best_returns(run.evaluations)
         # Told once, after the first evaluation of the run.
         self._unheard = set() if len(run.evaluations) else set(run.manifest.events)
         self._info_names: set[str] = set()
@@ -136,7 +137,7 @@ class Recorder:
         self._take(group, "evaluations", event.rows)
         self._info_names |= event.info_names
         self._save(event.policies)
-        for seed, value in _mean_returns(event.rows).items():
+        for seed, value in mean_returns(event.rows).items():
             if value > self._best.get(seed, -np.inf):
                 self._best[seed] = value
                 event.policies[seed].save(self._policy_file(seed, ".best"))
@@ -266,7 +267,7 @@ class Recorder:
         """Tell whoever watches of each evaluation that every group has passed."""
         for step in sorted({row["step"] for row in rows}):
             self._tell_perturbations(step)
-            returns = _mean_returns([row for row in rows if row["step"] == step])
+            returns = mean_returns([row for row in rows if row["step"] == step])
             self.evaluated.append((step, returns))
             self.run.log(f"step {step}: " + ", ".join(f"seed {seed} {value:.1f}" for seed, value in returns.items()))
             self.run.update_manifest(steps_done=step)
@@ -289,21 +290,5 @@ class Recorder:
             self._note(f"perturbed from step {begin + 1:,} on: {text}")
 
 
-def _best_means(evaluations: np.ndarray) -> dict[int, float]:
-    """Return each seed's best mean return so far."""
-    best: dict[int, float] = {}
-    for step in np.unique(evaluations["step"]):
-        for seed, value in _mean_returns(evaluations[evaluations["step"] == step]).items():
-            best[seed] = max(value, best.get(seed, -np.inf))
-    return best
-
-
 def _seeds(seeds: Sequence[int]) -> str:
     return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
-
-
-def _mean_returns(rows: Iterable[Any]) -> dict[int, float]:
-    returns: dict[int, list[float]] = defaultdict(list)
-    for row in rows:
-        returns[int(row["seed"])].append(float(row["return"]))
-    return {seed: float(np.mean(values)) for seed, values in returns.items()}
