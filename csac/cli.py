@@ -156,6 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     failed, 130 SIGINT, 143 SIGTERM.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    _open_standard_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -414,6 +415,15 @@ def _say(text: str) -> None:
 def _complain(message: object, code: int) -> int:
     print(f"csac: {' '.join(str(message).split())}", file=sys.stderr)
     return code
+
+
+def _open_standard_streams() -> None:
+    """Lead streams that were closed to nowhere: the next file to be opened would get what libraries print there."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
 
 
 def _settle_output() -> None:

@@ -189,11 +189,11 @@ def print_runs(console: Console, runs: Sequence[RunDirectory]) -> None:
         manifest, state, last = run.manifest, _state(run), _last_return(run)
         task, algorithm, seeds = manifest.task, manifest.algorithm, len(manifest.seeds)
         steps = f"{short(manifest.steps_done)} / {short(manifest.steps)}"
-        told = Text(state, STATE_STYLES.get(state, ""))
-        table.add_row(Text(task), algorithm, str(seeds), steps, told, last, Text(str(run.path)))
+        coloured = Text(state, STATE_STYLES.get(state, ""))
+        table.add_row(Text(task), algorithm, str(seeds), steps, coloured, last, Text(str(run.path)))
         of_seeds = f"{seeds} seed{'s' * (seeds > 1)}"
         lines.append(f"{run.path}\n  {task}, {algorithm}, {of_seeds}, {steps} steps, ")
-        lines.append(told).append(f", last return {last}\n" if last else "\n")
+        lines.append(coloured).append(f", last return {last}\n" if last else "\n")
     natural = Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
     console.print(table if natural <= console.width else lines, soft_wrap=True, end="")
 

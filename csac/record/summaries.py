@@ -1,7 +1,7 @@
 """What runs have reached, as plain values: results, comparisons, cases and recoveries. Each is computed here alone.
 
 `summary_tables` turns them into text for the terminal, Markdown and HTML. Rows are those of evaluations.csv; a seed in
-`failed` is told of and left out of what is over seeds.
+`failed` is shown and left out of what is over seeds.
 """
 
 from __future__ import annotations
@@ -92,10 +92,10 @@ class RecoverySummary(NamedTuple):
     seeds: dict[int, Recovery]
     failed: frozenset[int]
     metrics: dict[str, OverSeeds]
-    """By the fields of `Recovery`, over the seeds that tell. There is no mean of steps where a seed never came back."""
+    """By the fields of `Recovery`, over the seeds where it is known. No mean of steps where a seed never came back."""
     regained: int
-    """How many of the seeds that tell came back."""
-    told: int
+    known: int
+    """Of how many seeds the recovery is known, and how many of them came back."""
 
 
 class CaseSummary(NamedTuple):
@@ -235,7 +235,7 @@ def case_names(runs: Sequence[np.ndarray]) -> dict[str, bool]:
 def cases(rows: np.ndarray, names: Mapping[str, bool] | None = None) -> list[CaseSummary]:
     """Return how often success and each event came in `rows`, all of their episodes, seed by seed.
 
-    `names` are those of `case_names`, given where several runs are to be told of alike.
+    `names` are those of `case_names`, given where several runs are to be treated alike.
     """
     found = []
     for name, happens in (case_names([rows]) if names is None else names).items():

@@ -93,11 +93,11 @@ def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
         for seed, one in run.seeds.items():
             cells = (*label, _whole(seed), *_recovery_cells(one, largest))
             rows.append(Row(cells, "failed" if seed in run.failed else "plain"))
-        if run.told > 1:
+        if run.known > 1:
             for name, of in (("mean", lambda one: one.mean), ("± std", lambda one: one.std)):
                 cells = _recovery_cells(Recovery(*(of(run.metrics[field]) for field in Recovery._fields)), largest)
-                if name == "mean" and run.regained < run.told:
-                    cells[3] = Cell(f"{run.regained} of {run.told}", math.inf)
+                if name == "mean" and run.regained < run.known:
+                    cells[3] = Cell(f"{run.regained} of {run.known}", math.inf)
                 rows.append(Row((*label, Cell(name, math.nan), *cells), "summary"))
     title = runs[0].label if len(runs) == 1 else ""
     return Table((*["run"] * (len(runs) > 1), *headings), tuple(rows), title)

@@ -115,7 +115,7 @@ def test_what_a_perturbation_cost_several_runs():
     """After step 10. Seed 0 of `a` falls from 100 to 40 and is back at 30; its seed 1 never is; `b` loses nothing."""
     a = recoveries("a", rows_of([100.0, 40.0, 95.0], [200.0, 100.0, 150.0]), 10)
     b = recoveries("b", rows_of([10.0, 11.0]), 10)
-    assert (a.regained, a.told, a.metrics["drop"].mean, b.regained, b.told) == (1, 2, 80.0, 1, 1)
+    assert (a.regained, a.known, a.metrics["drop"].mean, b.regained, b.known) == (1, 2, 80.0, 1, 1)
     assert a.metrics["steps_to_regain"].count == 0
     assert lines(recovery_table([a, b])) == [
         ["run", "seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "worst fall"],
