@@ -85,7 +85,7 @@ def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
     labels; that of a single one is the title.
     """
     headings = ("seed", "before", "drop", "relative", f"steps to {REGAINED:.0%}".replace("%", " %"))
-    headings += ("area lost", "final", "worst fall")
+    headings += ("area lost", "final", "drawdown")
     rows: list[Row] = []
     for run in runs:
         label = [Cell(run.label)] if len(runs) > 1 else []

@@ -57,7 +57,7 @@ def test_a_perturbed_run_shows_what_it_cost(tmp_path):
     first, second = (text_of(table) for table in recovery_tables(run))
     assert first == [
         "friction x 1.5 after step 20, until 40",
-        "seed before drop relative steps to 90 % area lost final worst fall",
+        "seed before drop relative steps to 90 % area lost final drawdown",
         "0 100.0 60.0 60% 20 625 67.5 60.0",
         "1 200.0 100.0 50% never 1.25k 125.0 100.0",
         "mean 150.0 80.0 55% 1 of 2 938 96.2 80.0",

@@ -118,7 +118,7 @@ def test_what_a_perturbation_cost_several_runs():
     assert (a.regained, a.known, a.metrics["drop"].mean, b.regained, b.known) == (1, 2, 80.0, 1, 1)
     assert a.metrics["steps_to_regain"].count == 0
     assert lines(recovery_table([a, b])) == [
-        ["run", "seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "worst fall"],
+        ["run", "seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "drawdown"],
         ["a", "0", "100.0", "60.0", "60%", "20", "625", "67.5", "60.0"],
         ["a", "1", "200.0", "100.0", "50%", "never", "1.25k", "125.0", "100.0"],
         ["a", "mean", "150.0", "80.0", "55%", "1 of 2", "938", "96.2", "80.0"],
