@@ -156,6 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     failed, 130 SIGINT, 143 SIGTERM.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    _open_standard_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -255,8 +256,8 @@ def _perturbations(given: tuple[str, ...]) -> tuple[str, ...] | None:
 
 def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
-    from csac.console.progress import told_progress
     from csac.console.tables import case_table, evaluation_table, make_console, silent_events
+    from csac.console.waiting import progress_shown
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.play import evaluate_run, told_perturbations
     from csac.record.run import RunDirectory
@@ -268,8 +269,7 @@ def _evaluate(arguments: list[str]) -> int:
         check_new(options.csv)
     results = {}
     try:
-        with _waiting(console, "evaluating") as status:
-            progress = told_progress(status, "evaluating", "episodes") if status else None
+        with progress_shown(console, "evaluating", "episodes") as on_progress:
             results.update(
                 evaluate_run(
                     options.run,
@@ -278,7 +278,7 @@ def _evaluate(arguments: list[str]) -> int:
                     not options.stochastic,
                     options.perturb,
                     processes=options.processes,
-                    on_progress=progress,
+                    on_progress=on_progress,
                 )
             )
     except EvaluationFailure as error:
@@ -321,13 +321,13 @@ def _play(arguments: list[str]) -> int:
 
 def _runs(arguments: list[str]) -> int:
     options = parse(Runs, arguments, "csac runs")
-    from csac.console.tables import make_console, runs_table
+    from csac.console.tables import make_console, print_runs
     from csac.record.run import find_runs
 
     is_default = options.directory == Path("runs")
     runs = [] if is_default and not options.directory.exists() else find_runs(options.directory)
     if runs:
-        make_console().print(runs_table(runs))
+        print_runs(make_console(), runs)
     else:
         _say(f"no runs in {options.directory} yet; csac train HalfCheetah-v4 starts one")
     return 0
@@ -415,6 +415,15 @@ def _say(text: str) -> None:
 def _complain(message: object, code: int) -> int:
     print(f"csac: {' '.join(str(message).split())}", file=sys.stderr)
     return code
+
+
+def _open_standard_streams() -> None:
+    """Lead streams that were closed to nowhere: the next file to be opened would get what libraries print there."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
 
 
 def _settle_output() -> None:

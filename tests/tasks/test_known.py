@@ -24,10 +24,9 @@ from scalars import scalars
 from csac.algorithms import SAC
 from csac.cli import main
 from csac.console.progress import Reporter
-from csac.console.tables import case_table
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.evaluation.evaluator import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, _number
+from csac.evaluation.evaluator import ROWS, EvaluationFailure, Evaluator, _number
 from csac.evaluation.play import evaluate_run
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.manifest import Manifest
@@ -494,16 +493,6 @@ def test_info_may_hold_anything():
         0.5,
         7,
     ]
-
-
-def test_an_episode_that_does_not_speak_of_a_case_had_none():
-    told = [{"crashed": True, "stops": 4}, {"crashed": None, "stops": None}, {"crashed": None, "stops": 1}]
-    episodes = [EvaluationEpisode(n, 1.0, 5, 1.0 if n == 0 else None, events) for n, events in enumerate(told)]
-    table = case_table({0: episodes})
-    assert table is not None
-    cells = [list(column.cells) for column in table.columns]
-    assert [str(name) for name in cells[0]] == ["success", "crashed", "stops (mean)"]
-    assert cells[1] == ["333.3", "333.3", "2.500"]
 
 
 # Evaluation in several processes
