@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from csac.algorithms.sac import SAC
     from csac.algorithms.sd3 import SD3
     from csac.algorithms.td3 import TD3
-    from csac.deploy.policy import Policy, load
+    from csac.deploy.choosing import load
+    from csac.deploy.policy import Policy
     from csac.evaluation.evaluator import evaluate
     from csac.training.train import resume, train
     from csac.types import InputError
@@ -51,7 +52,7 @@ _MODULES = {
     "InputError": "csac.types",
     "Policy": "csac.deploy.policy",
     "evaluate": "csac.evaluation.evaluator",
-    "load": "csac.deploy.policy",
+    "load": "csac.deploy.choosing",
     "train": "csac.training.train",
     "resume": "csac.training.train",
 }

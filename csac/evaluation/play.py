@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from csac.deploy.policy import load
+from csac.deploy.choosing import load
 from csac.evaluation.evaluator import EvaluationEpisode, Evaluator
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.run import RunDirectory

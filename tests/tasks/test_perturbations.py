@@ -19,8 +19,9 @@ from gymnasium.envs.mujoco import MujocoEnv
 from resuming import LEARNERS, Crash, contents, crash_at, run
 from trajectories import steps_of
 
+from csac.deploy.choosing import load
 from csac.deploy.contract import Contract
-from csac.deploy.policy import Policy, load
+from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import Evaluator, evaluate
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
