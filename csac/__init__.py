@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from csac.algorithms.td3 import TD3
     from csac.deploy.choosing import load
     from csac.deploy.policy import Policy
-    from csac.evaluation.evaluator import evaluate
+    from csac.evaluation.evaluator import evaluate, evaluate_episodes
     from csac.training.train import resume, train
     from csac.types import InputError
 
@@ -38,6 +38,7 @@ __all__ = [
     "Policy",
     "__version__",
     "evaluate",
+    "evaluate_episodes",
     "load",
     "resume",
     "train",
@@ -52,6 +53,7 @@ _MODULES = {
     "InputError": "csac.types",
     "Policy": "csac.deploy.policy",
     "evaluate": "csac.evaluation.evaluator",
+    "evaluate_episodes": "csac.evaluation.evaluator",
     "load": "csac.deploy.choosing",
     "train": "csac.training.train",
     "resume": "csac.training.train",

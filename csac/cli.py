@@ -289,12 +289,12 @@ def _evaluate(arguments: list[str]) -> int:
     from csac.console.progress import told_progress
     from csac.console.tables import case_table, evaluation_table, make_console, silent_events
     from csac.evaluation.evaluator import EvaluationFailure
-    from csac.evaluation.play import evaluate_run, told_perturbations
+    from csac.evaluation.play import evaluate_run, perturbation_notes
     from csac.record.run import RunDirectory
     from csac.record.tables import COLUMNS, check_new, write_rows
 
     console = make_console()
-    told = told_perturbations(options.run, options.perturb)
+    told = perturbation_notes(options.run, options.perturb)
     if options.csv:
         check_new(options.csv)
     results = {}
@@ -332,11 +332,11 @@ def _evaluate(arguments: list[str]) -> int:
 def _play(arguments: list[str]) -> int:
     options = parse(Play, arguments, "csac play")
     from csac.console.tables import make_console
-    from csac.evaluation.play import play, told_perturbations
+    from csac.evaluation.play import perturbation_notes, play
     from csac.tasks.spaces import EnvironmentFailure
 
     console = make_console()
-    for line in told_perturbations(options.run, options.perturb):
+    for line in perturbation_notes(options.run, options.perturb):
         console.print(line, soft_wrap=True)
     try:
         with _waiting(console, "playing"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from csac.record.files import write_atomically
 from csac.types import InputError, Spec
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class Contract:
             "action_low": self.action_low.tolist(),
             "action_high": self.action_high.tolist(),
         }
-        write_file(Path(path), (json.dumps(fields, indent=2) + "\n").encode())
+        write_atomically(Path(path), (json.dumps(fields, indent=2) + "\n").encode())
 
     @staticmethod
     def load(path: str | Path) -> Contract:
@@ -199,13 +199,3 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write aside, then rename: a crash leaves the old file or the new one."""
-    aside = path.with_name(path.name + ".tmp")
-    with aside.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)

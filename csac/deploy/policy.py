@@ -8,11 +8,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac.deploy import tensors
-from csac.deploy.contract import Activation, Contract, read_file, write_file
+from csac.deploy.contract import Activation, Contract, read_file
 from csac.deploy.parameters import check_network, copied, from_tensors, to_tensors
+from csac.record.files import write_atomically
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork
 
 LOG_STD_RANGE = (-20.0, 2.0)
+
+_STREAM = 0x706F6C69  # far from what a task that spawns generators of its own would use: 0, 1, 2, ...
+
+
+def noise_generator(seed: int) -> np.random.Generator:
+    """Return what the stochastic actions of `seed` are drawn from.
+
+    Gymnasium gives `default_rng(seed)` to a task that is reset with `seed`. This is another stream: actions drawn from
+    the same numbers as the task's own chances would foresee them.
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STREAM,)))
 
 
 class Policy:
@@ -31,7 +43,7 @@ class Policy:
         self.network = network._replace(parameters=copied(network.parameters))
         self.contract = contract
         check_network(self.network, contract)
-        self._generator = np.random.default_rng(seed)
+        self._generator = noise_generator(seed)
         self._actors = [_split_actor(actor, contract) for actor in self.network.parameters.actors]
 
     def predict(
@@ -39,6 +51,7 @@ class Policy:
     ) -> tuple[np.ndarray, Any]:
         """Return the action on the environment's scale, and `state` as it came.
 
+        Deterministic unless told otherwise, as a controller is; Stable-Baselines3's `predict` draws unless told.
         One observation gives float32 [*action_shape], a batch of n (or a dict of such batches) [n, *action_shape].
 
         Raises:
@@ -84,7 +97,7 @@ class Policy:
 
     def save(self, path: str | Path) -> None:
         """Write the layers as safetensors, whole or not at all."""
-        write_file(Path(path), tensors.encode(to_tensors(self.network.parameters)))
+        write_atomically(Path(path), tensors.encode(to_tensors(self.network.parameters)))
 
     @staticmethod
     def load(path: str | Path, contract: Contract, seed: int = 0) -> Policy:

@@ -16,7 +16,7 @@ from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
 from csac.tasks.known import adapter_of
-from csac.tasks.perturbations import lasting, perturbations_of, values_at
+from csac.tasks.perturbations import constant_perturbations, perturbations_of, values_at
 from csac.tasks.seeds import FRESH_EVALUATION_SEED
 from csac.types import InputError
 
@@ -58,7 +58,7 @@ def evaluate_run(
         FRESH_EVALUATION_SEED,
         run.manifest.get("events", ()),
     )
-    evaluator.perturb(values_at(lasting(perturbations), 0))
+    evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     labels = _seeds_with_policies(run) if seed is None else [seed]
     policies = [load(directory, label) for label in labels]
     processes = choose_processes(evaluator, len(policies)) if processes is None else processes
@@ -69,11 +69,11 @@ def evaluate_run(
         workers.close()
 
 
-def told_perturbations(
+def perturbation_notes(
     directory: str | Path, perturbations: str | Perturbation | Iterable[str | Perturbation]
 ) -> list[str]:
     """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
-    given = lasting(perturbations)
+    given = constant_perturbations(perturbations)
     trained = perturbations_of(RunDirectory.open(directory).manifest.get("perturbations", []))
     if given:
         return [f"perturbed: {', '.join(item.label for item in given)}"]
@@ -96,7 +96,7 @@ def play(
         InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
         EnvironmentFailure: the environment raised, or gave what is not finite.
     """
-    run, perturbed = _open(directory), values_at(lasting(perturbations), 0)
+    run, perturbed = _open(directory), values_at(constant_perturbations(perturbations), 0)
     if episodes < 1:
         raise InputError(f"{episodes} episodes: play at least one")
     policy = load(directory, seed)

@@ -26,7 +26,7 @@ from csac.console.progress import Reporter
 from csac.console.tables import case_table
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.evaluation.evaluator import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, _number
+from csac.evaluation.evaluator import EPISODES_AT_ONCE, EvaluationEpisode, EvaluationFailure, Evaluator, _number
 from csac.evaluation.play import evaluate_run
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.run import RunDirectory
@@ -500,11 +500,15 @@ def test_an_episode_that_does_not_speak_of_a_case_had_none():
 def test_perturbed_episodes_do_not_depend_on_the_processes_either(tmp_path):
     make_run(tmp_path / "run", "Hopper-v4")
     perturbed = [
-        dict(evaluate_run(tmp_path / "run", episodes=2 * ROWS, perturbations="gravity=0.5", processes=processes))
+        dict(
+            evaluate_run(
+                tmp_path / "run", episodes=2 * EPISODES_AT_ONCE, perturbations="gravity=0.5", processes=processes
+            )
+        )
         for processes in (1, 2)
     ]
     assert perturbed[0] == perturbed[1]
-    assert perturbed[0] != dict(evaluate_run(tmp_path / "run", episodes=2 * ROWS, processes=1))
+    assert perturbed[0] != dict(evaluate_run(tmp_path / "run", episodes=2 * EPISODES_AT_ONCE, processes=1))
 
 
 def test_a_task_that_cannot_be_perturbed_so_is_never_evaluated():
@@ -531,10 +535,10 @@ def test_the_command_finds_modules_of_the_folder_that_it_is_called_in(tmp_path):
 
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_the_numbers_do_not_depend_on_the_processes(deterministic):
-    evaluator = Evaluator("Hopper-v4", episodes=2 * ROWS + 3)
+    evaluator = Evaluator("Hopper-v4", episodes=2 * EPISODES_AT_ONCE + 3)
     policies = [policy_for("Hopper-v4", width=256, seed=seed) for seed in (0, 1)]
     expected = evaluator.run_all(policies, deterministic)
-    pool = EvaluationPool(Evaluator("Hopper-v4", episodes=2 * ROWS + 3), processes=2)
+    pool = EvaluationPool(Evaluator("Hopper-v4", episodes=2 * EPISODES_AT_ONCE + 3), processes=2)
     told = []
     assert pool.run_all(policies, deterministic, lambda *counts: told.append(counts)) == expected
     assert pool.run(policies[1], deterministic) == expected[1]
@@ -547,10 +551,13 @@ def test_the_numbers_do_not_depend_on_the_processes(deterministic):
 def test_an_arm_that_pushes_is_made_anew_for_each_batch():
     """What PandaPush gives depends on the episodes before it in the same environment."""
     policy = policy_for("PandaPush-v3", seed=3)
-    evaluator = Evaluator("PandaPush-v3", episodes=ROWS + 2)
+    evaluator = Evaluator("PandaPush-v3", episodes=EPISODES_AT_ONCE + 2)
     first = evaluator.run(policy)
     assert evaluator.run(policy) == first
-    assert Evaluator("PandaPush-v3", episodes=2, first_seed=EVALUATION_SEED + ROWS).run(policy)[1][1:] == first[-1][1:]
+    assert (
+        Evaluator("PandaPush-v3", episodes=2, first_seed=EVALUATION_SEED + EPISODES_AT_ONCE).run(policy)[1][1:]
+        == first[-1][1:]
+    )
 
 
 def test_memory_is_known_by_what_a_task_is_made_of():
@@ -595,7 +602,7 @@ def test_evaluate_writes_its_episodes_where_nothing_is(tmp_path, monkeypatch, ca
 
 
 def test_workers_import_no_jax_and_are_several():
-    evaluator = Evaluator("probes:Cases-v0", {"tell": True}, 6 * ROWS, events=("process", "has_jax"))
+    evaluator = Evaluator("probes:Cases-v0", {"tell": True}, 6 * EPISODES_AT_ONCE, events=("process", "has_jax"))
     pool = EvaluationPool(evaluator, processes=2)
     episodes = pool.run(policy_for("probes:Cases-v0"))
     assert {episode.events["has_jax"] for episode in episodes} == {False}
@@ -610,7 +617,7 @@ def test_workers_import_no_jax_and_are_several():
 
 def test_the_first_failure_in_order_is_told():
     seeds = [EVALUATION_SEED + 12, EVALUATION_SEED + 31]
-    pool = EvaluationPool(Evaluator("probes:Failing-v0", {"seeds": seeds}, episodes=4 * ROWS), processes=2)
+    pool = EvaluationPool(Evaluator("probes:Failing-v0", {"seeds": seeds}, episodes=4 * EPISODES_AT_ONCE), processes=2)
     with pytest.raises(
         EvaluationFailure, match=r"evaluation episode 12, .* step raised RuntimeError: the simulator broke"
     ):
@@ -627,7 +634,7 @@ def test_a_process_that_dies_is_one_line(tmp_path, capsys):
 
 
 def test_processes_are_chosen_by_the_work_and_at_least_one_is_asked_for():
-    assert choose_processes(Evaluator("probes:Cases-v0", episodes=ROWS), 1) == 1
+    assert choose_processes(Evaluator("probes:Cases-v0", episodes=EPISODES_AT_ONCE), 1) == 1
     most = choose_processes(Evaluator("probes:Cases-v0", episodes=1000), 5)
     assert most == len(os.sched_getaffinity(0))
     with pytest.raises(InputError, match="0 processes: use at least one"):
