@@ -103,6 +103,8 @@ class Resume:
     """The directory of a run."""
     steps: Annotated[int | None, arg(help_behavior_hint="(default: as many as it was started for)")] = None
     """Environment steps per seed in all, counted from the run's beginning; may be more than it was started for."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,8 @@ class Evaluate:
     """Change the task, as friction=2 does; the kinds are those of csac train."""
     csv: Annotated[Path | None, arg(metavar="FILE.csv")] = None
     """Write a row for each episode there as well, as in evaluations.csv."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,8 @@ class Play:
     """Write this file instead of opening a window; needs no display."""
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
     """Change the task, as friction=2 does; the kinds are those of csac train."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
 
 
 @dataclass(frozen=True)
@@ -245,7 +251,12 @@ def _resume(arguments: list[str]) -> int:
     command = shlex.join(["csac", "resume", *arguments])
     return _exit_code(
         lambda: resume(
-            options.run, steps=options.steps, evaluation_processes=None, reporter=Reporter(), command=command
+            options.run,
+            steps=options.steps,
+            evaluation_processes=None,
+            trust_task=options.trust_task,
+            reporter=Reporter(),
+            command=command,
         )
     )
 
@@ -310,6 +321,7 @@ def _evaluate(arguments: list[str]) -> int:
                     options.perturb,
                     processes=options.processes,
                     on_progress=progress,
+                    trust_task=options.trust_task,
                 )
             )
     except EvaluationFailure as error:
@@ -331,6 +343,7 @@ def _evaluate(arguments: list[str]) -> int:
 
 def _play(arguments: list[str]) -> int:
     options = parse(Play, arguments, "csac play")
+    from csac.console.progress import told_progress
     from csac.console.tables import make_console
     from csac.evaluation.play import perturbation_notes, play
     from csac.tasks.spaces import EnvironmentFailure
@@ -339,8 +352,16 @@ def _play(arguments: list[str]) -> int:
     for line in perturbation_notes(options.run, options.perturb):
         console.print(line, soft_wrap=True)
     try:
-        with _waiting(console, "playing"):
-            for episode in play(options.run, options.seed, options.episodes, options.video, options.perturb):
+        with _waiting(console, "playing") as status:
+            for episode in play(
+                options.run,
+                options.seed,
+                options.episodes,
+                options.video,
+                options.perturb,
+                on_progress=told_progress(status, "playing", "steps at most") if status else None,
+                trust_task=options.trust_task,
+            ):
                 text = f"return {episode.episode_return:,.2f} in {episode.length:,} steps"
                 console.print(f"episode {episode.episode}: {text}")
     except EnvironmentFailure as error:

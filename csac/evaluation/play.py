@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.deploy.choosing import load
-from csac.evaluation.evaluator import EvaluationEpisode, Evaluator
+from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
 from csac.tasks.known import adapter_of
 from csac.tasks.perturbations import constant_perturbations, perturbations_of, values_at
 from csac.tasks.seeds import FRESH_EVALUATION_SEED
+from csac.tasks.trust import refuse_untrusted
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -38,19 +39,22 @@ def evaluate_run(
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
     processes: int | None = None,
     on_progress: OnProgress | None = None,
+    trust_task: bool = False,
 ) -> Iterator[tuple[int, list[EvaluationEpisode]]]:
     """Yield (seed, episodes) for the last policy of each seed of a run, or of the one asked for.
 
     The episodes are the same for every seed, and none that training or its evaluations have seen. The task is the one
     that the run began with, but for these `perturbations`, which last from beginning to end. The episodes are shared by
     `processes`, by default as many as pay; 1 is this one. Whatever their number, the results are the same.
-    `on_progress(episodes done, of how many)` is called after each batch of episodes.
+    `on_progress(episodes done, of how many)` is called after each batch of episodes. `trust_task` lets the task import
+    its module though nobody has named it here (`csac.tasks.trust`).
 
     Raises:
-        InputError: no run there, no such seed, a damaged file, or a task that can no longer be made or perturbed so.
+        InputError: no run there, no such seed, a damaged file, a task that can no longer be made or perturbed so, or
+            one whose module has never been named here.
         EvaluationFailure: an environment raised, or gave what is not finite; or a process died.
     """
-    run = _open(directory)
+    run = _open(directory, trust_task)
     evaluator = Evaluator(
         run.manifest["task"],
         run.manifest.get("environment_arguments"),
@@ -86,17 +90,20 @@ def play(
     episodes: int = 1,
     video: str | Path | None = None,
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
+    on_progress: OnProgress | None = None,
+    trust_task: bool = False,
 ) -> Iterator[EvaluationEpisode]:
     """Yield the episodes that a run's policy plays, in a window or, with `video`, into an .mp4 file.
 
     Without `seed` it is the seed with the best last evaluations. The video is there once the last episode was yielded.
-    `perturbations` are as in `evaluate_run`.
+    `on_progress(steps done, of how many at most)` is called after each step. An episode that reaches `LONGEST_EPISODE`
+    steps is broken off there. `perturbations` and `trust_task` are as in `evaluate_run`.
 
     Raises:
         InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
         EnvironmentFailure: the environment raised, or gave what is not finite.
     """
-    run, perturbed = _open(directory), values_at(constant_perturbations(perturbations), 0)
+    run, perturbed = _open(directory, trust_task), values_at(constant_perturbations(perturbations), 0)
     if episodes < 1:
         raise InputError(f"{episodes} episodes: play at least one")
     policy = load(directory, seed)
@@ -113,6 +120,7 @@ def play(
         or environment.raw.metadata.get("render_fps")
         or DEFAULT_FRAMES_PER_SECOND
     )
+    longest, done = _longest_episode(environment), 0
     try:
         environment.perturb(perturbed)
         _follow(environment)
@@ -124,8 +132,12 @@ def play(
                 while not ended:
                     action = policy.act(observation[None])[0]
                     observation, reward, terminated, truncated, _ = environment.step(action)
-                    episode_return, length, ended = episode_return + reward, length + 1, terminated or truncated
+                    episode_return, length = episode_return + reward, length + 1
+                    ended = terminated or truncated or length >= longest
                     record()
+                    if on_progress:
+                        on_progress(done + length, done + (episodes - number) * longest)
+                done += length
                 for _ in range(length + 1, round(SECONDS_ON_SCREEN * frames_per_second)):
                     record(again=True)
                 yield EvaluationEpisode(number, episode_return, length, None)
@@ -133,13 +145,21 @@ def play(
         environment.close()
 
 
-def _open(directory: str | Path) -> RunDirectory:
+def _longest_episode(environment: Environment) -> int:
+    """Return how many steps an episode can have."""
+    limit = environment.raw.spec.max_episode_steps if environment.raw.spec else None
+    return min(limit or LONGEST_EPISODE, LONGEST_EPISODE)
+
+
+def _open(directory: str | Path, trust_task: bool) -> RunDirectory:
+    """Open a run whose task is to be made."""
     run = RunDirectory.open(directory)
     if run.manifest.get("task_is_callable"):
         raise InputError(
             f"the task of {directory} was made by a Python function, {run.manifest['task']}: "
             "evaluate it in Python, with csac.load and csac.evaluate"
         )
+    refuse_untrusted(run.manifest["task"], run.path, trust_task)
     return run
 
 

@@ -24,6 +24,7 @@ from csac.tasks.environment import Environment
 from csac.tasks.known import adapter_of, check_events, events_of
 from csac.tasks.making import Task
 from csac.tasks.perturbations import by_step, perturbations_of, refuse_late
+from csac.tasks.trust import refuse_untrusted, remember
 from csac.training.checkpoint import FOLDER, Checkpoints
 from csac.training.compilation import tidy_programs
 from csac.training.messages import Settings
@@ -159,6 +160,7 @@ def train(
     _choose_device(device)
     with closing(Environment(task, environment_arguments)) as environment:
         spec, task_name = environment.spec, environment.task_name
+        remember(task)
         path = Path(directory) if directory is not None else default_directory(task_name, algorithm.name)
         existing = RunDirectory.open(path) if resume and is_run(path) else None
         source = Source.find(start_from) if start_from is not None and not existing else None
@@ -232,6 +234,7 @@ def resume(
     *,
     steps: int | None = None,
     evaluation_processes: int | None = 0,
+    trust_task: bool = False,
     reporter: Reporter | None = None,
     command: str | None = None,
     on_evaluation: OnEvaluation | None = None,
@@ -239,7 +242,8 @@ def resume(
 ) -> RunDirectory:
     """Go on with a run from its newest checkpoint; everything but a larger number of `steps` comes from its manifest.
 
-    `evaluation_processes` and what follows are as in `train`.
+    `trust_task` lets the task import its module though nobody has named it here (`csac.tasks.trust`);
+    `evaluation_processes` and `reporter` and what follows it are as in `train`.
 
     Raises:
         InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
@@ -248,6 +252,7 @@ def resume(
         StorageFailure: as `train`.
     """
     run = RunDirectory.open(directory)
+    refuse_untrusted(run.manifest["task"], run.path, trust_task)
     return train(
         algorithm_of(run.manifest),
         **arguments_of(run),
