@@ -66,7 +66,11 @@ def evaluate_run(
     labels = _seeds_with_policies(run) if seed is None else [seed]
     policies = [load(directory, label) for label in labels]
     processes = choose_processes(evaluator, len(policies)) if processes is None else processes
-    workers = evaluator if processes == 1 else EvaluationPool(evaluator, processes)
+    if processes == 1:
+        workers = evaluator
+    else:
+        Environment(run.manifest["task"], run.manifest.get("environment_arguments")).close()  # says what is to be said
+        workers = EvaluationPool(evaluator, processes)
     try:
         yield from zip(labels, workers.run_all(policies, deterministic, on_progress), strict=True)
     finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import Any
@@ -16,6 +17,7 @@ from csac.tasks.physics import NOISES, PHYSICS, Noise, Physics
 from csac.tasks.silence import quietly
 from csac.tasks.snapshots import restore, snapshot
 from csac.tasks.spaces import (
+    RAISED,
     ContractParts,
     EnvironmentFailure,
     action_parts,
@@ -24,6 +26,7 @@ from csac.tasks.spaces import (
     observation_parts,
     one_line,
     part,
+    say_once,
     scalar,
     size,
 )
@@ -50,6 +53,9 @@ class Environment:
             arguments["render_mode"] = render_mode
         self.raw = make(task, arguments)
         self.task_name = task_name(task, self.raw)
+        if multiprocessing.parent_process() is None:  # which has made one too, or will
+            for note in known.wrapper_notes(self.raw):
+                say_once(f"note: {self.task_name}: {note}")
         self._quietly = quietly if known.is_pybullet(self.raw) else nullcontext
         self.has_memory = known.has_memory(task, self.raw)
         try:
@@ -95,7 +101,7 @@ class Environment:
         try:
             with self._quietly():
                 observation, _ = self.raw.reset(seed=seed)
-        except Exception as error:
+        except RAISED as error:
             raise EnvironmentFailure(f"reset raised {one_line(error)}") from error
         try:
             return self._flatten(observation)
@@ -125,12 +131,15 @@ class Environment:
         try:
             observation, reward, terminated, truncated, info = self.raw.step(action)
             terminated, truncated, info = bool(terminated), bool(truncated), dict(info)
-        except Exception as error:
+        except RAISED as error:
             raise EnvironmentFailure(f"step raised {one_line(error)}") from error
         return self._flatten(observation), scalar(reward), terminated, truncated, info
 
     def snapshot(self) -> Snapshot | None:
-        """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell."""
+        """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell.
+
+        One whose `get_snapshot` raises, or gives what cannot be stored, cannot tell; the log says so, once.
+        """
         saved = snapshot(self.raw)
         if saved and self._noise:
             saved.values["noise"] = self._noise.state()
@@ -147,13 +156,16 @@ class Environment:
             restore(self.raw, saved)
             if self._noise:
                 self._noise.take_back(saved.values.get("noise", {}))
-        except Exception as error:
+        except RAISED as error:
             raise EnvironmentFailure(f"the environment does not take its snapshot back: {one_line(error)}") from error
 
     def close(self) -> None:
-        """Close the Gymnasium environment."""
-        with self._quietly():
-            self.raw.close()
+        """Close the Gymnasium environment. What it raises then spoils nothing: the log says so, once."""
+        try:
+            with self._quietly():
+                self.raw.close()
+        except RAISED as error:
+            say_once(f"{self.task_name}: close raised {one_line(error)}")
 
     def _flatten(self, observation: Any) -> np.ndarray:
         """Copy the observation, since environments may reuse their array."""

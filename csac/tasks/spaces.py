@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any, NamedTuple
 
@@ -13,6 +14,13 @@ from csac.types import InputError
 Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
+RAISED = (
+    Exception,
+    SystemExit,
+)  # what a task may raise: one that calls `sys.exit` is broken, and ends nobody's program
+
+_log = logging.getLogger(__name__)
+_said: set[str] = set()
 
 
 class EnvironmentFailure(RuntimeError):
@@ -56,7 +64,10 @@ def action_parts(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray, np.n
     if not low.size:
         raise InputError("the action space is empty: there is nothing to learn")
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise InputError("the action space has no bounds: wrap the environment in gymnasium.wrappers.RescaleAction")
+        raise InputError(
+            "the action space has no bounds: give it some, as gymnasium.wrappers.TransformAction(environment, "
+            f"lambda action: action, gymnasium.spaces.Box(-1.0, 1.0, {space.shape})) does"
+        )
     return space.low.shape, low, high
 
 
@@ -120,11 +131,18 @@ def scalar(reward: Any) -> float:
     return reward
 
 
-def message(error: Exception) -> str:
+def say_once(text: str) -> None:
+    """Say something of a task on the log, at level WARNING, once in this process."""
+    if text not in _said:
+        _said.add(text)
+        _log.warning("%s", text)
+
+
+def message(error: BaseException) -> str:
     """Return what an error says, in one line."""
     return " ".join(str(error).split())
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """Return an error's type and what it says, in one line."""
     return f"{type(error).__name__}: {message(error)}" if str(error) else type(error).__name__

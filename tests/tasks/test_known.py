@@ -39,7 +39,7 @@ from csac.training.train import resume, train
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 
 SUPPORT = Path(__file__).parents[1] / "support"
-QUAD, REACH = "PyFlyt/QuadX-Waypoints-v1", "PandaReach-v3"
+QUAD, HOVER, REACH = "PyFlyt/QuadX-Waypoints-v1", "PyFlyt/QuadX-Hover-v1", "PandaReach-v3"
 QUAD_EVENTS = ("out_of_bounds", "collision", "env_complete", "num_targets_reached")
 TINY = SAC(actor_hidden_sizes=(8,), critic_hidden_sizes=(8,), batch_size=8, warmup_steps=20, replay_size=200)
 SHORT: dict[str, Any] = {"evaluation_interval": 20, "evaluation_episodes": 2, "checkpoint_interval": 20}
@@ -319,12 +319,29 @@ class Notes(Reporter):
         self.notes.append(text)
 
 
+def test_hovering_is_seen_from_beside_the_drone():
+    """PyFlyt's own camera, in the drone's nose, never shows it. Here it is what lies in the middle of the picture."""
+    environment = Environment(HOVER, render_mode="rgb_array")
+    environment.reset(0)
+    drone: Any = environment.raw.unwrapped
+    adapter = known.adapter_of(HOVER)
+    assert adapter
+    assert adapter.camera
+    take, state = adapter.camera(environment.raw), drone.env.state(0)
+    with_drone = take()
+    drone.env.removeBody(drone.env.drones[0].Id)
+    drone.env.state = lambda index: state
+    rows, columns = np.nonzero((with_drone != take()).any(axis=2))
+    np.testing.assert_allclose([np.median(rows), np.median(columns)], [240, 320], atol=20)
+    environment.close()
+
+
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # JAX is loaded here; where csac plays, it is not
-@pytest.mark.parametrize(("task", "size"), [(QUAD, "640x480, 30"), (REACH, "720x480, 10")])
+@pytest.mark.parametrize(("task", "size"), [(QUAD, "640x480, 30"), (HOVER, "640x480, 30"), (REACH, "720x480, 10")])
 def test_a_robot_is_drawn_without_a_display(tmp_path, capsys, monkeypatch, task, size):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.chdir(tmp_path)
-    arguments = {"max_duration_seconds": 0.2} if task == QUAD else {"max_episode_steps": 4}
+    arguments = {"max_episode_steps": 4} if task == REACH else {"max_duration_seconds": 0.2}
     make_run(Path("run"), task, arguments=arguments)
 
     assert main(["play", "run", "--video", "film.mp4"]) == 0
