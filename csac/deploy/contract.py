@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 SCHEMA_VERSION = 1
+MOST_AXES = 31  # of a shape; a batch has one more, and NumPy 1 holds 32
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 Activation = Literal["relu", "tanh"]
@@ -174,6 +175,8 @@ def _contract(fields: Any) -> Contract:
 def _shape(numbers: Any) -> tuple[int, ...]:
     if not isinstance(numbers, list) or not all(type(number) is int and number > 0 for number in numbers):
         raise ValueError(f"{numbers!r} is not a shape")
+    if len(numbers) > MOST_AXES:
+        raise ValueError(f"a shape of {len(numbers)} axes")
     return tuple(numbers)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import math
 import multiprocessing
 from collections.abc import Mapping
@@ -26,11 +28,13 @@ from csac.tasks.spaces import (
     observation_parts,
     one_line,
     part,
-    say_once,
     scalar,
     size,
 )
 from csac.types import InputError, Snapshot, Spec
+
+_log = logging.getLogger(__name__)
+_said: set[str] = set()
 
 
 class Environment:
@@ -54,8 +58,7 @@ class Environment:
         self.raw = make(task, arguments)
         self.task_name = task_name(task, self.raw)
         if multiprocessing.parent_process() is None:  # which has made one too, or will
-            for note in known.wrapper_notes(self.raw):
-                say_once(f"note: {self.task_name}: {note}")
+            _say_once(self.task_name, known.wrapper_notes(self.raw))
         self._quietly = quietly if known.is_pybullet(self.raw) else nullcontext
         self.has_memory = known.has_memory(task, self.raw)
         try:
@@ -138,9 +141,15 @@ class Environment:
     def snapshot(self) -> Snapshot | None:
         """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell.
 
-        One whose `get_snapshot` raises, or gives what cannot be stored, cannot tell; the log says so, once.
+        Raises:
+            EnvironmentFailure: its `get_snapshot` raised, or gave what cannot be saved.
         """
-        saved = snapshot(self.raw)
+        try:
+            saved = snapshot(self.raw)
+        except RAISED as error:
+            raise EnvironmentFailure(f"get_snapshot raised {one_line(error)}") from error
+        if saved:
+            _check_savable(saved)
         if saved and self._noise:
             saved.values["noise"] = self._noise.state()
         return saved
@@ -160,12 +169,12 @@ class Environment:
             raise EnvironmentFailure(f"the environment does not take its snapshot back: {one_line(error)}") from error
 
     def close(self) -> None:
-        """Close the Gymnasium environment. What it raises then spoils nothing: the log says so, once."""
+        """Close the Gymnasium environment. What that raises is logged: it takes nothing back of what was done."""
         try:
             with self._quietly():
                 self.raw.close()
         except RAISED as error:
-            say_once(f"{self.task_name}: close raised {one_line(error)}")
+            _log.warning("%s: close raised %s", getattr(self, "task_name", "the task"), one_line(error))
 
     def _flatten(self, observation: Any) -> np.ndarray:
         """Copy the observation, since environments may reuse their array."""
@@ -186,3 +195,22 @@ class Environment:
         raw = {key: part.reshape(shape) for (key, shape), part in zip(self._parts, np.split(noisy, ends), strict=True)}
         self.raw_observation = raw.get(None, raw)
         return noisy
+
+
+def _say_once(task_name: str, notes: list[str]) -> None:
+    """Log what the user should know of a task, once in this process."""
+    for note in notes:
+        if note not in _said:
+            _log.warning("note: %s: %s", task_name, note)
+    _said.update(notes)
+
+
+def _check_savable(saved: Snapshot) -> None:
+    """Raise EnvironmentFailure where an environment gave what a file of arrays and JSON cannot hold."""
+    for name, array in saved.arrays.items():
+        if array.dtype.kind not in "biuf":
+            raise EnvironmentFailure(f"get_snapshot gave {name.removeprefix('own.')!r}, which is no array of numbers")
+    try:
+        json.dumps(saved.values)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise EnvironmentFailure(f"get_snapshot gave values that JSON cannot hold: {one_line(error)}") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from typing import Any, NamedTuple
 
@@ -14,13 +13,10 @@ from csac.types import InputError
 Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-RAISED = (
-    Exception,
-    SystemExit,
-)  # what a task may raise: one that calls `sys.exit` is broken, and ends nobody's program
 
-_log = logging.getLogger(__name__)
-_said: set[str] = set()
+
+# What an environment may raise that is its own failure; a script that ends with `sys.exit` is one too.
+RAISED = (Exception, SystemExit)
 
 
 class EnvironmentFailure(RuntimeError):
@@ -129,13 +125,6 @@ def scalar(reward: Any) -> float:
     if not abs(reward) <= FLOAT32_MAX:
         raise EnvironmentFailure(f"reward is {reward}")
     return reward
-
-
-def say_once(text: str) -> None:
-    """Say something of a task on the log, at level WARNING, once in this process."""
-    if text not in _said:
-        _said.add(text)
-        _log.warning("%s", text)
 
 
 def message(error: BaseException) -> str:

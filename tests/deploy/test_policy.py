@@ -298,6 +298,7 @@ def test_a_policy_of_another_task_is_refused(tmp_path):
         {"observation_parts": [{"key": "a", "shape": [1]}, {"key": None, "shape": [1]}]},
         {"observation_parts": [{"shape": [2]}]},
         {"action_shape": [2]},
+        {"action_shape": [1] * 64},
         {"action_shape": "1"},
         {"action_low": [float("nan")]},
         {"action_low": [2.0]},

@@ -73,7 +73,6 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
         (5, "a Gymnasium id or a function that makes an environment, not 5"),
         (None, "a Gymnasium id or a function"),
         (gymnasium.wrappers.TimeLimit, "TimeLimit could not be made: TypeError"),
-        (lambda: sys.exit(7), "could not be made: SystemExit: 7"),
     ],
 )
 def test_a_task_that_cannot_be_learnt_is_refused(task, message):
@@ -458,48 +457,9 @@ def test_a_stopped_seed_steps_no_more():
     assert [failure.index for failure in second.failures] == [1]
 
 
-class Leaving(probes.Endless):
-    """Calls `sys.exit` where it is told to."""
-
-    def __init__(self, where: str) -> None:
-        super().__init__()
-        self.where = where
-
-    def reset(self, **options: Any) -> Any:
-        return sys.exit(7) if self.where == "reset" else super().reset(**options)
-
-    def step(self, action: np.ndarray) -> Any:
-        return sys.exit(7) if self.where == "step" else super().step(action)
-
-    def close(self) -> None:
-        if self.where == "close":
-            sys.exit(7)
-        if self.where == "broken close":
-            raise OSError("the simulator\nis gone")
-
-
-@pytest.mark.parametrize("where", ["reset", "step"])
-def test_an_environment_that_leaves_the_program_has_failed(where):
-    environments = SeedEnvironments(Leaving, {"where": where}, [0])
-    environments.reset()
-    (steps,) = steps_of(environments, 1)
-    assert [failure.reason for failure in steps.failures] == [f"{where} raised SystemExit: 7"]
-
-
-@pytest.mark.parametrize(
-    ("where", "told"), [("close", "SystemExit: 7"), ("broken close", "OSError: the simulator is gone")]
-)
-def test_what_close_raises_is_told_once_and_spoils_nothing(where, told, caplog, monkeypatch):
-    monkeypatch.setattr("csac.tasks.spaces._said", set())
-    environments = [Environment(Leaving, {"where": where}) for _ in range(3)]
-    for environment in environments:
-        environment.close()
-    assert caplog.messages == [f"Leaving: close raised {told}"]
-
-
 @pytest.mark.parametrize("wrapper", ["NormalizeObservation", "NormalizeReward"])
 def test_a_wrapper_that_learns_by_itself_is_told_once(wrapper, caplog, monkeypatch):
-    monkeypatch.setattr("csac.tasks.spaces._said", set())
+    monkeypatch.setattr("csac.tasks.environment._said", set())
 
     def wrapped() -> gymnasium.Env:
         environment = getattr(gymnasium.wrappers, wrapper)(probes.Endless())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -107,44 +106,6 @@ def test_what_cannot_be_had_whole_is_not_offered(task):
     environment = Environment(task)
     environment.reset(0)
     assert environment.snapshot() is None
-
-
-class Misbehaving(Counting):
-    """Its snapshot is what it was told, or an error."""
-
-    def __init__(self, snapshot: Any) -> None:
-        super().__init__()
-        self.snapshot = snapshot
-
-    def get_snapshot(self):
-        if isinstance(self.snapshot, BaseException):
-            raise self.snapshot
-        return self.snapshot
-
-
-@pytest.mark.parametrize(
-    ("snapshot", "told"),
-    [
-        (RuntimeError("not now"), "RuntimeError: not now"),
-        (None, "TypeError"),
-        (5, "TypeError"),
-        (({}, {}, {}), "ValueError: too many values"),
-        (([1.0], {}), "AttributeError"),
-        (({"state": object()}, {}), "TypeError: array 'state' is of type object, not numbers"),
-        (({"state": ["text"]}, {}), "TypeError: array 'state' is of type <U4"),
-        (({"state": [[1], [2, 3]]}, {}), "ValueError"),
-        (({}, {"state": np.zeros(3)}), "TypeError: Object of type ndarray is not JSON serializable"),
-    ],
-)
-def test_a_snapshot_that_cannot_be_kept_is_none_and_is_told_once(snapshot, told, caplog, monkeypatch):
-    monkeypatch.setattr("csac.tasks.spaces._said", set())
-    environments = SeedEnvironments(Misbehaving, {"snapshot": snapshot}, [0])
-    environments.reset()
-    for _ in range(3):
-        assert not environments.save(0).values["exact"]
-    (message,) = caplog.messages
-    assert f"get_snapshot of Misbehaving gives nothing that can be kept ({told}" in message
-    assert "\n" not in message
 
 
 def test_a_snapshot_of_another_physics_is_refused():
