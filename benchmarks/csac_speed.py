@@ -112,9 +112,9 @@ def main() -> None:
     arguments = parse()
     paper = hyperparameters("paper", arguments.algorithm, arguments.task)
     algorithm = ALGORITHMS[arguments.algorithm](**paper)
-    if algorithm.warmup_steps:
+    if algorithm.cadence.warmup_steps:
         algorithm = dataclasses.replace(algorithm, warmup_steps=arguments.warmup, update_interval=arguments.interval)
-    clock = Clock(arguments, algorithm.update_interval)
+    clock = Clock(arguments, algorithm.cadence.update_interval)
     try:
         train(
             algorithm,

@@ -77,7 +77,7 @@ def measure(task: str, algorithm: str, steps: int) -> Shares:
     """Train for `steps` after the warm-up, then evaluate once."""
     settings: dict[str, Any] = hyperparameters("paper", algorithm, task)
     learner = dataclasses.replace(ALGORITHMS[algorithm](**settings), replay_size=100_000)
-    if learner.warmup_steps:
+    if learner.cadence.warmup_steps:
         learner = dataclasses.replace(learner, warmup_steps=WARMUP)
     last = 2 * WARMUP + steps
     with closing(Group(Settings(learner, task, {}, last + 1, INTERVAL, EPISODES), [0])) as group:

@@ -23,11 +23,11 @@ import jax.numpy as jnp
 from report import table
 from update_speed import Driver, make_learner
 
-from csac.algorithms import networks
+from csac.algorithms import critics, networks
 from csac.training import learner
 from csac.types import Spec
 
-OWN_MAKE_CRITICS, OWN_CALL, OWN_NORMAL = networks.make_critics, networks.MLP.__call__, jax.random.normal
+OWN_MAKE_CRITICS, OWN_CALL, OWN_NORMAL = critics.make_critics, networks.MLP.__call__, jax.random.normal
 
 
 def stacked_make_critics(*arguments: Any) -> Any:
@@ -35,10 +35,10 @@ def stacked_make_critics(*arguments: Any) -> Any:
     return jax.tree.map(lambda first, second: jnp.stack([first, second]), *OWN_MAKE_CRITICS(*arguments))
 
 
-def stacked_q_values(critics: Any, observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+def stacked_q_values(stacked: Any, observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return both values out of one batched product for each layer."""
     inputs = jnp.concatenate([observation, action])
-    values = jax.vmap(lambda critic: critic(inputs)[0])(critics)
+    values = jax.vmap(lambda critic: critic(inputs)[0])(stacked)
     return values[0], values[1]
 
 
@@ -67,7 +67,7 @@ def kept_normal(key: jax.Array, shape: tuple[int, ...] = (), *_: Any) -> jax.Arr
 @contextmanager
 def patched(**functions: Callable) -> Iterator[None]:
     """Replace functions wherever the algorithms have imported them."""
-    modules = [importlib.import_module(f"csac.algorithms.{name}") for name in ("networks", "csac", "sac", "td3", "sd3")]
+    modules = [importlib.import_module(f"csac.algorithms.{name}") for name in ("critics", "csac", "sac", "td3", "sd3")]
     before = [
         (module, name, getattr(module, name)) for module in modules for name in functions if hasattr(module, name)
     ]

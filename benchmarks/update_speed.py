@@ -36,7 +36,7 @@ class Driver:
     def __init__(self, learner: Learner, seeds: int = 1) -> None:
         observation_size, action_size = learner.spec
         generator = np.random.default_rng(0)
-        self.learner, self.step, self.interval = learner, 0, learner.algorithm.update_interval
+        self.learner, self.step, self.interval = learner, 0, learner.algorithm.cadence.update_interval
         self.observations = generator.standard_normal((seeds, observation_size), dtype=np.float32)
         self.actions = np.zeros((seeds, action_size), np.float32)
         none = np.zeros(seeds, bool)

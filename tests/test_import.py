@@ -6,6 +6,7 @@ import pytest
 from policies import contract, random_policy
 
 import csac
+from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 
 DRAWN = """
@@ -38,8 +39,8 @@ gymnasium.register("Drawn-v0", entry_point=Drawn)
 def tiny_run(tmp_path):
     """A folder with a finished run, a policy that has learnt nothing, and its task, which can be drawn."""
     (tmp_path / "drawn.py").write_text(DRAWN)
-    manifest = {"task": "drawn:Drawn-v0", "algorithm": "sac", "seeds": [0], "steps": 9, "steps_done": 9}
-    run = RunDirectory.create(tmp_path / "run", {**manifest, "state": "finished"})
+    manifest = Manifest(task="drawn:Drawn-v0", algorithm="sac", seeds=(0,), steps=9, state="finished", steps_done=9)
+    run = RunDirectory.create(tmp_path / "run", manifest)
     rows = {"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 5, "success": None}
     run.append("evaluations", [rows])
     agreement = contract()

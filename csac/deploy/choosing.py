@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-import re
-from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.record.run import RunDirectory, is_run
-from csac.record.tables import read_rows
+from csac.record.run import RunDirectory, Which
 from csac.types import InputError
 
-EVALUATION_POINTS = 3
+if TYPE_CHECKING:
+    from pathlib import Path
 
-Which = Literal["last", "best"]
+EVALUATION_POINTS = 3
 
 
 def load(directory: str | Path, seed: int | None = None, which: Which = "last") -> Policy:
@@ -36,56 +34,46 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
         InputError: no run there, no such seed (the message names those there), a damaged file, or every seed failed and
             none was asked for.
     """
-    directory = Path(directory)
     if which not in get_args(Which):
         raise InputError(f"which={which!r}: choose 'last' or 'best'")
-    if not directory.is_dir():
-        raise InputError(f"{directory} is not a directory: give the directory of a run")
-    folder = directory / "policy"
-    seeds = _seeds(folder)
+    run = RunDirectory.open(directory)
+    seeds = run.seeds_with_policies()
     if not seeds:
-        raise InputError(f"{directory} holds no policies: give the directory of a run that has been evaluated once")
+        raise InputError(f"{directory} holds no policies yet: its first evaluation writes them")
     if seed is None:
-        seed = _best_seed(directory / "evaluations.csv", _without_failed(directory, seeds))
+        seed = _best_seed(run, _without_failed(run, seeds))
     elif seed not in seeds:
         raise InputError(f"{directory} has no policy of seed {seed}; it has those of {_listed(seeds)}")
-    name = f"seed_{seed}.safetensors" if which == "last" else f"seed_{seed}.best.safetensors"
-    return Policy.load(folder / name, Contract.load(folder / "contract.json"))
+    return Policy.load(run.policy(seed, which), Contract.load(run.contract))
 
 
-def _seeds(folder: Path) -> list[int]:
-    names = (re.fullmatch(r"seed_([0-9]{1,18})\.safetensors", path.name) for path in folder.glob("seed_*.safetensors"))
-    return sorted(int(match[1]) for match in names if match)
-
-
-def _without_failed(directory: Path, seeds: list[int]) -> list[int]:
+def _without_failed(run: RunDirectory, seeds: list[int]) -> list[int]:
     """Return the seeds that did not fail. What a failed one has left may never have learnt anything."""
-    failures = RunDirectory.open(directory).manifest["failures"] if is_run(directory) else {}
-    sound = [seed for seed in seeds if str(seed) not in failures]
+    failures = run.manifest.failures
+    sound = [seed for seed in seeds if seed not in failures]
     if not sound:
-        reason = failures[str(seeds[0])]
         raise InputError(
-            f"every seed of {directory} failed (seed {seeds[0]} at {reason}): train again, "
+            f"every seed of {run.path} failed (seed {seeds[0]} at {failures[seeds[0]]}): train again, "
             f"or ask for what one has left by its seed, one of {_listed(seeds)}"
         )
     return sound
 
 
-def _best_seed(path: Path, seeds: list[int]) -> int:
+def _best_seed(run: RunDirectory, seeds: list[int]) -> int:
     if len(seeds) == 1:
         return seeds[0]
-    scores = _last_evaluations(path) if path.exists() else {}
+    scores = _last_evaluations(run)
     ranked = [(scores[seed], -seed) for seed in seeds if seed in scores]
     if not ranked:
-        raise InputError(f"{path} has no evaluations to choose by: give a seed, one of {_listed(seeds)}")
+        raise InputError(f"{run.path} has no evaluations to choose by: give a seed, one of {_listed(seeds)}")
     return -max(ranked)[1]
 
 
-def _last_evaluations(path: Path) -> dict[int, float]:
+def _last_evaluations(run: RunDirectory) -> dict[int, float]:
     """Return each seed's mean return over its last evaluation points; a line still being written does not count."""
-    rows = read_rows(path)
-    if len(rows) and "return" not in (rows.dtype.names or ()):
-        raise InputError(f"{path} has no column of returns: give a seed, or restore it from a copy")
+    rows = run.evaluations
+    if "return" not in (rows.dtype.names or ()):
+        raise InputError(f"the evaluations.csv of {run.path} has no returns: give a seed, or restore it from a copy")
     scores = {}
     for seed in np.unique(rows["seed"]):
         of_seed = rows[rows["seed"] == seed]

@@ -56,11 +56,11 @@ def evaluate_run(
     """
     run = _open(directory, trust_task)
     evaluator = Evaluator(
-        run.manifest["task"],
-        run.manifest.get("environment_arguments"),
+        run.manifest.task,
+        run.manifest.environment_arguments,
         episodes,
         FRESH_EVALUATION_SEED,
-        run.manifest.get("events", ()),
+        run.manifest.events,
     )
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     labels = _seeds_with_policies(run) if seed is None else [seed]
@@ -69,7 +69,7 @@ def evaluate_run(
     if processes == 1:
         workers = evaluator
     else:
-        Environment(run.manifest["task"], run.manifest.get("environment_arguments")).close()  # says what is to be said
+        Environment(run.manifest.task, run.manifest.environment_arguments).close()  # says what is to be said
         workers = EvaluationPool(evaluator, processes)
     try:
         yield from zip(labels, workers.run_all(policies, deterministic, on_progress), strict=True)
@@ -82,7 +82,7 @@ def perturbation_notes(
 ) -> list[str]:
     """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
     given = constant_perturbations(perturbations)
-    trained = perturbations_of(RunDirectory.open(directory).manifest.get("perturbations", []))
+    trained = perturbations_of(RunDirectory.open(directory).manifest.perturbations)
     if given:
         return [f"perturbed: {', '.join(item.label for item in given)}"]
     return [f"not perturbed, unlike its training ({', '.join(map(str, trained))}): see --perturb"] if trained else []
@@ -117,7 +117,7 @@ def play(
         _check_video(Path(video))
         _draw_off_screen()
     environment = _drawn_environment(run, "human" if video is None else "rgb_array")
-    adapter = adapter_of(run.manifest["task"])
+    adapter = adapter_of(run.manifest.task)
     picture = adapter.camera(environment.raw) if adapter and adapter.camera else environment.raw.render
     frames_per_second = round(
         (adapter and adapter.pictures_per_second)
@@ -158,12 +158,12 @@ def _longest_episode(environment: Environment) -> int:
 def _open(directory: str | Path, trust_task: bool) -> RunDirectory:
     """Open a run whose task is to be made."""
     run = RunDirectory.open(directory)
-    if run.manifest.get("task_is_callable"):
+    if run.manifest.task_is_callable:
         raise InputError(
-            f"the task of {directory} was made by a Python function, {run.manifest['task']}: "
+            f"the task of {directory} was made by a Python function, {run.manifest.task}: "
             "evaluate it in Python, with csac.load and csac.evaluate"
         )
-    refuse_untrusted(run.manifest["task"], run.path, trust_task)
+    refuse_untrusted(run.manifest.task, run.path, trust_task)
     return run
 
 
@@ -177,7 +177,7 @@ def _follow(environment: Environment) -> None:
 
 
 def _seeds_with_policies(run: RunDirectory) -> list[int]:
-    seeds = [seed for seed in run.manifest["seeds"] if (run.path / "policy" / f"seed_{seed}.safetensors").exists()]
+    seeds = run.seeds_with_policies()
     if not seeds:
         raise InputError(f"{run.path} holds no policy yet: its first evaluation writes one")
     return seeds
@@ -202,7 +202,7 @@ def _check_video(path: Path) -> None:
 
 
 def _drawn_environment(run: RunDirectory, render_mode: str) -> Environment:
-    task, arguments = run.manifest["task"], run.manifest.get("environment_arguments") or {}
+    task, arguments = run.manifest.task, run.manifest.environment_arguments
     adapter = adapter_of(task)
     if adapter and render_mode == "rgb_array":
         arguments = {**adapter.picture_arguments, **arguments}

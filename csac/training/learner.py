@@ -34,10 +34,11 @@ class Learner:
 
     def __init__(self, algorithm: Algorithm, spec: Spec, seeds: Sequence[int], steps: int) -> None:
         self.algorithm, self.spec, self._steps = algorithm, spec, steps
+        self._cadence = algorithm.cadence
         self._is_alone = len(seeds) == 1
         self._metrics: list[str] = []
         self._updates_summed = 0
-        self._waiting = np.zeros((len(seeds), algorithm.update_interval, row_width(spec)), np.float32)
+        self._waiting = np.zeros((len(seeds), self._cadence.update_interval, row_width(spec)), np.float32)
         keep_programs()
         keys = np.stack([np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds])
         # Asked for its metrics' names and then to learn: traced once.
@@ -54,7 +55,7 @@ class Learner:
 
     def next_actions(self, observations: np.ndarray, step: int) -> np.ndarray:
         """Return the actions [seed, action] for observations [seed, observation], after `step` steps."""
-        program = self._explore_alone if step < self.algorithm.warmup_steps else self._act_alone
+        program = self._explore_alone if step < self._cadence.warmup_steps else self._act_alone
         return np.array(program(self._buffers, observations, np.int32(step)))
 
     def step(self, observations: np.ndarray, actions: np.ndarray, outcome: Steps, step: int) -> np.ndarray:
@@ -63,7 +64,7 @@ class Learner:
         One dispatch, whatever the algorithm does. Between updates transitions wait on the host, so that an algorithm
         that learns from rollouts is only asked to act.
         """
-        interval = self.algorithm.update_interval
+        interval = self._cadence.update_interval
         self._waiting[:, (step - 1) % interval] = pack(
             Transition(
                 observations, actions, outcome.reward, outcome.next_observation, outcome.terminated, outcome.truncated
@@ -72,9 +73,9 @@ class Learner:
         if step % interval:
             return self.next_actions(outcome.observation, step)
         program = self._explore
-        if step >= self.algorithm.warmup_steps:
+        if step >= self._cadence.warmup_steps:
             program = self._learn
-            self._updates_summed += self.algorithm.updates_per_interval
+            self._updates_summed += self._cadence.updates_per_interval
         next_actions, self._buffers = program(self._buffers, self._waiting, outcome.observation, np.int32(step))
         return np.asarray(next_actions)
 
@@ -113,7 +114,7 @@ class Learner:
     def memory(self, index: int, step: int) -> Ring:
         """Return the memory of the seed at this place, to read only; `step` environment steps were made."""
         rows = np.asarray(self._carry[1].rows)
-        return Ring(self._of_seed(rows, index), step // self.algorithm.update_interval * self.algorithm.update_interval)
+        return Ring(self._of_seed(rows, index), step - step % self._cadence.update_interval)
 
     def take_back(self, saved: Sequence[Snapshot], memories: Sequence[Callable[[np.ndarray], None]]) -> None:
         """Go on from what `save` returned for each seed; `memories` fill each seed's rows [capacity, width].
@@ -199,7 +200,7 @@ class Learner:
         metrics = jax.eval_shape(self._update, state, batch, run_key, jnp.int32(0))[1]
         self._metrics = list(metrics)
         # What acts more often than it learns would take its policy out of the row again and again.
-        self._packing = Packing(state, SMALL if self.algorithm.update_interval == 1 else 0)
+        self._packing = Packing(state, SMALL if self._cadence.update_interval == 1 else 0)
         return self._packing.pack(state), memory, jnp.zeros(len(metrics)), jax.random.key_data(run_key)
 
     def _remember_and_explore(self, carry: tuple, rows: jax.Array, observation: jax.Array, step: jax.Array):
@@ -219,21 +220,21 @@ class Learner:
             state, metrics = self._update(state, batch, jax.random.fold_in(update_key, i), first + i)
             return state, sums + jnp.stack([metrics[name] for name in self._metrics])
 
-        if self.algorithm.updates_per_interval == 1:
+        if self._cadence.updates_per_interval == 1:
             state, sums = update(jnp.int32(0), (state, sums))
         else:
-            state, sums = jax.lax.fori_loop(0, self.algorithm.updates_per_interval, update, (state, sums))
+            state, sums = jax.lax.fori_loop(0, self._cadence.updates_per_interval, update, (state, sums))
         carry = (state, memory, sums, key_data)
         return self._act(carry, observation, step), carry
 
     def _draw(self, memory: Any, key: jax.Array, count: jax.Array) -> Transition:
-        return memory.draw(key, count, self.algorithm.transitions_per_update, self.spec)
+        return memory.draw(key, count, self._cadence.transitions_per_update, self.spec)
 
     def _updates_before(self, step: jax.Array) -> jax.Array:
         """Return how many updates came before those that follow environment step `step`."""
-        interval = self.algorithm.update_interval
-        first_step = -(-max(self.algorithm.warmup_steps, 1) // interval) * interval
-        return (step - first_step) // interval * self.algorithm.updates_per_interval
+        interval = self._cadence.update_interval
+        first_step = -(-max(self._cadence.warmup_steps, 1) // interval) * interval
+        return (step - first_step) // interval * self._cadence.updates_per_interval
 
     def _act(self, carry: tuple, observation: jax.Array, step: jax.Array) -> jax.Array:
         return self.algorithm.act(carry[0], observation, self._keys(carry[3], step)[2], True)
@@ -257,7 +258,7 @@ def misfit(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str
             found = "no such array" if given is None else f"{given.dtype} {given.shape}"
             return f"{name} is to be {leaf.dtype} {leaf.shape} and the checkpoint has {found}"
     rows = saved.arrays["waiting"]
-    if rows.shape != (algorithm.update_interval, row_width(spec)):
+    if rows.shape != (algorithm.cadence.update_interval, row_width(spec)):
         return f"the checkpoint has rollouts of {len(rows)} steps of width {rows.shape[1]}"
     return None
 

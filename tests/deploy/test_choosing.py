@@ -10,19 +10,23 @@ from policies import contract, random_policy
 
 from csac.deploy.choosing import load
 from csac.deploy.policy import Policy
+from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.types import InputError
 
 
-def save_run(directory: Path, evaluations: str = "", seeds=(0, 1, 2)) -> dict[int, Policy]:
-    folder = directory / "policy"
-    folder.mkdir(parents=True)
+def save_run(
+    directory: Path, evaluations: str = "", seeds=(0, 1, 2), failures: dict[int, str] | None = None
+) -> dict[int, Policy]:
+    manifest = Manifest(task="Task-v0", algorithm="csac", seeds=tuple(seeds), steps=9, failures=failures or {})
+    run = RunDirectory.create(directory, manifest)
+    run.contract.parent.mkdir()
     agreement = contract()
-    agreement.save(folder / "contract.json")
+    agreement.save(run.contract)
     policies = {seed: random_policy(agreement, seed) for seed in seeds}
     for seed, policy in policies.items():
-        policy.save(folder / f"seed_{seed}.safetensors")
-        random_policy(agreement, seed + 100).save(folder / f"seed_{seed}.best.safetensors")
+        policy.save(run.policy(seed))
+        random_policy(agreement, seed + 100).save(run.policy(seed, "best"))
     if evaluations:
         (directory / "evaluations.csv").write_text("seed,step,episode,return,length,success\n" + evaluations)
     return policies
@@ -68,10 +72,14 @@ def test_the_first_of_equal_seeds_and_the_only_seed_are_chosen(tmp_path):
 def test_load_says_what_is_missing(tmp_path):
     save_run(tmp_path / "run")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="not a directory"):
+    save_run(tmp_path / "young", seeds=[0])
+    (tmp_path / "young" / "policy" / "seed_0.safetensors").unlink()
+    with pytest.raises(InputError, match="does not exist"):
         load(tmp_path / "nowhere")
-    with pytest.raises(InputError, match="holds no policies"):
+    with pytest.raises(InputError, match="holds no run"):
         load(tmp_path / "empty")
+    with pytest.raises(InputError, match="holds no policies yet"):
+        load(tmp_path / "young")
     with pytest.raises(InputError, match="no policy of seed 7; it has those of 0, 1, 2"):
         load(tmp_path / "run", seed=7)
     with pytest.raises(InputError, match="no evaluations to choose by: give a seed, one of 0, 1, 2"):
@@ -94,20 +102,17 @@ def test_evaluations_that_are_no_table_are_refused_in_one_line(tmp_path, text):
     assert "\n" not in str(caught.value)
 
 
-def save_failed_run(path: Path, failures: dict[str, str]) -> dict[int, Policy]:
-    manifest = {"task": "Task-v0", "algorithm": "csac", "seeds": [0, 1, 2], "steps": 9, "state": "failed"}
-    RunDirectory.create(path, {**manifest, "failures": failures})
-    return save_run(path, "0,1,0,5.0,10,\n1,1,0,6.0,10,\n2,1,0,7.0,10,\n")
+EVALUATIONS = "0,1,0,5.0,10,\n1,1,0,6.0,10,\n2,1,0,7.0,10,\n"
 
 
 def test_a_failed_seed_is_not_chosen(tmp_path):
-    policies = save_failed_run(tmp_path, {"2": "step 1: reward is nan"})
+    policies = save_run(tmp_path, EVALUATIONS, failures={2: "step 1: reward is nan"})
     assert same(load(tmp_path), policies[1])
     assert same(load(tmp_path, seed=2), policies[2])
 
 
 def test_where_every_seed_failed_none_is_chosen(tmp_path):
-    policies = save_failed_run(tmp_path, {str(seed): f"step {seed}: reward is nan" for seed in range(3)})
+    policies = save_run(tmp_path, EVALUATIONS, failures={seed: f"step {seed}: reward is nan" for seed in range(3)})
     with pytest.raises(InputError, match=r"every seed of .* failed \(seed 0 at step 0: reward is nan\): train again"):
         load(tmp_path)
     assert same(load(tmp_path, seed=1), policies[1])

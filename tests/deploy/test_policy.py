@@ -19,6 +19,8 @@ from policies import DICT_PARTS, contract, random_layers, random_network, random
 
 from csac.deploy.contract import Activation, Contract
 from csac.deploy.policy import Policy
+from csac.record.manifest import Manifest
+from csac.record.run import RunDirectory
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
 
 
@@ -335,9 +337,10 @@ def test_a_contract_without_a_named_task_is_kept(tmp_path):
 def test_a_policy_needs_numpy_and_nothing_else(tmp_path):
     """What a robot has: Python, NumPy and this package."""
     policy = random_policy(contract(DICT_PARTS, (2,)))
-    (tmp_path / "policy").mkdir()
-    policy.save(tmp_path / "policy" / "seed_3.safetensors")
-    policy.contract.save(tmp_path / "policy" / "contract.json")
+    run = RunDirectory.create(tmp_path / "run", Manifest(task="Task-v0", algorithm="csac", seeds=(3,), steps=9))
+    run.contract.parent.mkdir()
+    policy.save(run.policy(3))
+    policy.contract.save(run.contract)
     code = f"""
 import sys
 
@@ -348,7 +351,7 @@ class NumpyAlone:
 
 sys.meta_path.insert(0, NumpyAlone())
 from csac import InputError, Policy, load
-policy = load({str(tmp_path)!r})
+policy = load({str(run.path)!r})
 action, _ = policy.predict({{"speed": 0.5, "position": [[0.3, 0.4]], "achieved": [0.1, 0.2]}})
 policy.save({str(tmp_path / "again")!r})
 print(*action.tolist())
@@ -357,7 +360,7 @@ print(*action.tolist())
     assert done.returncode == 0, done.stderr
     expected, _ = policy.predict({"speed": 0.5, "position": [[0.3, 0.4]], "achieved": [0.1, 0.2]})
     np.testing.assert_array_equal(np.array(done.stdout.split(), np.float32), expected)
-    assert (tmp_path / "again").read_bytes() == (tmp_path / "policy" / "seed_3.safetensors").read_bytes()
+    assert (tmp_path / "again").read_bytes() == run.policy(3).read_bytes()
 
 
 @given(st.data())

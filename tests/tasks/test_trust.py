@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 from policies import contract, random_policy
 
+from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.tasks import trust
 from csac.types import InputError
@@ -56,7 +57,7 @@ def stranger(tmp_path, monkeypatch):
 
     def make_run(task: str) -> Path:
         path = folder / "run"
-        manifest = {"task": task, "algorithm": "csac", "seeds": [0], "steps": 9, "state": "finished", "steps_done": 9}
+        manifest = Manifest(task=task, algorithm="csac", seeds=(0,), steps=9, state="finished", steps_done=9)
         RunDirectory.create(path, manifest)
         (path / "policy").mkdir()
         random_policy(contract()).save(path / "policy" / "seed_0.safetensors")
