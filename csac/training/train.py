@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 import warnings
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
-
-import jax
 
 from csac.record.run import RunDirectory, default_directory, is_run
 from csac.tasks.environment import Environment
@@ -18,6 +15,7 @@ from csac.tasks.perturbations import by_step, perturbations_of, refuse_late
 from csac.tasks.trust import refuse_untrusted, remember
 from csac.training.checkpoint import Checkpoints
 from csac.training.compilation import tidy_programs
+from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
 from csac.training.interruptions import Interrupted, caught_signals, storage_failures_told
 from csac.training.learner import misfit
@@ -367,23 +365,6 @@ def _draw(run: RunDirectory) -> None:
         from csac.record.plots import learning_curve  # matplotlib is slow to import
 
         learning_curve([(run.manifest.algorithm.upper(), rows)], run.curve, title=run.manifest.task, marks=marks)
-
-
-def choose_device(device: str) -> None:
-    """Have JAX compute there, in this process and its workers. Raises InputError where there is no such device."""
-    if device not in ("cpu", "gpu"):
-        raise InputError(f"device must be cpu or gpu, not {device!r}")
-    before, platform_name = os.environ.get("JAX_PLATFORMS"), "cpu" if device == "cpu" else "cuda"
-    jax.config.update("jax_platforms", platform_name)
-    if device == "gpu":
-        try:
-            jax.devices()
-        except Exception as error:  # which one depends on what is missing, and on JAX's version
-            jax.config.update("jax_platforms", before)
-            raise InputError("no GPU that JAX can use: install csac[cuda], or choose the cpu") from error
-    # Every dispatch is waited for at once: handing it to another thread would only cost the hand-over.
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
-    os.environ |= {"JAX_PLATFORMS": platform_name, "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0"}  # for the workers
 
 
 def _defaults(algorithm: Algorithm) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def run_of(tmp_path):
     def make(steps: int | None) -> RunDirectory:
         task = f"Stripes-v{steps or 0}"
         if task not in gymnasium.registry:
-            gymnasium.register(task, entry_point=Stripes, max_episode_steps=steps)
+            gymnasium.register(task, entry_point=f"{__name__}:Stripes", max_episode_steps=steps)
         run = RunDirectory.create(tmp_path / "run", Manifest(task=task, algorithm="csac", seeds=(0,), steps=9))
         run.contract.parent.mkdir()
         contract().save(run.contract)

@@ -31,6 +31,7 @@ from csac.record.run import RunDirectory
 from csac.record.tensorboard import TensorBoardLog
 from csac.tasks.seeds import SeedEnvironments
 from csac.training.checkpoint import (
+    SCHEMA_VERSION,
     Checkpoint,
     Checkpoints,
     Damaged,
@@ -212,7 +213,7 @@ def forge(place: Path, fields: Any) -> None:
 
 def forged(content: bytes, name: str) -> dict[str, Any]:
     facts = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-    return {"schema_version": 1, "step": 5, "files": {name: facts}, "values": {}}
+    return {"schema_version": SCHEMA_VERSION, "step": 5, "files": {name: facts}, "values": {}}
 
 
 def use_all(place: Path, memory: np.ndarray) -> Snapshot:

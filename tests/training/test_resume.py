@@ -37,8 +37,9 @@ def advance(group: Group, until: int) -> list[messages.Event]:
 
 def everything(group: Group) -> list[np.ndarray]:
     """What a group has learnt, remembers and does next."""
-    leaves = jax.tree.leaves(group.learner._carry)
-    return [np.asarray(leaf) for leaf in leaves] + [group._actions, group._observations, group.learner._waiting]
+    learner, seeds = group.learner, range(len(group.seeds))
+    leaves = jax.tree.leaves([(learner.carry(index), learner.waiting(index)) for index in seeds])
+    return [*leaves, group._actions, group._observations]
 
 
 @pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda learner: f"{learner.name}-{learner.cadence.update_interval}")
@@ -86,8 +87,8 @@ def test_seeds_may_be_grouped_otherwise(tmp_path):
     alone = group(tmp_path, LEARNERS[0], (4,), 300, begin=150)
     advance(together, 170)
     advance(alone, 170)
-    ours = jax.tree.leaves(alone.learner._carry[0])
-    theirs = [leaf[1] for leaf in jax.tree.leaves(together.learner._carry[0])]
+    ours = jax.tree.leaves(alone.learner.carry(0).state)
+    theirs = jax.tree.leaves(together.learner.carry(1).state)
     for our, their in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(our, their, rtol=1e-3, atol=1e-5)
 
@@ -376,6 +377,6 @@ def test_a_diverged_seed_names_its_first_bad_array_and_is_not_saved(tmp_path):
     settings = messages.Settings(wild, "Hopper-v4", {}, 300, 1000, 1, tmp_path / "checkpoint", 50)
     told = [message for _, message in run_groups(settings, [[0]], lambda: False)]
     (failed,) = [message for message in told if isinstance(message, messages.Failed)]
-    assert "actor.layers[0].weight is not finite" in failed.reason
+    assert "actor.layers.0.weight is not finite" in failed.reason
     assert 40 <= failed.step <= 50
     assert not [message for message in told if isinstance(message, messages.Saved) and message.step >= failed.step]
