@@ -8,7 +8,7 @@ import json
 import os
 import shlex
 import sys
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -22,8 +22,6 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-    from rich.console import Console
 
     from csac.record.manifest import Manifest
     from csac.record.run import RunDirectory
@@ -103,6 +101,8 @@ class Resume:
     """The directory of a run."""
     steps: Annotated[int | None, arg(help_behavior_hint="(default: as many as it was started for)")] = None
     """Environment steps per seed in all, counted from the run's beginning; may be more than it was started for."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,8 @@ class Evaluate:
     """Change the task, as friction=2 does; the kinds are those of csac train."""
     csv: Annotated[Path | None, arg(metavar="FILE.csv")] = None
     """Write a row for each episode there as well, as in evaluations.csv."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,8 @@ class Play:
     """Write this file instead of opening a window; needs no display."""
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
     """Change the task, as friction=2 does; the kinds are those of csac train."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +228,12 @@ def _resume(arguments: list[str]) -> int:
     command = shlex.join(["csac", "resume", *arguments])
     return _exit_code(
         lambda: resume(
-            options.run, steps=options.steps, evaluation_processes=None, reporter=Reporter(), command=command
+            options.run,
+            steps=options.steps,
+            evaluation_processes=None,
+            trust_task=options.trust_task,
+            reporter=Reporter(),
+            command=command,
         )
     )
 
@@ -259,12 +268,12 @@ def _evaluate(arguments: list[str]) -> int:
     from csac.console.tables import case_table, evaluation_table, make_console, silent_events
     from csac.console.waiting import progress_shown
     from csac.evaluation.evaluator import EvaluationFailure
-    from csac.evaluation.play import evaluate_run, told_perturbations
+    from csac.evaluation.play import evaluate_run, perturbation_notes
     from csac.record.run import RunDirectory
     from csac.record.tables import COLUMNS, check_new, write_rows
 
     console = make_console()
-    told = told_perturbations(options.run, options.perturb)
+    told = perturbation_notes(options.run, options.perturb)
     if options.csv:
         check_new(options.csv)
     results = {}
@@ -279,6 +288,7 @@ def _evaluate(arguments: list[str]) -> int:
                     options.perturb,
                     processes=options.processes,
                     on_progress=on_progress,
+                    trust_task=options.trust_task,
                 )
             )
     except EvaluationFailure as error:
@@ -301,15 +311,24 @@ def _evaluate(arguments: list[str]) -> int:
 def _play(arguments: list[str]) -> int:
     options = parse(Play, arguments, "csac play")
     from csac.console.tables import make_console
-    from csac.evaluation.play import play, told_perturbations
+    from csac.console.waiting import progress_shown
+    from csac.evaluation.play import perturbation_notes, play
     from csac.tasks.spaces import EnvironmentFailure
 
     console = make_console()
-    for line in told_perturbations(options.run, options.perturb):
+    for line in perturbation_notes(options.run, options.perturb):
         console.print(line, soft_wrap=True)
     try:
-        with _waiting(console, "playing"):
-            for episode in play(options.run, options.seed, options.episodes, options.video, options.perturb):
+        with progress_shown(console, "playing", "steps at most") as on_progress:
+            for episode in play(
+                options.run,
+                options.seed,
+                options.episodes,
+                options.video,
+                options.perturb,
+                on_progress=on_progress,
+                trust_task=options.trust_task,
+            ):
                 text = f"return {episode.episode_return:,.2f} in {episode.length:,} steps"
                 console.print(f"episode {episode.episode}: {text}")
     except EnvironmentFailure as error:
@@ -400,11 +419,6 @@ def _inherited(source: Manifest) -> list[tuple[str, Any, Any]]:
         ("evaluation_episodes", int, source.evaluation.episodes),
         ("env_kwargs", Annotated[str, arg(metavar="JSON")], json.dumps(source.environment_arguments)),
     ]
-
-
-def _waiting(console: Console, doing: str) -> AbstractContextManager[Any]:
-    """Say on a terminal what takes its time."""
-    return console.status(doing) if console.is_interactive else nullcontext()
 
 
 def _say(text: str) -> None:
