@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, get_args
 
-import numpy as np
-
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.record.run import RunDirectory, Which
+from csac.record.statistics import last_evaluations
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-EVALUATION_POINTS = 3
 
 
 def load(directory: str | Path, seed: int | None = None, which: Which = "last") -> Policy:
@@ -62,26 +59,14 @@ def _without_failed(run: RunDirectory, seeds: list[int]) -> list[int]:
 def _best_seed(run: RunDirectory, seeds: list[int]) -> int:
     if len(seeds) == 1:
         return seeds[0]
-    scores = _last_evaluations(run)
+    rows = run.evaluations
+    if "return" not in (rows.dtype.names or ()):
+        raise InputError(f"the evaluations.csv of {run.path} has no returns: give a seed, or restore it from a copy")
+    scores = {seed: score for seed, score in last_evaluations(rows).items() if not math.isnan(score)}
     ranked = [(scores[seed], -seed) for seed in seeds if seed in scores]
     if not ranked:
         raise InputError(f"{run.path} has no evaluations to choose by: give a seed, one of {_listed(seeds)}")
     return -max(ranked)[1]
-
-
-def _last_evaluations(run: RunDirectory) -> dict[int, float]:
-    """Return each seed's mean return over its last evaluation points; a line still being written does not count."""
-    rows = run.evaluations
-    if "return" not in (rows.dtype.names or ()):
-        raise InputError(f"the evaluations.csv of {run.path} has no returns: give a seed, or restore it from a copy")
-    scores = {}
-    for seed in np.unique(rows["seed"]):
-        of_seed = rows[rows["seed"] == seed]
-        points = np.unique(of_seed["step"])[-EVALUATION_POINTS:]
-        score = float(np.mean([of_seed["return"][of_seed["step"] == step].mean() for step in points]))
-        if not math.isnan(score):
-            scores[int(seed)] = score
-    return scores
 
 
 def _listed(seeds: list[int]) -> str:
