@@ -26,6 +26,7 @@ html_extra_path = ["index.html"]
 html_show_copyright = html_show_sphinx = False
 
 myst_heading_anchors = 3
+smartquotes = False
 default_role = "code"  # of single backticks in docstrings
 autodoc_member_order = "bysource"
 viewcode_follow_imported_members = False
@@ -33,7 +34,7 @@ autodoc_default_options = {"members": True}
 
 # The side of each page. What stands in docs/ and in no list comes last, so that a new page is seen at once.
 NAVIGATION = {
-    "Use": ["docs/python", "docs/tasks", "docs/perturbations", "docs/reliability"],
+    "Use": ["docs/python", "docs/tasks", "docs/perturbations", "docs/going-on", "docs/reliability"],
     "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo")],
     "Measured": ["docs/performance", "benchmarks/README", "results/*/README", "results/parity/*/README"],
     "Inside": ["docs/design", "docs/adding-an-algorithm", "CONTRIBUTING", "docs/reference/csac", "CHANGELOG"],
