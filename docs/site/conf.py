@@ -36,7 +36,7 @@ autodoc_default_options = {"members": True}
 NAVIGATION = {
     "Use": ["docs/python", "docs/tasks", "docs/perturbations", "docs/going-on", "docs/reliability"],
     "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo")],
-    "Measured": ["docs/performance", "benchmarks/README", "results/*/README", "results/parity/*/README"],
+    "Measured": ["docs/performance", "docs/gpu", "benchmarks/README", "results/*/README", "results/parity/*/README"],
     "Inside": ["docs/design", "docs/adding-an-algorithm", "CONTRIBUTING", "docs/reference/csac", "CHANGELOG"],
 }
 
