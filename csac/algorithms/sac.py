@@ -157,7 +157,8 @@ class SAC:
         actor_key, critics_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, 2 * spec.action_size)
         critics = make_critics(critics_key, spec, self.critic_hidden_sizes)
-        log_temperature = jnp.log(jnp.float32(self.entropy_weight))
+        # log 0 is no number to keep; the lowest float is one, and its exponential is 0 too.
+        log_temperature = jnp.maximum(jnp.log(jnp.float32(self.entropy_weight)), jnp.finfo(jnp.float32).min)
         return State(
             actor=actor,
             critics=critics,
