@@ -19,8 +19,9 @@ import numpy as np
 
 from csac import CSAC
 from csac.tasks.seeds import Steps
-from csac.training.checkpoint import Checkpoints, SeedFiles, newest_sound
+from csac.training.checkpoint import Checkpoints, newest_sound
 from csac.training.learner import Learner
+from csac.training.seed_files import SeedFiles
 from csac.types import Ring, Spec
 
 SEEDS, NEW, CAPACITY = 5, 50_000, 1_000_000
