@@ -14,12 +14,13 @@ ARGS ?=
 SETUP := .venv/.installed
 PEERS := .venv-peers/.installed
 PARL := .venv-parl/.installed
+CUDA := .venv/.cuda
 
 define require_python
 @test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
 endef
 
-.PHONY: help setup train test slow chaos check lock clean peers bench roofline scaling
+.PHONY: help setup train test slow chaos check lock clean peers bench limit growth gpu
 
 help:  ## List the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
@@ -48,13 +49,16 @@ check: $(SETUP)  ## Check format, lint, types and the direction of imports
 peers: $(PEERS) $(PARL)  ## Install what to measure against: into .venv-peers, and PARL into .venv-parl
 
 bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS)) $(if $(PARL_PYTHON),,$(PARL))  ## Measure speed beside the peers: make bench ARGS=--quick
-	.venv/bin/python benchmarks/speed.py --out benchmarks $(ARGS)
+	.venv/bin/python -m benchmarks peers --write $(ARGS)
 
-roofline: $(SETUP)  ## Measure how near training comes to the machine's limit: make roofline ARGS='--repetitions 1'
-	.venv/bin/python benchmarks/roofline.py --out benchmarks --page docs/performance.md $(ARGS)
+limit: $(SETUP)  ## Measure how near training comes to the machine's limit: make limit ARGS='--repetitions 1'
+	.venv/bin/python -m benchmarks limit --write $(ARGS)
 
-scaling: $(SETUP)  ## Measure what seeds, widths, batches, observations and replays cost
-	.venv/bin/python benchmarks/scaling.py --out benchmarks --page docs/performance.md $(ARGS)
+growth: $(SETUP)  ## Measure what seeds, widths, batches, observations and replays cost
+	.venv/bin/python -m benchmarks growth --write $(ARGS)
+
+gpu: $(SETUP) $(if $(shell command -v nvidia-smi),$(CUDA))  ## Measure training on a GPU, and compare its numbers with the CPU's: docs/gpu.md
+	.venv/bin/python -m benchmarks gpu --write $(ARGS)
 
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml
 	$(UV) pip compile pyproject.toml --extra robots --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
@@ -69,6 +73,11 @@ $(SETUP): requirements.lock pyproject.toml | $(UV)
 	@test -x .venv/bin/python || $(UV) venv --quiet --python "$$(command -v $(PYTHON))" .venv
 	@$(UV) pip sync --quiet --compile-bytecode --python .venv/bin/python --require-hashes requirements.lock
 	@$(UV) pip install --quiet --python .venv/bin/python --no-deps --editable .
+	@touch $@
+
+$(CUDA): $(SETUP)
+	@echo "Installing JAX for CUDA into .venv"
+	@$(UV) pip install --quiet --python .venv/bin/python --editable '.[cuda]'
 	@touch $@
 
 $(PEERS): benchmarks/requirements-peers.txt

@@ -11,12 +11,13 @@ import sys
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from csac.arguments import json_object, nearest, parse, peek
 from csac.presets import PRESETS, hyperparameters
+from csac.training.options import Options
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -24,7 +25,9 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from csac.record.manifest import Manifest
     from csac.record.run import RunDirectory
+    from csac.training.options import PlanOptions
 
 HELP = """\
 usage: csac COMMAND ...
@@ -44,8 +47,8 @@ To begin: csac train HalfCheetah-v4 --seeds 2 --steps 60_000
 """
 
 
-@dataclass(frozen=True)
-class Train:
+@dataclass(frozen=True, kw_only=True)
+class Train(Options):
     """Train controllers for a task: independent seeds, each evaluated as it learns.
 
     Exit codes: 0 done, 2 wrong arguments, 3 a seed failed, 130 or 143 stopped by a signal (what was learnt is saved).
@@ -57,12 +60,6 @@ class Train:
     """What learns; its own options are listed below."""
     preset: str | None = None
     """Hyperparameters to start from: paper is the paper's tables. Options given here win over it."""
-    steps: int = 1_000_000
-    """Environment steps per seed, warm-up included."""
-    seeds: int = 1
-    """How many seeds to train."""
-    first_seed: int = 0
-    """Label of the first seed; the others follow."""
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/TASK/ALGORITHM/DATE-TIME)")] = None
     """The run's own directory, new or empty."""
     resume: FlagCreatePairsOff[bool] = False
@@ -79,20 +76,23 @@ class Train:
     """Change the task after STEP environment steps, as friction=1.5@300000 does: factors on friction, gravity, mass or
     gain of a MuJoCo task, standard deviations of observation_noise or action_noise. With --from, none leaves out what
     that run had planned."""
-    device: Literal["cpu", "gpu"] = "cpu"
-    """Where the networks learn."""
     groups: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
     """Processes to split the seeds over."""
-    evaluation_interval: int = 5_000
-    """Environment steps between two evaluations; there is one at the last step as well."""
-    evaluation_episodes: int = 10
-    """Episodes of each evaluation."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
     """Processes in which each group evaluates while it trains on; 0 evaluates in line. The results are the same."""
-    checkpoint_interval: int = 50_000
-    """Environment steps between checkpoints; there is one every ten minutes and at the end as well. 0 makes none."""
-    keep_checkpoints: int = 2
-    """How many of the newest checkpoints to keep; 0 keeps all."""
+
+    def plan_options(self) -> PlanOptions:
+        """Return the options of `train` that are given here."""
+        same = {item.name: getattr(self, item.name) for item in dataclasses.fields(Options)}
+        options: Any = {
+            **same,
+            "environment_arguments": json_object("--env-kwargs", self.env_kwargs),
+            "perturbations": _perturbations(self.perturb),
+            "events": None if self.events is None else self.events.split(","),
+            "groups": self.groups,
+            "evaluation_processes": self.evaluation_processes,
+        }
+        return options
 
 
 @dataclass(frozen=True)
@@ -191,19 +191,10 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def _train(arguments: list[str]) -> int:
-    from csac.algorithms import ALGORITHMS
-
-    source = _source(peek(arguments, "--from", None))
-    name = peek(arguments, "--algorithm", source["algorithm"] if source else "csac")
-    if name not in ALGORITHMS:
-        raise InputError(f"no algorithm is called {name!r}: choose {' or '.join(ALGORITHMS)}")
-    preset, others = peek(arguments, "--preset", None), {k: v for k, v in ALGORITHMS.items() if k != name}
-    # Twice: what a preset gives can depend on the task, and the task is known once the arguments are parsed.
-    options = parse(_with_algorithm(ALGORITHMS, name, preset, "", source), arguments, "csac train", others)
-    if preset:
-        options = parse(
-            _with_algorithm(ALGORITHMS, name, preset, options.task, source), arguments, "csac train", others
-        )
+    chosen = Chosen.among(arguments)
+    options = parse(chosen.command(""), arguments, "csac train", chosen.others())
+    if chosen.preset:  # what it gives can depend on the task, which is known by now
+        options = parse(chosen.command(options.task), arguments, "csac train", chosen.others())
     if options.resume and options.directory is None:
         raise InputError("--resume needs the run's --directory (csac resume DIR does without)")
 
@@ -212,27 +203,14 @@ def _train(arguments: list[str]) -> int:
 
     return _exit_code(
         lambda: train(
-            getattr(options, name),
+            getattr(options, chosen.algorithm),
             options.task,
-            steps=options.steps,
-            seeds=options.seeds,
-            first_seed=options.first_seed,
             directory=options.directory,
-            groups=options.groups,
-            evaluation_interval=options.evaluation_interval,
-            evaluation_episodes=options.evaluation_episodes,
-            evaluation_processes=options.evaluation_processes,
-            environment_arguments=json_object("--env-kwargs", options.env_kwargs),
-            perturbations=_perturbations(options.perturb),
-            device=options.device,
-            checkpoint_interval=options.checkpoint_interval,
-            keep_checkpoints=options.keep_checkpoints,
             resume=options.resume,
             start_from=options.start_from,
-            events=None if options.events is None else options.events.split(","),
-            preset=preset,
             reporter=Reporter(),
             command=shlex.join(["csac", "train", *arguments]),
+            **options.plan_options(),
         )
     )
 
@@ -254,25 +232,16 @@ def _exit_code(training: Callable[[], RunDirectory]) -> int:
     """Train, and turn how it ended into an exit code and, where it did not reach its end, the line to type next."""
     from csac.console.tables import program
     from csac.record.run import StorageFailure
-    from csac.training.train import Interrupted
+    from csac.training.interruptions import Interrupted
 
     try:
         run = training()
     except Interrupted as interruption:
-        line = f"{program()} resume {shlex.quote(str(interruption.run.path))}"
-        return _complain(f"{interruption}; to go on, type: {line}", 128 + interruption.signal_number)
+        line = f"; to go on, type: {program()} resume {shlex.quote(str(interruption.run.path))}"
+        return _complain(f"{interruption}{line if interruption.is_saved else ''}", 128 + interruption.signal_number)
     except StorageFailure as failure:
         return _complain(f"{failure}; the run can go on from its last checkpoint (csac resume) once that is mended", 1)
-    return 3 if run.manifest["state"] == "failed" else 0
-
-
-def _source(where: str | None) -> dict[str, Any] | None:
-    """Return the manifest of the run that another is to begin with."""
-    if where is None:
-        return None
-    from csac.training.resume import Source
-
-    return Source.find(where).run.manifest
+    return 3 if run.manifest.state == "failed" else 0
 
 
 def _perturbations(given: tuple[str, ...]) -> tuple[str, ...] | None:
@@ -322,7 +291,7 @@ def _evaluate(arguments: list[str]) -> int:
     for name in silent_events(results):
         _say(f"note: no episode's last info holds a number called {name!r}")
     if options.csv:
-        step = RunDirectory.open(options.run).manifest["steps_done"]
+        step = RunDirectory.open(options.run).manifest.steps_done
         rows = [episode.row(seed, step) for seed, episodes in results.items() for episode in episodes]
         write_rows(options.csv, COLUMNS["evaluations"], rows)
         console.print(str(options.csv), soft_wrap=True)
@@ -364,41 +333,72 @@ def _runs(arguments: list[str]) -> int:
     return 0
 
 
-def _with_algorithm(
-    algorithms: dict[str, Any], name: str, preset: str | None, task: str, source: dict[str, Any] | None
-) -> type[Any]:
-    """Return `Train` with the options of one algorithm beside its own.
+class Chosen(NamedTuple):
+    """What is known of a `csac train` before its options can be: they and their defaults depend on it."""
 
-    What they are by default comes from a preset or from the manifest of the run to begin with, if one is given.
-    """
-    presets: Any = Literal[PRESETS]
-    hint = arg(help_behavior_hint=f"(default: {preset or 'none'})")
-    algorithm = algorithms[name](**(hyperparameters(preset, name, task) if preset else {}))
-    fields: list[Any] = []
-    if source:
-        from csac.training.resume import algorithm_of
+    algorithm: str
+    preset: str | None
+    source: Manifest | None
+    """Of the run to begin with."""
 
-        algorithm = algorithm_of(source) if source["algorithm"] == name and not preset else algorithm
-        fields += [(field, type_, dataclasses.field(default=value)) for field, type_, value in _inherited(source)]
-    fields += [
-        ("algorithm", Literal[tuple(algorithms)], field(default=name)),
-        ("preset", Annotated[presets | None, hint], field(default=preset)),
-        (name, OmitArgPrefixes[type(algorithm)], field(default=algorithm)),
-    ]
-    return dataclasses.make_dataclass(
-        "Train", fields, bases=(Train,), frozen=True, namespace={"__doc__": Train.__doc__}
-    )
+    @classmethod
+    def among(cls, arguments: list[str]) -> Chosen:
+        """Look for what was chosen. Raises InputError for an algorithm, or a run to begin with, that is not there."""
+        from csac.algorithms import ALGORITHMS
+
+        source = None
+        if (where := peek(arguments, "--from", None)) is not None:
+            from csac.training.resume import Source
+
+            source = Source.find(where).run.manifest
+        name = peek(arguments, "--algorithm", source.algorithm if source else "csac")
+        if name not in ALGORITHMS:
+            raise InputError(f"no algorithm is called {name!r}: choose {' or '.join(ALGORITHMS)}")
+        return cls(name, peek(arguments, "--preset", None), source)
+
+    def command(self, task: str) -> type[Any]:
+        """Return `Train` with the hyperparameters of the algorithm beside its own options.
+
+        Their defaults are those of the preset for this task, or of the run to begin with.
+        """
+        from csac.algorithms import ALGORITHMS
+
+        presets: Any = Literal[PRESETS]
+        hint = arg(help_behavior_hint=f"(default: {self.preset or 'none'})")
+        values = hyperparameters(self.preset, self.algorithm, task) if self.preset else {}
+        algorithm, fields = ALGORITHMS[self.algorithm](**values), []
+        if self.source:
+            from csac.training.plan import algorithm_of
+
+            is_same = self.source.algorithm == self.algorithm and not self.preset
+            algorithm = algorithm_of(self.source) if is_same else algorithm
+            fields += [(name, kind, field(default=value)) for name, kind, value in _inherited(self.source)]
+        fields += [
+            ("algorithm", Literal[tuple(ALGORITHMS)], field(default=self.algorithm)),
+            ("preset", Annotated[presets | None, hint], field(default=self.preset)),
+            (self.algorithm, OmitArgPrefixes[type(algorithm)], field(default=algorithm)),
+        ]
+        documented = {"__doc__": Train.__doc__}
+        return dataclasses.make_dataclass(
+            "Train", fields, bases=(Train,), frozen=True, kw_only=True, namespace=documented
+        )
+
+    def others(self) -> dict[str, type[Any]]:
+        """Return the algorithms that were not chosen, by name."""
+        from csac.algorithms import ALGORITHMS
+
+        return {name: kind for name, kind in ALGORITHMS.items() if name != self.algorithm}
 
 
-def _inherited(source: dict[str, Any]) -> list[tuple[str, Any, Any]]:
+def _inherited(source: Manifest) -> list[tuple[str, Any, Any]]:
     """Return the options of `Train`, with their types, that a run takes from the one it begins with."""
     return [
-        ("steps", int, source["steps"]),
-        ("seeds", int, len(source["seeds"])),
-        ("first_seed", int, source["seeds"][0]),
-        ("evaluation_interval", int, source["evaluation"]["interval"]),
-        ("evaluation_episodes", int, source["evaluation"]["episodes"]),
-        ("env_kwargs", Annotated[str, arg(metavar="JSON")], json.dumps(source.get("environment_arguments", {}))),
+        ("steps", int, source.steps),
+        ("seeds", int, len(source.seeds)),
+        ("first_seed", int, source.seeds[0]),
+        ("evaluation_interval", int, source.evaluation.interval),
+        ("evaluation_episodes", int, source.evaluation.episodes),
+        ("env_kwargs", Annotated[str, arg(metavar="JSON")], json.dumps(source.environment_arguments)),
     ]
 
 

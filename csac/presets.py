@@ -113,3 +113,11 @@ def hyperparameters(preset: str, algorithm: str, task: str) -> dict[str, Any]:
     if algorithm not in _PAPER:
         raise InputError(f"the preset {preset!r} has no {algorithm!r}: it has {' and '.join(_PAPER)}")
     return {**_PAPER[algorithm], **_PAPER_TASKS.get((algorithm, task.rpartition(":")[2]), {})}
+
+
+def matching_preset(algorithm: str, task: str, values: Mapping[str, Any]) -> str | None:
+    """Return the preset of which all hyperparameters are among these values, or None."""
+    for preset in PRESETS:
+        if algorithm in _PAPER and hyperparameters(preset, algorithm, task).items() <= values.items():
+            return preset
+    return None

@@ -100,6 +100,21 @@ class Ring(NamedTuple):
     count: int
 
 
+class Cadence(NamedTuple):
+    """When an algorithm learns, and from how much. Steps are environment steps of one seed."""
+
+    warmup_steps: int
+    """Steps with uniform random actions and no update, before learning starts."""
+    update_interval: int
+    """Steps after each of which it learns: 1 in strict order, or as many as a rollout has."""
+    updates_per_interval: int
+    """Calls of `update` each time that it learns, once the warm-up is over."""
+    transitions_per_update: int
+    """Transitions that one call of `update` is given."""
+    has_schedule: bool = False
+    """Whether what is learnt depends on how many steps the run has in all, so that it cannot be extended."""
+
+
 class Algorithm(Protocol):
     """What the training loop asks of an algorithm: a frozen dataclass whose fields are its hyperparameters.
 
@@ -110,28 +125,8 @@ class Algorithm(Protocol):
     """The name in `ALGORITHMS`, on the command line and in the manifest."""
 
     @property
-    def warmup_steps(self) -> int:
-        """Environment steps with uniform random actions and no update, before learning starts."""
-        ...
-
-    @property
-    def update_interval(self) -> int:
-        """Environment steps after each of which it learns: 1 in strict order, or as many as a rollout has."""
-        ...
-
-    @property
-    def updates_per_interval(self) -> int:
-        """Calls of `update` each time that it learns, once the warm-up is over."""
-        ...
-
-    @property
-    def transitions_per_update(self) -> int:
-        """Transitions that one call of `update` is given."""
-        ...
-
-    @property
-    def has_schedule(self) -> bool:
-        """Whether what is learnt depends on how many steps the run has in all, so that it cannot be extended."""
+    def cadence(self) -> Cadence:
+        """When it learns, and from how much."""
         ...
 
     def memory(self, spec: Spec, steps: int) -> Any:

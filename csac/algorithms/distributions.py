@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from csac.algorithms.shapes import Action, Observation, Scalar
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,19 +24,19 @@ MINIMUM_LOG_STD, MAXIMUM_LOG_STD = -20.0, 2.0
 class Gaussian(NamedTuple):
     """The distribution N(mean, exp(log_std)²), its dimensions independent."""
 
-    mean: jax.Array  # [action]
-    log_std: jax.Array  # [action]
+    mean: Action
+    log_std: Action
 
-    def sample(self, noise: jax.Array) -> jax.Array:
-        """Return mean + std ξ for noise ξ ~ N(0, I) [action]."""
+    def sample(self, noise: Action) -> Action:
+        """Return mean + std ξ for noise ξ ~ N(0, I)."""
         return self.mean + jnp.exp(self.log_std) * noise
 
-    def log_prob(self, value: jax.Array) -> jax.Array:
-        """Return the log-density of a value [action]."""
+    def log_prob(self, value: Action) -> Scalar:
+        """Return the log-density of a value."""
         noise = (value - self.mean) * jnp.exp(-self.log_std)
         return jnp.sum(-0.5 * noise**2 - self.log_std - HALF_LOG_TWO_PI)
 
-    def entropy(self) -> jax.Array:
+    def entropy(self) -> Scalar:
         """Return the differential entropy in nats."""
         return jnp.sum(self.log_std + GAUSSIAN_ENTROPY)
 
@@ -44,49 +47,49 @@ class TanhGaussian(NamedTuple):
     Densities are evaluated at the pre-tanh value u, never at a stored action: atanh of a saturated action is infinite.
     """
 
-    mean: jax.Array  # [action]
-    log_std: jax.Array  # [action]
+    mean: Action
+    log_std: Action
 
     @classmethod
-    def from_output(cls, output: jax.Array) -> TanhGaussian:
+    def from_output(cls, output: Float[Array, " twice_action"]) -> TanhGaussian:
         """Read mean and log standard deviation, side by side in a network's output [2 action], and clip the latter."""
         mean, log_std = jnp.split(output, 2)
         return cls(mean, jnp.clip(log_std, MINIMUM_LOG_STD, MAXIMUM_LOG_STD))
 
-    def pre_tanh(self, noise: jax.Array) -> jax.Array:
-        """Return the reparameterised sample u = mean + std ξ for noise ξ ~ N(0, I) [action]; the action is tanh(u)."""
+    def pre_tanh(self, noise: Action) -> Action:
+        """Return the reparameterised sample u = mean + std ξ for noise ξ ~ N(0, I); the action is tanh(u)."""
         return self.mean + jnp.exp(self.log_std) * noise
 
-    def gaussian_log_prob(self, pre_tanh: jax.Array) -> jax.Array:
+    def gaussian_log_prob(self, pre_tanh: Action) -> Scalar:
         """Return log N(u; mean, std²), the density beneath the tanh."""
         return Gaussian(self.mean, self.log_std).log_prob(pre_tanh)
 
-    def log_prob(self, pre_tanh: jax.Array) -> jax.Array:
+    def log_prob(self, pre_tanh: Action) -> Scalar:
         """Return the log-density of the action tanh(u)."""
         return self.gaussian_log_prob(pre_tanh) - jnp.sum(log_tanh_derivative(pre_tanh))
 
-    def mode(self) -> jax.Array:
+    def mode(self) -> Action:
         """Return tanh(mean), the deterministic action."""
         return jnp.tanh(self.mean)
 
 
-def log_tanh_derivative(pre_tanh: jax.Array) -> jax.Array:
+def log_tanh_derivative(pre_tanh: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return log(1 - tanh²u) elementwise, without the cancellation of the direct formula."""
     return 2.0 * (LOG_TWO - pre_tanh - jax.nn.softplus(-2.0 * pre_tanh))
 
 
-def log_ratio(policy: TanhGaussian, reference: TanhGaussian, pre_tanh: jax.Array) -> jax.Array:
+def log_ratio(policy: TanhGaussian, reference: TanhGaussian, pre_tanh: Action) -> Scalar:
     """Return log π(a) - log π̃(a) at a = tanh(u). The tanh is common to both, so its Jacobian cancels."""
     return policy.gaussian_log_prob(pre_tanh) - reference.gaussian_log_prob(pre_tanh)
 
 
-def kl(policy: TanhGaussian, reference: TanhGaussian) -> jax.Array:
+def kl(policy: TanhGaussian, reference: TanhGaussian) -> Scalar:
     """Return KL(π ‖ π̃) in closed form: that of the Gaussians beneath, since tanh is invertible."""
     log_scale = policy.log_std - reference.log_std
     shift = (policy.mean - reference.mean) * jnp.exp(-reference.log_std)
     return jnp.sum(0.5 * (jnp.exp(2.0 * log_scale) + shift**2 - 1.0) - log_scale)
 
 
-def policy_at(actor: Callable[[jax.Array], jax.Array], observation: jax.Array) -> TanhGaussian:
+def policy_at(actor: Callable[[jax.Array], jax.Array], observation: Observation) -> TanhGaussian:
     """Return the distribution that an actor network gives at one observation."""
     return TanhGaussian.from_output(actor(observation))

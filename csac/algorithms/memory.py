@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from csac.types import Transition
+from csac.algorithms.shapes import Count, Key
+from csac.types import Cadence, Transition
 
 if TYPE_CHECKING:
     from csac.types import Spec
@@ -20,7 +22,7 @@ class Replay(NamedTuple):
     The number of transitions added so far is not kept here: it equals the environment steps, which the caller counts.
     """
 
-    rows: jax.Array  # [capacity, 2 observation + action + 3]
+    rows: Float[Array, "capacity 2*observation+action+3"]
 
     @classmethod
     def create(cls, capacity: int, spec: Spec, together: int = 1) -> Replay:
@@ -28,7 +30,7 @@ class Replay(NamedTuple):
         capacity = -(-capacity // together) * together
         return cls(jnp.zeros((capacity, row_width(spec)), jnp.float32))
 
-    def add(self, rows: jax.Array, count: jax.Array) -> Replay:
+    def add(self, rows: Float[Array, "n width"], count: Count) -> Replay:
         """Return the ring with packed rows [n, width] written over the oldest; `count` rows were added before them.
 
         `n` divides both `count` and the capacity, so that rows added together lie together.
@@ -36,7 +38,7 @@ class Replay(NamedTuple):
         start = (count % self.rows.shape[0], 0)
         return Replay(jax.lax.dynamic_update_slice(self.rows, rows, start))
 
-    def draw(self, key: jax.Array, count: jax.Array, batch_size: int, spec: Spec) -> Transition:
+    def draw(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
         """Return a batch drawn uniformly with replacement from the `count` rows added, or the newest `capacity`."""
         indices = jax.random.randint(key, (batch_size,), 0, jnp.minimum(count, self.rows.shape[0]))
         return jax.vmap(unpack, in_axes=(0, None))(self.rows[indices], spec)
@@ -45,20 +47,25 @@ class Replay(NamedTuple):
 class Rollout(NamedTuple):
     """The newest transitions, in order, for an algorithm that learns from what its own policy has just done."""
 
-    rows: jax.Array  # [steps, 2 observation + action + 3]
+    rows: Float[Array, "steps 2*observation+action+3"]
 
     @classmethod
     def create(cls, steps: int, spec: Spec) -> Rollout:
         """Return a rollout yet to be made."""
         return cls(jnp.zeros((steps, row_width(spec)), jnp.float32))
 
-    def add(self, rows: jax.Array, count: jax.Array) -> Rollout:
+    def add(self, rows: Float[Array, "n width"], count: Count) -> Rollout:
         """Return the rollout that consists of these packed rows [steps, width]."""
         return Rollout(jnp.reshape(rows, self.rows.shape))
 
-    def draw(self, key: jax.Array, count: jax.Array, batch_size: int, spec: Spec) -> Transition:
+    def draw(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
         """Return all of it: transitions with a leading axis of time."""
         return jax.vmap(unpack, in_axes=(0, None))(self.rows, spec)
+
+
+def replay_cadence(warmup_steps: int, update_interval: int, updates_per_step: int, transitions: int) -> Cadence:
+    """Return when an algorithm learns that draws `transitions` from a replay for each of its updates."""
+    return Cadence(warmup_steps, update_interval, updates_per_step * update_interval, transitions)
 
 
 def row_width(spec: Spec) -> int:
@@ -72,7 +79,7 @@ def pack(transition: Transition) -> np.ndarray:
     return np.concatenate(fields, axis=1, dtype=np.float32, casting="unsafe")
 
 
-def unpack(row: jax.Array, spec: Spec) -> Transition:
+def unpack(row: Float[Array, " width"], spec: Spec) -> Transition:
     """Return the transition in one packed row [width]."""
     observation_size, action_size = spec
     first, second, third = observation_size, observation_size + action_size, 2 * observation_size + action_size + 1

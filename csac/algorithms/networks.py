@@ -1,4 +1,4 @@
-"""Multilayer perceptrons, and the few things that every actor-critic does with parameters."""
+"""Multilayer perceptrons, and the few things that every algorithm does with parameters."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float
 
-from csac.types import Layer
+from csac.algorithms.shapes import Key, Scalar
+from csac.types import Layer, Metrics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -21,22 +23,22 @@ class MLP(eqx.Module):
     layers: tuple[Layer, ...]
     activation: Literal["relu", "tanh"] = eqx.field(static=True, default="relu")
 
-    def __call__(self, inputs: jax.Array) -> jax.Array:
-        """Map [in] to [out]."""
+    def __call__(self, inputs: Float[Array, " in"]) -> Float[Array, " out"]:
+        """Return the last layer's outputs, which have no activation."""
         activate = jax.nn.relu if self.activation == "relu" else jnp.tanh
         for layer in self.layers[:-1]:
             inputs = activate(inputs @ layer.weight + layer.bias)
         return inputs @ self.layers[-1].weight + self.layers[-1].bias
 
 
-def make_mlp(key: jax.Array, input_size: int, hidden_sizes: Sequence[int], output_size: int) -> MLP:
+def make_mlp(key: Key, input_size: int, hidden_sizes: Sequence[int], output_size: int) -> MLP:
     """Return an MLP with weights and biases uniform in ±1/sqrt(inputs), as PyTorch (and so SB3) draws them."""
     sizes = (input_size, *hidden_sizes, output_size)
     keys = jax.random.split(key, len(sizes) - 1)
     return MLP(tuple(_make_layer(k, n_in, n_out) for k, n_in, n_out in zip(keys, sizes[:-1], sizes[1:], strict=True)))
 
 
-def _make_layer(key: jax.Array, n_in: int, n_out: int) -> Layer:
+def _make_layer(key: Key, n_in: int, n_out: int) -> Layer:
     weight_key, bias_key = jax.random.split(key)
     bound = 1.0 / n_in**0.5
     weight = jax.random.uniform(weight_key, (n_in, n_out), minval=-bound, maxval=bound)
@@ -44,7 +46,7 @@ def _make_layer(key: jax.Array, n_in: int, n_out: int) -> Layer:
 
 
 def make_orthogonal_mlp(
-    key: jax.Array, input_size: int, hidden_sizes: Sequence[int], output_size: int, output_gain: float
+    key: Key, input_size: int, hidden_sizes: Sequence[int], output_size: int, output_gain: float
 ) -> MLP:
     """Return an MLP with tanh, orthogonal weights of gain √2 (`output_gain` in the last layer) and no biases yet."""
     sizes = (input_size, *hidden_sizes, output_size)
@@ -55,21 +57,6 @@ def make_orthogonal_mlp(
         for k, gain, n_in, n_out in zip(keys, gains, sizes[:-1], sizes[1:], strict=True)
     ]
     return MLP(tuple(layers), activation="tanh")
-
-
-def make_critics(
-    key: jax.Array, observation_size: int, action_size: int, hidden_sizes: Sequence[int]
-) -> tuple[MLP, MLP]:
-    """Return two independent critics Q(observation, action)."""
-    first, second = jax.random.split(key)
-    size = observation_size + action_size
-    return make_mlp(first, size, hidden_sizes, 1), make_mlp(second, size, hidden_sizes, 1)
-
-
-def q_values(critics: tuple[MLP, MLP], observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return both critics' values of one pair. Two products side by side beat one batched product on a CPU."""
-    inputs = jnp.concatenate([observation, action])
-    return critics[0](inputs)[0], critics[1](inputs)[0]
 
 
 def polyak(targets: Any, sources: Any, rate: float) -> Any:
@@ -83,7 +70,7 @@ def copy_tree(tree: Any) -> Any:
 
 
 def make_optimiser(
-    learning_rate: float | jax.Array, max_gradient_norm: float = 0.0, epsilon: float = 1e-8
+    learning_rate: float | Scalar, max_gradient_norm: float = 0.0, epsilon: float = 1e-8
 ) -> optax.GradientTransformation:
     """Return Adam, after clipping by the global norm of the gradient where a positive bound is given."""
     adam = optax.adam(learning_rate, eps=epsilon)
@@ -98,9 +85,22 @@ def begin_descent(optimiser: optax.GradientTransformation, parameters: Any) -> A
 
 
 def descend(
-    optimiser: optax.GradientTransformation, loss: Callable, parameters: Any, optimiser_state: Any
-) -> tuple[Any, Any, Any]:
-    """Return (parameters, optimiser state, metrics) after one step down `loss(parameters) -> (scalar, metrics)`."""
-    gradients, metrics = jax.grad(loss, has_aux=True)(parameters)
+    optimiser: optax.GradientTransformation, loss: Callable, parameters: Any, optimiser_state: Any, *examples: Any
+) -> tuple[Any, Any, Metrics]:
+    """Return (parameters, optimiser state, mean metrics) after one step down the mean of a loss over examples.
+
+    Args:
+        optimiser: what makes a step of a gradient.
+        loss: `loss(parameters, *example) -> (scalar, metrics)`, of one example.
+        parameters: a tree of arrays.
+        optimiser_state: that of the optimiser for these parameters.
+        examples: trees whose leaves have a leading axis of examples.
+    """
+
+    def mean_loss(parameters: Any) -> tuple[Scalar, Metrics]:
+        losses, metrics = jax.vmap(loss, in_axes=(None, *(0 for _ in examples)))(parameters, *examples)
+        return jnp.mean(losses), jax.tree.map(jnp.mean, metrics)
+
+    gradients, metrics = jax.grad(mean_loss, has_aux=True)(parameters)
     updates, optimiser_state = optimiser.update(gradients, optimiser_state, parameters)
     return optax.apply_updates(parameters, updates), optimiser_state, metrics

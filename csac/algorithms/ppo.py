@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float
 
 from csac.algorithms.distributions import Gaussian
-from csac.algorithms.hyperparameters import check_hyperparameters
+from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, SHARE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Rollout
 from csac.algorithms.networks import MLP, begin_descent, descend, make_optimiser, make_orthogonal_mlp
-from csac.types import InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
-
-# Added to variances and to the spread of advantages, as in SB3 and CleanRL: what never varies is divided by little.
-EPSILON = 1e-8
+from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar, Scalars
+from csac.algorithms.statistics import EPSILON, Statistics
+from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
 class Parameters(NamedTuple):
@@ -24,32 +25,7 @@ class Parameters(NamedTuple):
 
     actor: MLP  # [observation] -> mean [action]
     critic: MLP  # [observation] -> [1]
-    log_std: jax.Array  # [action]
-
-
-class Statistics(NamedTuple):
-    """Mean and spread of everything absorbed so far; the identity, 0 and 1, before there is any."""
-
-    count: jax.Array  # []
-    mean: jax.Array  # [...]
-    variance: jax.Array  # [...]
-    std: jax.Array  # [...] sqrt(variance + epsilon), kept because it is needed at every step and changes at few
-
-    @classmethod
-    def create(cls, shape: tuple[int, ...]) -> Statistics:
-        """Return the statistics of nothing."""
-        return cls(jnp.zeros(()), jnp.zeros(shape), jnp.ones(shape), jnp.ones(shape))
-
-    def absorb(self, values: jax.Array) -> Statistics:
-        """Return the statistics of all values so far and of these [n, ...] (Chan, Golub, LeVeque 1979)."""
-        count = self.count + len(values)
-        shares = self.count / count, len(values) / count
-        # Differences to the old mean, because they are small: little is rounded away where the mean itself is large.
-        differences = jax.vmap(jnp.subtract, in_axes=(0, None))(values, self.mean)
-        shift = jnp.mean(differences, axis=0)
-        within = shares[0] * self.variance + shares[1] * jnp.var(differences, axis=0)
-        variance = within + shares[0] * shares[1] * shift**2
-        return Statistics(count, self.mean + shares[1] * shift, variance, jnp.sqrt(variance + EPSILON))
+    log_std: Action
 
 
 class State(NamedTuple):
@@ -59,102 +35,216 @@ class State(NamedTuple):
     optimiser: Any
     observations: Statistics  # [observation]
     returns: Statistics  # [] of the discounted return so far in each episode
-    discounted_return: jax.Array  # [] of the episode that the last rollout broke off
-    total_updates: jax.Array  # [] in this run
+    discounted_return: Scalar  # of the episode that the last rollout broke off
+    total_updates: Scalar  # in this run
 
 
 class Sample(NamedTuple):
-    """One transition, or several, ready to be learnt from."""
+    """One transition, or several with leading axes, ready to be learnt from."""
 
-    observation: jax.Array  # [observation] normalised
-    action: jax.Array  # [action]
-    log_prob: jax.Array  # [] of the action when it was chosen
-    value: jax.Array  # [] before the update
-    advantage: jax.Array  # []
-    target: jax.Array  # [] of the value
+    observation: Float[Array, "... observation"]  # normalised
+    action: Float[Array, "... action"]
+    log_prob: Float[Array, "..."]  # of the action when it was chosen
+    value: Float[Array, "..."]  # before the update
+    advantage: Float[Array, "..."]
+    target: Float[Array, "..."]  # of the value
 
 
 @dataclass(frozen=True)
 class PPO:
     """Proximal Policy Optimisation."""
 
-    learning_rate: float = 3e-4
+    learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the one optimiser, at the start or throughout."""
     learning_rate_schedule: Literal["linear", "constant"] = "linear"
     """Whether the learning rate falls linearly to zero over the run or stays as it starts."""
-    discount: float = 0.99
+    discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
-    trace_decay: float = 0.95
+    trace_decay: Annotated[float, SHARE] = 0.95
     """How far an advantage looks past the critic: 0 one step, 1 to the end of the episode (GAE's lambda)."""
-    clip_range: float = 0.2
+    clip_range: Annotated[float, POSITIVE] = 0.2
     """How far the probability ratio may leave 1 before its gradient stops (epsilon)."""
     clip_value_loss: bool = True
     """Whether a value earns nothing by moving further than `clip_range` from what it was."""
-    value_loss_weight: float = 0.5
+    value_loss_weight: Annotated[float, NOT_NEGATIVE] = 0.5
     """Weight of the value loss beside the policy's."""
-    entropy_weight: float = 0.0
+    entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.0
     """Weight of the policy's entropy."""
-    max_gradient_norm: float = 0.5
+    max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.5
     """Bound on the norm of the gradient of all parameters together; 0 leaves gradients alone."""
-    adam_epsilon: float = 1e-5
+    adam_epsilon: Annotated[float, POSITIVE] = 1e-5
     """Added to the root of Adam's second moment (its epsilon)."""
-    rollout_steps: int = 2048
+    rollout_steps: Annotated[int, COUNT] = 2048
     """Environment steps from one update to the next, all of which it learns from."""
-    minibatches: int = 32
+    minibatches: Annotated[int, COUNT] = 32
     """Parts into which each epoch divides the rollout; they must be equal."""
-    epochs: int = 10
+    epochs: Annotated[int, COUNT] = 10
     """Passes over the rollout in one update."""
     normalise_advantages: bool = True
     """Whether the advantages of each minibatch are brought to mean 0 and standard deviation 1."""
-    hidden_sizes: tuple[int, ...] = (64, 64)
+    hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (64, 64)
     """Widths of the hidden layers, with tanh, of the actor and of the critic."""
     normalise_observations: bool = True
     """Whether observations are brought to mean 0 and standard deviation 1 by running statistics."""
     normalise_rewards: bool = True
     """Whether rewards are divided by the running standard deviation of the discounted return."""
-    normalisation_limit: float = 10.0
+    normalisation_limit: Annotated[float, POSITIVE] = 10.0
     """Bound on the magnitude of normalised observations and rewards."""
 
     name: ClassVar[str] = "ppo"
 
     def __post_init__(self) -> None:
-        check_hyperparameters(self)
+        take_hyperparameters(self)
         if self.rollout_steps % self.minibatches:
             raise InputError(
                 f"minibatches must divide rollout_steps into equal parts: {self.rollout_steps} steps make no "
                 f"{self.minibatches} minibatches"
             )
 
-    @property
-    def warmup_steps(self) -> int:
-        """None: a policy can only learn from what it did itself."""
-        return 0
+    def discounted_returns(self, start: Scalar, batch: Transition) -> tuple[Scalars, Scalar]:
+        """Return R_t = r_t + γ R_{t-1}, from 0 in each episode, and what the next rollout goes on from."""
+
+        def advance(running: Scalar, transition: Transition) -> tuple[Scalar, Scalar]:
+            running = self.discount * running + transition.reward
+            return running * _goes_on(transition), running
+
+        last, returns = jax.lax.scan(advance, start, batch)
+        return returns, last
+
+    def advantages(self, batch: Transition, values: Scalars, next_values: Scalars) -> Scalars:
+        """Return the generalised advantages of a rollout (GAE, Eq. 16; PPO, Eq. 11).
+
+        A_t = δ_t + γ λ A_{t+1} with δ_t = r_t + γ (1 - terminated_t) V(s_{t+1}) - V(s_t), where s_{t+1} is what step t
+        led to. Nothing is carried back over the end of an episode, of whichever kind, nor from beyond the rollout.
+        """
+        errors = batch.reward + self.discount * (1.0 - batch.terminated) * next_values - values
+        decays = self.discount * self.trace_decay * _goes_on(batch)
+
+        def step_back(advantage: Scalar, step: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+            error, decay = step
+            advantage = error + decay * advantage
+            return advantage, advantage
+
+        return jax.lax.scan(step_back, jnp.zeros(()), (errors, decays), reverse=True)[1]
+
+    def policy_loss(self, log_ratio: Scalar, advantage: Scalar) -> Scalar:
+        """Return -min(ρ A, clip(ρ, 1 - ε, 1 + ε) A) with ρ = π(a|s) / π_old(a|s) (PPO, Eq. 7)."""
+        ratio = jnp.exp(log_ratio)
+        clipped = jnp.clip(ratio, 1.0 - self.clip_range, 1.0 + self.clip_range)
+        return -jnp.minimum(ratio * advantage, clipped * advantage)
+
+    def value_loss(self, value: Scalar, old_value: Scalar, target: Scalar) -> Scalar:
+        """Return ½ (V - target)², or if more ½ (V_old + clip(V - V_old, -ε, ε) - target)² where that is asked for."""
+        loss = (value - target) ** 2
+        if self.clip_value_loss:
+            clipped = old_value + jnp.clip(value - old_value, -self.clip_range, self.clip_range)
+            loss = jnp.maximum(loss, (clipped - target) ** 2)
+        return 0.5 * loss
+
+    def loss(self, parameters: Parameters, sample: Sample) -> tuple[Scalar, Metrics]:
+        """Return policy loss + weighted value loss - weighted entropy (PPO, Eq. 9), and what to log."""
+        policy = policy_at(parameters, sample.observation)
+        log_ratio = policy.log_prob(sample.action) - sample.log_prob
+        policy_loss = self.policy_loss(log_ratio, sample.advantage)
+        value_loss = self.value_loss(value_at(parameters, sample.observation), sample.value, sample.target)
+        entropy = policy.entropy()
+        return policy_loss + self.value_loss_weight * value_loss - self.entropy_weight * entropy, {
+            "actor_loss": policy_loss,
+            "critic_loss": value_loss,
+            "entropy": entropy,
+            "approximate_kl": jnp.expm1(log_ratio) - log_ratio,  # its mean is KL(π_old ‖ π), and it is never negative
+            "clip_fraction": jnp.abs(jnp.expm1(log_ratio)) > self.clip_range,
+        }
+
+    def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
+        """Absorb the rollout into the statistics, then take `epochs` times `minibatches` gradient steps on it."""
+        discounted_returns, discounted_return = self.discounted_returns(state.discounted_return, batch)
+        absorbed = state._replace(
+            observations=state.observations.absorb(batch.observation),
+            returns=state.returns.absorb(discounted_returns),
+            discounted_return=discounted_return,
+        )
+        samples = self.samples(state, absorbed, batch)
+        learning_rate = self.learning_rate_at(step, state.total_updates)
+        optimiser = self._optimiser(learning_rate)
+
+        def learn(learnt: tuple[Parameters, Any], minibatch: Sample) -> tuple[tuple[Parameters, Any], Metrics]:
+            minibatch = minibatch._replace(advantage=self.normal_advantages(minibatch.advantage))
+            parameters, optimiser_state, metrics = descend(optimiser, self.loss, *learnt, minibatch)
+            return (parameters, optimiser_state), metrics
+
+        def pass_over(learnt: tuple[Parameters, Any], key: Key) -> tuple[tuple[Parameters, Any], Metrics]:
+            return jax.lax.scan(learn, learnt, self.shuffled(samples, key))
+
+        keys = jax.random.split(key, self.epochs)
+        (parameters, optimiser_state), metrics = jax.lax.scan(pass_over, (state.parameters, state.optimiser), keys)
+        return absorbed._replace(parameters=parameters, optimiser=optimiser_state), {
+            **jax.tree.map(jnp.mean, metrics),
+            "explained_variance": explained_variance(samples.value, samples.target),
+            "learning_rate": learning_rate,
+        }
+
+    def samples(self, state: State, absorbed: State, batch: Transition) -> Sample:
+        """Return what there is to learn from: densities by the state that acted, all else by the newest statistics."""
+
+        def log_prob(observation: Observation, action: Action) -> Scalar:
+            return policy_at(state.parameters, self.normalise(state.observations, observation)).log_prob(action)
+
+        normalise = jax.vmap(partial(self.normalise, absorbed.observations))
+        observations, next_observations = normalise(batch.observation), normalise(batch.next_observation)
+        value = jax.vmap(partial(value_at, state.parameters))
+        values, next_values = value(observations), value(next_observations)
+        scaled = batch._replace(reward=self.scale(absorbed.returns, batch.reward))
+        advantages = self.advantages(scaled, values, next_values)
+        log_probs = jax.vmap(log_prob)(batch.observation, batch.action)
+        return Sample(observations, batch.action, log_probs, values, advantages, values + advantages)
+
+    def normalise(self, statistics: Statistics, observation: Observation) -> Observation:
+        """Return (observation - mean) / std, clipped, or the observation as it is."""
+        if not self.normalise_observations:
+            return observation
+        normalised = (observation - statistics.mean) / statistics.std
+        return jnp.clip(normalised, -self.normalisation_limit, self.normalisation_limit)
+
+    def scale(self, statistics: Statistics, reward: Scalars) -> Scalars:
+        """Return reward / std of the discounted return, clipped, or the reward as it is."""
+        if not self.normalise_rewards:
+            return reward
+        return jnp.clip(reward / statistics.std, -self.normalisation_limit, self.normalisation_limit)
+
+    def shuffled(self, samples: Sample, key: Key) -> Sample:
+        """Return all samples in a random order, [minibatch, sample in it, ...]."""
+        order = jax.random.permutation(key, self.rollout_steps)
+        return jax.tree.map(lambda leaf: leaf[order].reshape(self.minibatches, -1, *leaf.shape[1:]), samples)
+
+    def learning_rate_at(self, step: Count, total_updates: Scalar) -> Scalar:
+        """Return the learning rate of the update after `step` others, of `total_updates` in the run."""
+        if self.learning_rate_schedule == "constant":
+            return jnp.float32(self.learning_rate)
+        return self.learning_rate * (1.0 - step / total_updates)
+
+    def normal_advantages(self, advantages: Scalars) -> Scalars:
+        """Return a minibatch's advantages brought to mean 0 and standard deviation 1, or as they are."""
+        if not self.normalise_advantages:
+            return advantages
+        return (advantages - advantages.mean()) / (advantages.std() + EPSILON)
 
     @property
-    def updates_per_interval(self) -> int:
-        """One call of `update` for each rollout."""
-        return 1
-
-    @property
-    def update_interval(self) -> int:
-        """Environment steps from one update to the next."""
-        return self.rollout_steps
-
-    @property
-    def transitions_per_update(self) -> int:
-        """Transitions that one call of `update` is given."""
-        return self.rollout_steps
-
-    @property
-    def has_schedule(self) -> bool:
-        """Whether the run's length is part of the algorithm."""
-        return self.learning_rate_schedule == "linear"
+    def cadence(self) -> Cadence:
+        """One update for each rollout and no warm-up: a policy can only learn from what it did itself."""
+        return Cadence(
+            warmup_steps=0,
+            update_interval=self.rollout_steps,
+            updates_per_interval=1,
+            transitions_per_update=self.rollout_steps,
+            has_schedule=self.learning_rate_schedule == "linear",
+        )
 
     def memory(self, spec: Spec, steps: int) -> Rollout:
         """Return a rollout yet to be made."""
         return Rollout.create(self.rollout_steps, spec)
 
-    def init(self, key: jax.Array, spec: Spec, steps: int) -> State:
+    def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return random networks, a policy near N(0, 1) everywhere, and statistics of nothing."""
         actor_key, critic_key = jax.random.split(key)
         parameters = Parameters(
@@ -171,142 +261,12 @@ class PPO:
             total_updates=jnp.float32(max(steps // self.rollout_steps, 1)),
         )
 
-    def act(self, state: State, observation: jax.Array, key: jax.Array, explore: bool) -> jax.Array:
+    def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return an unclipped sample to explore, else the mean clipped to [-1, 1]."""
         policy = policy_at(state.parameters, self.normalise(state.observations, observation))
         if explore:
             return policy.sample(jax.random.normal(key, policy.mean.shape))
         return jnp.clip(policy.mean, -1.0, 1.0)
-
-    def normalise(self, statistics: Statistics, observation: jax.Array) -> jax.Array:
-        """Return (observation - mean) / std, clipped, or the observation as it is."""
-        if not self.normalise_observations:
-            return observation
-        normalised = (observation - statistics.mean) / statistics.std
-        return jnp.clip(normalised, -self.normalisation_limit, self.normalisation_limit)
-
-    def discounted_returns(self, start: jax.Array, batch: Transition) -> tuple[jax.Array, jax.Array]:
-        """Return R_t = r_t + γ R_{t-1} [steps], from 0 in each episode, and what the next rollout goes on from."""
-
-        def advance(running: jax.Array, transition: Transition) -> tuple[jax.Array, jax.Array]:
-            running = self.discount * running + transition.reward
-            return running * _goes_on(transition), running
-
-        last, returns = jax.lax.scan(advance, start, batch)
-        return returns, last
-
-    def advantages(self, batch: Transition, values: jax.Array, next_values: jax.Array) -> jax.Array:
-        """Return the generalised advantages [steps] of a rollout (GAE, Eq. 16; PPO, Eq. 11).
-
-        A_t = δ_t + γ λ A_{t+1} with δ_t = r_t + γ (1 - terminated_t) V(s_{t+1}) - V(s_t), where s_{t+1} is what step t
-        led to. Nothing is carried back over the end of an episode, of whichever kind, nor from beyond the rollout.
-        """
-        errors = batch.reward + self.discount * (1.0 - batch.terminated) * next_values - values
-        decays = self.discount * self.trace_decay * _goes_on(batch)
-
-        def step_back(advantage: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            error, decay = step
-            advantage = error + decay * advantage
-            return advantage, advantage
-
-        return jax.lax.scan(step_back, jnp.zeros(()), (errors, decays), reverse=True)[1]
-
-    def policy_loss(self, log_ratio: jax.Array, advantage: jax.Array) -> jax.Array:
-        """Return -min(ρ A, clip(ρ, 1 - ε, 1 + ε) A) with ρ = π(a|s) / π_old(a|s) (PPO, Eq. 7)."""
-        ratio = jnp.exp(log_ratio)
-        clipped = jnp.clip(ratio, 1.0 - self.clip_range, 1.0 + self.clip_range)
-        return -jnp.minimum(ratio * advantage, clipped * advantage)
-
-    def value_loss(self, value: jax.Array, old_value: jax.Array, target: jax.Array) -> jax.Array:
-        """Return ½ (V - target)², or if more ½ (V_old + clip(V - V_old, -ε, ε) - target)² where that is asked for."""
-        loss = (value - target) ** 2
-        if self.clip_value_loss:
-            clipped = old_value + jnp.clip(value - old_value, -self.clip_range, self.clip_range)
-            loss = jnp.maximum(loss, (clipped - target) ** 2)
-        return 0.5 * loss
-
-    def loss(self, parameters: Parameters, sample: Sample) -> tuple[jax.Array, Metrics]:
-        """Return policy loss + weighted value loss - weighted entropy (PPO, Eq. 9), and what to log."""
-        policy = policy_at(parameters, sample.observation)
-        log_ratio = policy.log_prob(sample.action) - sample.log_prob
-        policy_loss = self.policy_loss(log_ratio, sample.advantage)
-        value_loss = self.value_loss(value_at(parameters, sample.observation), sample.value, sample.target)
-        entropy = policy.entropy()
-        return policy_loss + self.value_loss_weight * value_loss - self.entropy_weight * entropy, {
-            "actor_loss": policy_loss,
-            "critic_loss": value_loss,
-            "entropy": entropy,
-            "approximate_kl": jnp.expm1(log_ratio) - log_ratio,  # its mean is KL(π_old ‖ π), and it is never negative
-            "clip_fraction": jnp.abs(jnp.expm1(log_ratio)) > self.clip_range,
-        }
-
-    def update(self, state: State, batch: Transition, key: jax.Array, step: jax.Array) -> tuple[State, Metrics]:
-        """Absorb the rollout into the statistics, then take `epochs` times `minibatches` gradient steps on it."""
-        discounted_returns, discounted_return = self.discounted_returns(state.discounted_return, batch)
-        absorbed = state._replace(
-            observations=state.observations.absorb(batch.observation),
-            returns=state.returns.absorb(discounted_returns),
-            discounted_return=discounted_return,
-        )
-        samples = self.samples(state, absorbed, batch)
-        learning_rate = self.learning_rate_at(step, state.total_updates)
-        optimiser = self._optimiser(learning_rate)
-
-        def learn(learnt: tuple[Parameters, Any], minibatch: Sample) -> tuple[tuple[Parameters, Any], Metrics]:
-            minibatch = self._with_normal_advantages(minibatch)
-
-            def mean_loss(parameters: Parameters) -> tuple[jax.Array, Metrics]:
-                losses, metrics = jax.vmap(self.loss, in_axes=(None, 0))(parameters, minibatch)
-                return jnp.mean(losses), jax.tree.map(jnp.mean, metrics)
-
-            parameters, optimiser_state, metrics = descend(optimiser, mean_loss, *learnt)
-            return (parameters, optimiser_state), metrics
-
-        def pass_over(learnt: tuple[Parameters, Any], key: jax.Array) -> tuple[tuple[Parameters, Any], Metrics]:
-            return jax.lax.scan(learn, learnt, self.shuffled(samples, key))
-
-        keys = jax.random.split(key, self.epochs)
-        (parameters, optimiser_state), metrics = jax.lax.scan(pass_over, (state.parameters, state.optimiser), keys)
-        return absorbed._replace(parameters=parameters, optimiser=optimiser_state), {
-            **jax.tree.map(jnp.mean, metrics),
-            "explained_variance": explained_variance(samples.value, samples.target),
-            "learning_rate": learning_rate,
-        }
-
-    def samples(self, state: State, absorbed: State, batch: Transition) -> Sample:
-        """Return what there is to learn from: densities by the state that acted, all else by the newest statistics."""
-        parameters = state.parameters
-
-        def log_prob(observation: jax.Array, action: jax.Array) -> jax.Array:
-            return policy_at(parameters, self.normalise(state.observations, observation)).log_prob(action)
-
-        normalise = jax.vmap(self.normalise, in_axes=(None, 0))
-        observations = normalise(absorbed.observations, batch.observation)
-        next_observations = normalise(absorbed.observations, batch.next_observation)
-        values, next_values = (
-            jax.vmap(value_at, in_axes=(None, 0))(parameters, of) for of in (observations, next_observations)
-        )
-        scaled = batch._replace(reward=self.scale(absorbed.returns, batch.reward))
-        advantages = self.advantages(scaled, values, next_values)
-        log_probs = jax.vmap(log_prob)(batch.observation, batch.action)
-        return Sample(observations, batch.action, log_probs, values, advantages, values + advantages)
-
-    def scale(self, statistics: Statistics, reward: jax.Array) -> jax.Array:
-        """Return reward / std of the discounted return, clipped, or the reward as it is."""
-        if not self.normalise_rewards:
-            return reward
-        return jnp.clip(reward / statistics.std, -self.normalisation_limit, self.normalisation_limit)
-
-    def shuffled(self, samples: Sample, key: jax.Array) -> Sample:
-        """Return all samples in a random order, [minibatch, sample in it, ...]."""
-        order = jax.random.permutation(key, self.rollout_steps)
-        return jax.tree.map(lambda leaf: leaf[order].reshape(self.minibatches, -1, *leaf.shape[1:]), samples)
-
-    def learning_rate_at(self, step: jax.Array, total_updates: jax.Array) -> jax.Array:
-        """Return the learning rate of the update after `step` others, of `total_updates` in the run."""
-        if self.learning_rate_schedule == "constant":
-            return jnp.float32(self.learning_rate)
-        return self.learning_rate * (1.0 - step / total_updates)
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, its spread and the statistics that it sees observations by."""
@@ -319,34 +279,28 @@ class PPO:
         )
         return PolicyNetwork(parameters, actor.activation, "clipped_gaussian")
 
-    def _with_normal_advantages(self, minibatch: Sample) -> Sample:
-        if not self.normalise_advantages:
-            return minibatch
-        advantages = minibatch.advantage
-        return minibatch._replace(advantage=(advantages - advantages.mean()) / (advantages.std() + EPSILON))
-
-    def _optimiser(self, learning_rate: float | jax.Array) -> optax.GradientTransformation:
+    def _optimiser(self, learning_rate: float | Scalar) -> optax.GradientTransformation:
         # As one vector: few buffers to hand over when acting, which takes longer than the networks do.
         return optax.flatten(make_optimiser(learning_rate, self.max_gradient_norm, self.adam_epsilon))
 
 
-def policy_at(parameters: Parameters, observation: jax.Array) -> Gaussian:
+def policy_at(parameters: Parameters, observation: Observation) -> Gaussian:
     """Return the distribution of actions at one normalised observation."""
     return Gaussian(parameters.actor(observation), parameters.log_std)
 
 
-def value_at(parameters: Parameters, observation: jax.Array) -> jax.Array:
+def value_at(parameters: Parameters, observation: Observation) -> Scalar:
     """Return the critic's value of one normalised observation."""
     return parameters.critic(observation)[0]
 
 
-def explained_variance(values: jax.Array, targets: jax.Array) -> jax.Array:
-    """Return 1 - Var[target - value] / Var[target] over [n] of both; 0 where the targets do not vary."""
+def explained_variance(values: Scalars, targets: Scalars) -> Scalar:
+    """Return 1 - Var[target - value] / Var[target]; 0 where the targets do not vary."""
     variance = jnp.var(targets)
     explained = 1.0 - jnp.var(targets - values) / jnp.where(variance > 0, variance, 1.0)
     return jnp.where(variance > 0, explained, 0.0)
 
 
-def _goes_on(transition: Transition) -> jax.Array:
+def _goes_on(transition: Transition) -> Float[Array, "..."]:
     """Return 0 where the episode ended, of whichever kind, else 1."""
     return (1.0 - transition.terminated) * (1.0 - transition.truncated)

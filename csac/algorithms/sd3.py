@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from functools import partial
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float
 
-from csac.algorithms.hyperparameters import check_hyperparameters
-from csac.algorithms.memory import Replay
-from csac.algorithms.networks import (
-    MLP,
-    begin_descent,
-    copy_tree,
-    descend,
-    make_mlp,
-    make_optimiser,
-    polyak,
-    q_values,
-)
-from csac.types import Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
+from csac.algorithms.critics import Critics, least_q_value, make_critic, q_value
+from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
+from csac.algorithms.memory import Replay, replay_cadence
+from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
+from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 # Targets computed at once. The activations of a whole batch's samples leave the processor's caches: in groups of this
 # many examples an update takes 40 % less time on a CPU.
@@ -50,111 +45,72 @@ class State(NamedTuple):
 class SD3:
     """Softmax Deep Double Deterministic policy gradients (its Algorithm 1)."""
 
-    inverse_temperature: float = 0.05
+    inverse_temperature: Annotated[float, NOT_NEGATIVE] = 0.05
     """How far the value of a state leans to its best sampled action (the paper's beta): 0 is the mean."""
-    noise_samples: int = 50
+    noise_samples: Annotated[int, COUNT] = 50
     """Actions sampled around the target actor's to value a state (the paper's K)."""
     importance_sampling: bool = False
     """Whether to divide each sample's weight by its density (as the paper derives it); its authors' code does not."""
-    exploration_noise: float = 0.1
+    exploration_noise: Annotated[float, NOT_NEGATIVE] = 0.1
     """Standard deviation of the noise on the actions that explore."""
-    target_noise: float = 0.2
+    target_noise: Annotated[float, NOT_NEGATIVE] = 0.2
     """Standard deviation of the noise on the target actors' actions (the paper's sigma)."""
-    target_noise_clip: float = 0.5
+    target_noise_clip: Annotated[float, NOT_NEGATIVE] = 0.5
     """Bound on that noise (the paper's c)."""
-    discount: float = 0.99
+    discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
-    target_rate: float = 0.005
+    target_rate: Annotated[float, RATE] = 0.005
     """Soft update rate of the targets (the paper's tau)."""
-    actor_learning_rate: float = 1e-3
+    actor_learning_rate: Annotated[float, POSITIVE] = 1e-3
     """Learning rate of the actors."""
-    critic_learning_rate: float = 1e-3
+    critic_learning_rate: Annotated[float, POSITIVE] = 1e-3
     """Learning rate of the critics."""
-    actor_hidden_sizes: tuple[int, ...] = (256, 256)
+    actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each actor's hidden layers."""
-    critic_hidden_sizes: tuple[int, ...] = (256, 256)
+    critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
-    batch_size: int = 256
+    batch_size: Annotated[int, COUNT] = 256
     """Transitions for each of the two pairs in one update."""
-    replay_size: int = 1_000_000
+    replay_size: Annotated[int, COUNT] = 1_000_000
     """Transitions that the replay keeps."""
-    warmup_steps: int = 10_000
+    warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts."""
-    updates_per_step: int = 1
+    updates_per_step: Annotated[int, COUNT] = 1
     """Updates for each environment step."""
-    update_interval: int = 1
+    update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
-    max_gradient_norm: float = 0.0
+    max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
-    has_schedule = False
     name: ClassVar[str] = "sd3"
 
     def __post_init__(self) -> None:
-        check_hyperparameters(self)
-
-    @property
-    def updates_per_interval(self) -> int:
-        """Calls of `update` after every `update_interval` environment steps."""
-        return self.updates_per_step * self.update_interval
-
-    @property
-    def transitions_per_update(self) -> int:
-        """Transitions that one call of `update` is given: a mini-batch for each pair."""
-        return 2 * self.batch_size
-
-    def memory(self, spec: Spec, steps: int) -> Replay:
-        """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
-        return Replay.create(min(self.replay_size, steps), spec, self.update_interval)
-
-    def init(self, key: jax.Array, spec: Spec, steps: int) -> State:
-        """Return two pairs of random networks; the targets are copies."""
-        first_key, second_key = jax.random.split(key)
-        return State(self._make_pair(first_key, spec), self._make_pair(second_key, spec))
-
-    def _make_pair(self, key: jax.Array, spec: Spec) -> Pair:
-        actor_key, critic_key = jax.random.split(key)
-        actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, spec.action_size)
-        critic = make_mlp(critic_key, spec.observation_size + spec.action_size, self.critic_hidden_sizes, 1)
-        return Pair(
-            actor=actor,
-            critic=critic,
-            target_actor=copy_tree(actor),
-            target_critic=copy_tree(critic),
-            actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
-            critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critic),
-        )
-
-    def act(self, state: State, observation: jax.Array, key: jax.Array, explore: bool) -> jax.Array:
-        """Return the action of the actor whose own critic values it more, with noise and clipped to explore."""
-        first, second = (jnp.tanh(pair.actor(observation)) for pair in state)
-        first_value, second_value = (
-            q_value(pair.critic, observation, action) for pair, action in zip(state, (first, second), strict=True)
-        )
-        action = jnp.where(first_value >= second_value, first, second)
-        if not explore:
-            return action
-        return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
+        take_hyperparameters(self)
 
     def critic_target(
-        self, target_actor: MLP, target_critics: tuple[MLP, MLP], transition: Transition, noise: jax.Array
-    ) -> jax.Array:
+        self,
+        transition: Transition,
+        noise: Float[Array, "sample action"],
+        *,
+        target_actor: MLP,
+        target_critics: Critics,
+    ) -> Scalar:
         """Return y = r + γ softmax of min Q'(s', ãₖ) at ãₖ = clip(π'(s') + clip(σ ξₖ, -c, c), -1, 1) (Algorithm 1).
 
-        `noise` are the ξₖ ~ N(0, I) [sample, action]; nothing follows a terminal step.
+        The `noise` are the ξₖ ~ N(0, I); nothing follows a terminal step.
         """
         observation = transition.next_observation
         mean = jnp.tanh(target_actor(observation))
 
-        def value(noise: jax.Array) -> jax.Array:
+        def value(noise: Action) -> Scalar:
             noise = jnp.clip(self.target_noise * noise, -self.target_noise_clip, self.target_noise_clip)
-            return jnp.minimum(*q_values(target_critics, observation, jnp.clip(mean + noise, -1.0, 1.0)))
+            return least_q_value(target_critics, observation, jnp.clip(mean + noise, -1.0, 1.0))
 
         log_weights = -log_density(noise) if self.importance_sampling else jnp.zeros(len(noise))
         softmax_value = softmax_operator(jax.vmap(value)(noise), self.inverse_temperature, log_weights)
         return transition.reward + self.discount * (1.0 - transition.terminated) * softmax_value
 
-    def update(self, state: State, batch: Transition, key: jax.Array, step: jax.Array) -> tuple[State, Metrics]:
+    def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Update the first pair on half of the batch, then the second, which sees its new target, on the rest."""
         first_key, second_key = jax.random.split(key)
         first_batch = jax.tree.map(lambda leaf: leaf[: self.batch_size], batch)
@@ -163,32 +119,22 @@ class SD3:
         second, second_metrics = self.update_pair(state.second, first.target_critic, second_batch, second_key)
         return State(first, second), jax.tree.map(lambda a, b: (a + b) / 2.0, first_metrics, second_metrics)
 
-    def update_pair(
-        self, pair: Pair, other_target_critic: MLP, batch: Transition, key: jax.Array
-    ) -> tuple[Pair, Metrics]:
+    def update_pair(self, pair: Pair, other_target_critic: MLP, batch: Transition, key: Key) -> tuple[Pair, Metrics]:
         """Take one gradient step on the critic, then one on the actor, then move the targets of both."""
         noise = jax.random.normal(key, (len(batch.action), self.noise_samples, batch.action.shape[-1]))
-        target_critics = (pair.target_critic, other_target_critic)
-        targets = jax.lax.map(
-            lambda example: self.critic_target(pair.target_actor, target_critics, *example),
-            (batch, noise),
-            batch_size=EXAMPLES_AT_ONCE,
+        critic_target = partial(
+            self.critic_target,
+            target_actor=pair.target_actor,
+            target_critics=(pair.target_critic, other_target_critic),
         )
-
-        def mean_critic_loss(critic: MLP) -> tuple[jax.Array, Metrics]:
-            losses, metrics = jax.vmap(critic_loss, in_axes=(None, 0, 0))(critic, batch, targets)
-            return jnp.mean(losses), jax.tree.map(jnp.mean, {"critic_loss": losses, **metrics})
-
+        targets = jax.lax.map(lambda example: critic_target(*example), (batch, noise), batch_size=EXAMPLES_AT_ONCE)
+        optimiser = self._optimiser(self.critic_learning_rate)
         critic, critic_optimiser, critic_metrics = descend(
-            self._optimiser(self.critic_learning_rate), mean_critic_loss, pair.critic, pair.critic_optimiser
+            optimiser, critic_loss, pair.critic, pair.critic_optimiser, batch, targets
         )
-
-        def mean_actor_loss(actor: MLP) -> tuple[jax.Array, Metrics]:
-            loss = jnp.mean(jax.vmap(actor_loss, in_axes=(None, None, 0))(actor, critic, batch.observation))
-            return loss, {"actor_loss": loss}
-
+        optimiser = self._optimiser(self.actor_learning_rate)
         actor, actor_optimiser, actor_metrics = descend(
-            self._optimiser(self.actor_learning_rate), mean_actor_loss, pair.actor, pair.actor_optimiser
+            optimiser, partial(actor_loss, critic=critic), pair.actor, pair.actor_optimiser, batch.observation
         )
         new_pair = Pair(
             actor=actor,
@@ -199,6 +145,44 @@ class SD3:
             critic_optimiser=critic_optimiser,
         )
         return new_pair, {**critic_metrics, **actor_metrics}
+
+    @property
+    def cadence(self) -> Cadence:
+        """When it learns; one update takes a mini-batch for each pair."""
+        return replay_cadence(self.warmup_steps, self.update_interval, self.updates_per_step, 2 * self.batch_size)
+
+    def memory(self, spec: Spec, steps: int) -> Replay:
+        """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
+        return Replay.create(min(self.replay_size, steps), spec, self.update_interval)
+
+    def init(self, key: Key, spec: Spec, steps: int) -> State:
+        """Return two pairs of random networks; the targets are copies."""
+        first_key, second_key = jax.random.split(key)
+        return State(self._make_pair(first_key, spec), self._make_pair(second_key, spec))
+
+    def _make_pair(self, key: Key, spec: Spec) -> Pair:
+        actor_key, critic_key = jax.random.split(key)
+        actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, spec.action_size)
+        critic = make_critic(critic_key, spec, self.critic_hidden_sizes)
+        return Pair(
+            actor=actor,
+            critic=critic,
+            target_actor=copy_tree(actor),
+            target_critic=copy_tree(critic),
+            actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
+            critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critic),
+        )
+
+    def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
+        """Return the action of the actor whose own critic values it more, with noise and clipped to explore."""
+        first, second = (jnp.tanh(pair.actor(observation)) for pair in state)
+        first_value, second_value = (
+            q_value(pair.critic, observation, action) for pair, action in zip(state, (first, second), strict=True)
+        )
+        action = jnp.where(first_value >= second_value, first, second)
+        if not explore:
+            return action
+        return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return both actors' and both critics' layers: the critics choose the actor."""
@@ -212,27 +196,26 @@ class SD3:
         return make_optimiser(learning_rate, self.max_gradient_norm)
 
 
-def softmax_operator(values: jax.Array, inverse_temperature: float, log_weights: jax.Array) -> jax.Array:
-    """Return Σ wₖ exp(β Qₖ) Qₖ / Σ wₖ exp(β Qₖ) over the samples [sample], wₖ = exp(log_weights)."""
+def softmax_operator(
+    values: Float[Array, " sample"], inverse_temperature: float, log_weights: Float[Array, " sample"]
+) -> Scalar:
+    """Return Σ wₖ exp(β Qₖ) Qₖ / Σ wₖ exp(β Qₖ) over the samples, wₖ = exp(log_weights)."""
     return jnp.sum(jax.nn.softmax(inverse_temperature * values + log_weights) * values)
 
 
-def log_density(noise: jax.Array) -> jax.Array:
-    """Return the log-density of unclipped standard noise [sample, action], but for what all samples share."""
+def log_density(noise: Float[Array, "sample action"]) -> Float[Array, " sample"]:
+    """Return the log-density of unclipped standard noise, but for what all samples share."""
     return -0.5 * jnp.sum(noise**2, axis=-1)
 
 
-def critic_loss(critic: MLP, transition: Transition, target: jax.Array) -> tuple[jax.Array, Metrics]:
+def critic_loss(critic: MLP, transition: Transition, target: Scalar) -> tuple[Scalar, Metrics]:
     """Return [Qᵢ(s, a) - y]² (Algorithm 1), and what to log."""
     value = q_value(critic, transition.observation, transition.action)
-    return (value - target) ** 2, {"q_mean": value}
+    loss = (value - target) ** 2
+    return loss, {"critic_loss": loss, "q_mean": value}
 
 
-def actor_loss(actor: MLP, critic: MLP, observation: jax.Array) -> jax.Array:
+def actor_loss(actor: MLP, observation: Observation, *, critic: MLP) -> tuple[Scalar, Metrics]:
     """Return -Qᵢ(s, πᵢ(s)), whose gradient is the deterministic policy gradient against its sign (Algorithm 1)."""
-    return -q_value(critic, observation, jnp.tanh(actor(observation)))
-
-
-def q_value(critic: MLP, observation: jax.Array, action: jax.Array) -> jax.Array:
-    """Return one critic's value of one pair."""
-    return critic(jnp.concatenate([observation, action]))[0]
+    loss = -q_value(critic, observation, jnp.tanh(actor(observation)))
+    return loss, {"actor_loss": loss}

@@ -6,7 +6,7 @@ import math
 import shlex
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Group
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.status import Status
 
+    from csac.record.manifest import Manifest
     from csac.record.run import RunDirectory
 
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -130,7 +131,7 @@ class Reporter:
                 self._print(table)
         else:
             self._print(Text("no evaluations yet"))
-        for seed, reason in run.manifest["failures"].items():
+        for seed, reason in run.manifest.failures.items():
             self._print(Text(f"seed {seed} failed at {reason}", "red"))
         self._print_next(run, bool(len(evaluations)))
 
@@ -267,10 +268,10 @@ def sparkline(values: Sequence[float] | np.ndarray, low: float, high: float, wid
     return drawn
 
 
-def _outcome(manifest: Mapping[str, Any], time_taken: str) -> str:
-    steps, failed, seeds = f"{manifest['steps_done']:,}", len(manifest["failures"]), len(manifest["seeds"])
-    if manifest["state"] == "interrupted":
-        return f"stopped at step {steps} of {manifest['steps']:,} after {time_taken}"
+def _outcome(manifest: Manifest, time_taken: str) -> str:
+    steps, failed, seeds = f"{manifest.steps_done:,}", len(manifest.failures), len(manifest.seeds)
+    if manifest.state == "interrupted":
+        return f"stopped at step {steps} of {manifest.steps:,} after {time_taken}"
     if failed == seeds:
         return f"failed at step {steps} after {time_taken}"
     return f"finished {steps} steps in {time_taken}" + (f", but {failed} of {seeds} seeds failed" if failed else "")

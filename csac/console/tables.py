@@ -86,7 +86,7 @@ def results_table(run: RunDirectory) -> Table:
     Below them the mean, standard deviation and 95 % t-interval over the seeds that did not fail. Their best is the best
     evaluation of all seeds together (the paper's maximum average return), not the mean of each seed's own.
     """
-    rows, failures = run.evaluations, run.manifest["failures"]
+    rows, failures = run.evaluations, run.manifest.failures
     steps, seeds, returns = evaluation_matrix(rows)
     trained, last_three = run.rows("episodes")["seed"], last_evaluations(rows, points=3)
     largest = float(np.nanmax(np.abs(returns), initial=0.0))
@@ -95,9 +95,9 @@ def results_table(run: RunDirectory) -> Table:
         best = int(np.nanargmax(line))
         values = (line[~np.isnan(line)][-1], last_three[seed], line[best])
         cells = [*(number(value, largest) for value in values), f"{steps[best]:,}"]
-        style = "red" if str(seed) in failures else None
+        style = "red" if seed in failures else None
         table.add_row(str(seed), *cells, f"{np.count_nonzero(trained == seed):,}", style=style)
-    sound = np.array([str(seed) not in failures for seed in seeds])
+    sound = np.array([seed not in failures for seed in seeds.tolist()])
     together = ~np.isnan(returns[sound]).any(axis=0)
     if sound.sum() > 1 and together.any():
         steps, returns = steps[together], returns[sound][:, together]
@@ -114,7 +114,7 @@ def recovery_tables(run: RunDirectory) -> list[Table]:
 
     Each looks as far as the next perturbation. There is none where no evaluation lies before the step or none after it.
     """
-    rows, perturbed = run.evaluations, by_step(perturbations_of(run.manifest.get("perturbations", [])))
+    rows, perturbed = run.evaluations, by_step(perturbations_of(run.manifest.perturbations))
     tables = []
     for index, (step, text) in enumerate(perturbed):
         until = perturbed[index + 1][0] if index + 1 < len(perturbed) else None
@@ -123,11 +123,11 @@ def recovery_tables(run: RunDirectory) -> list[Table]:
             title = f"{text} after step {step:,}" + (
                 f", until {until:,}" if until and until < rows["step"].max() else ""
             )
-            tables.append(_recovery_table(title, recoveries, run.manifest["failures"]))
+            tables.append(_recovery_table(title, recoveries, run.manifest.failures))
     return tables
 
 
-def _recovery_table(title: str, recoveries: Mapping[int, Recovery], failures: Mapping[str, str]) -> Table:
+def _recovery_table(title: str, recoveries: Mapping[int, Recovery], failures: Mapping[int, str]) -> Table:
     """Return one row per seed, and below them the mean and standard deviation over seeds that did not fail.
 
     Where a seed never came back there is no mean of the steps, but how many did; a share of a return of 0 is left out.
@@ -137,8 +137,8 @@ def _recovery_table(title: str, recoveries: Mapping[int, Recovery], failures: Ma
     values = np.array(list(recoveries.values()))
     largest = float(np.nanmax(np.abs(values[:, [0, 1, 5, 6]])))
     for seed, one in recoveries.items():
-        table.add_row(str(seed), *_recovery_cells(one, largest), style="red" if str(seed) in failures else None)
-    sound = np.array([one for seed, one in recoveries.items() if str(seed) not in failures and np.isfinite(one.drop)])
+        table.add_row(str(seed), *_recovery_cells(one, largest), style="red" if seed in failures else None)
+    sound = np.array([one for seed, one in recoveries.items() if seed not in failures and np.isfinite(one.drop)])
     if len(sound) > 1:
         back = np.isfinite(sound[:, 3])
         columns = np.where(back.all() | (np.arange(7) != 3), sound, np.nan).T
@@ -264,11 +264,11 @@ def runs_table(runs: Sequence[RunDirectory]) -> Table:
     table.columns[6].overflow = "fold"
     for run in runs:
         manifest, state = run.manifest, _state(run)
-        steps = f"{short(manifest['steps_done'])} / {short(manifest['steps'])}"
+        steps = f"{short(manifest.steps_done)} / {short(manifest.steps)}"
         table.add_row(
-            Text(manifest["task"]),
-            manifest["algorithm"],
-            str(len(manifest["seeds"])),
+            Text(manifest.task),
+            manifest.algorithm,
+            str(len(manifest.seeds)),
             steps,
             Text(state, STATE_STYLES.get(state, "")),
             _last_return(run),
@@ -294,8 +294,8 @@ def _cell(value: float, digits: int) -> str:
 
 def _state(run: RunDirectory) -> str:
     """Return the state of the manifest, but see through a run whose process, on this machine, is no more."""
-    state, process = run.manifest["state"], run.manifest.get("process")
-    host = run.manifest.get("machine", {}).get("host", platform.node())
+    state, process = run.manifest.state, run.manifest.process
+    host = run.manifest.machine.host or platform.node()
     if state == "running" and process and host == platform.node() and not psutil.pid_exists(process):
         return "killed"
     return state

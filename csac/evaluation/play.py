@@ -52,11 +52,11 @@ def evaluate_run(
     """
     run = _open(directory)
     evaluator = Evaluator(
-        run.manifest["task"],
-        run.manifest.get("environment_arguments"),
+        run.manifest.task,
+        run.manifest.environment_arguments,
         episodes,
         FRESH_EVALUATION_SEED,
-        run.manifest.get("events", ()),
+        run.manifest.events,
     )
     evaluator.perturb(values_at(lasting(perturbations), 0))
     labels = _seeds_with_policies(run) if seed is None else [seed]
@@ -74,7 +74,7 @@ def told_perturbations(
 ) -> list[str]:
     """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
     given = lasting(perturbations)
-    trained = perturbations_of(RunDirectory.open(directory).manifest.get("perturbations", []))
+    trained = perturbations_of(RunDirectory.open(directory).manifest.perturbations)
     if given:
         return [f"perturbed: {', '.join(item.label for item in given)}"]
     return [f"not perturbed, unlike its training ({', '.join(map(str, trained))}): see --perturb"] if trained else []
@@ -106,7 +106,7 @@ def play(
         _check_video(Path(video))
         _draw_off_screen()
     environment = _drawn_environment(run, "human" if video is None else "rgb_array")
-    adapter = adapter_of(run.manifest["task"])
+    adapter = adapter_of(run.manifest.task)
     picture = adapter.camera(environment.raw) if adapter and adapter.camera else environment.raw.render
     frames_per_second = round(
         (adapter and adapter.pictures_per_second)
@@ -135,9 +135,9 @@ def play(
 
 def _open(directory: str | Path) -> RunDirectory:
     run = RunDirectory.open(directory)
-    if run.manifest.get("task_is_callable"):
+    if run.manifest.task_is_callable:
         raise InputError(
-            f"the task of {directory} was made by a Python function, {run.manifest['task']}: "
+            f"the task of {directory} was made by a Python function, {run.manifest.task}: "
             "evaluate it in Python, with csac.load and csac.evaluate"
         )
     return run
@@ -153,7 +153,7 @@ def _follow(environment: Environment) -> None:
 
 
 def _seeds_with_policies(run: RunDirectory) -> list[int]:
-    seeds = [seed for seed in run.manifest["seeds"] if (run.path / "policy" / f"seed_{seed}.safetensors").exists()]
+    seeds = [seed for seed in run.manifest.seeds if (run.path / "policy" / f"seed_{seed}.safetensors").exists()]
     if not seeds:
         raise InputError(f"{run.path} holds no policy yet: its first evaluation writes one")
     return seeds
@@ -178,7 +178,7 @@ def _check_video(path: Path) -> None:
 
 
 def _drawn_environment(run: RunDirectory, render_mode: str) -> Environment:
-    task, arguments = run.manifest["task"], run.manifest.get("environment_arguments") or {}
+    task, arguments = run.manifest.task, run.manifest.environment_arguments or {}
     adapter = adapter_of(task)
     if adapter and render_mode == "rgb_array":
         arguments = {**adapter.picture_arguments, **arguments}

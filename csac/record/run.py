@@ -1,9 +1,10 @@
-"""A run directory: its manifest, its tables, its log. The manifest is whole or absent, whenever the run is killed."""
+"""A run directory: its manifest, its tables, its log, and what all its files are called."""
 
 from __future__ import annotations
 
-import json
+import dataclasses
 import os
+import re
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import numpy as np
 
+from csac.record import manifest as manifests
 from csac.record.files import create_atomically, write_atomically
 from csac.record.tables import COLUMNS, append_rows, read_rows, structured
 from csac.types import InputError
@@ -23,22 +25,13 @@ except ImportError:  # Windows: nothing keeps two processes apart there
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-Table = Literal["episodes", "metrics", "evaluations"]
+    from csac.record.manifest import Manifest
 
-SCHEMA_VERSION = 1
+Table = Literal["episodes", "metrics", "evaluations"]
+Which = Literal["last", "best"]
+
 LOCK = ".lock"
 MANIFEST = "manifest.json"
-REQUIRED_FIELDS: dict[str, type] = {
-    "task": str,
-    "algorithm": str,
-    "seeds": list,
-    "steps": int,
-    "state": str,
-    "steps_done": int,
-    "failures": dict,
-    "history": list,
-    "created": str,
-}
 
 
 class StorageFailure(RuntimeError):
@@ -46,9 +39,9 @@ class StorageFailure(RuntimeError):
 
 
 class RunDirectory:
-    """One run on disk. `manifest` holds plain JSON values, so the keys of `failures` are strings."""
+    """One run on disk."""
 
-    def __init__(self, path: Path, manifest: dict[str, Any]):
+    def __init__(self, path: Path, manifest: Manifest) -> None:
         self.path = path
         self.manifest = manifest
 
@@ -56,45 +49,68 @@ class RunDirectory:
         return f"RunDirectory({str(self.path)!r})"
 
     @classmethod
-    def create(cls, path: str | Path, manifest: Mapping[str, Any]) -> RunDirectory:
-        """Start a run in a new or empty directory.
+    def create(cls, path: str | Path, manifest: Manifest) -> RunDirectory:
+        """Start a run in a new or empty directory; the moment is noted in its manifest.
 
-        Fills in `schema_version` and, where not given, `created`, `state`, `steps_done`, `failures` and `history`.
         Raises InputError, and leaves no trace, where `path` holds a run, holds anything else, or cannot be written.
         """
         path = Path(path)
-        created = datetime.now().astimezone().isoformat(timespec="seconds")
-        progress = {"state": "running", "steps_done": 0, "failures": {}, "history": [], "created": created}
-        complete = _as_json({**progress, **manifest, "schema_version": SCHEMA_VERSION})
+        content = manifests.written(dataclasses.replace(manifest, created=manifest.created or now()))
         try:
-            _claim(path, complete)
+            _claim(path, content)
         except OSError as error:
             reason = error.strerror or str(error)
             raise InputError(f"cannot write to {path}: {reason}; choose another directory") from None
-        return cls(path, complete)
+        return cls(path, manifests.read(content))
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
         """Open a run that exists. Raises InputError where there is none or its manifest is broken."""
         path = Path(path)
         try:
-            manifest = json.loads((path / MANIFEST).read_bytes())
+            return cls(path, manifests.read((path / MANIFEST).read_bytes()))
         except (FileNotFoundError, NotADirectoryError):
             what = "holds no run" if path.exists() else "does not exist"
             raise InputError(f"{path} {what}; give a run directory ('csac runs' lists them)") from None
         except OSError as error:
             raise InputError(f"cannot read {path / MANIFEST}: {error.strerror}; check its permissions") from None
-        except ValueError:
-            raise InputError(f"{path / MANIFEST} is broken: it is not JSON; restore it or train again") from None
-        if problem := _manifest_problem(manifest):
-            raise InputError(f"{path / MANIFEST} is broken: {problem}; restore it or train again")
-        return cls(path, manifest)
+        except InputError as error:
+            raise InputError(f"{path / MANIFEST} is broken: {error}; restore it or train again") from None
 
     def update_manifest(self, **changes: Any) -> None:
         """Change fields of the manifest, on disk and in `manifest`, at one stroke."""
-        manifest = _as_json({**self.manifest, **changes})
-        write_atomically(self.path / MANIFEST, _encode(manifest))
-        self.manifest = manifest
+        content = manifests.written(dataclasses.replace(self.manifest, **changes))
+        write_atomically(self.path / MANIFEST, content)
+        self.manifest = manifests.read(content)
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of its checkpoints."""
+        return self.path / "checkpoint"
+
+    @property
+    def tensorboard(self) -> Path:
+        """The folder of its TensorBoard files."""
+        return self.path / "tensorboard"
+
+    @property
+    def curve(self) -> Path:
+        """The picture of its evaluations."""
+        return self.path / "curve.png"
+
+    @property
+    def contract(self) -> Path:
+        """What its policies and its task agree on."""
+        return self.path / "policy" / "contract.json"
+
+    def policy(self, seed: int, which: Which = "last") -> Path:
+        """Return the file of a seed's last or best policy."""
+        return self.path / "policy" / f"seed_{seed}{'.best' if which == 'best' else ''}.safetensors"
+
+    def seeds_with_policies(self) -> list[int]:
+        """Return the labels of the seeds whose last policy is there, in order."""
+        names = (re.fullmatch(r"seed_(\d+)\.safetensors", path.name) for path in self.contract.parent.glob("seed_*"))
+        return sorted(int(match[1]) for match in names if match)
 
     def append(self, name: Table, rows: Sequence[Mapping[str, Any]]) -> None:
         """Add rows to `<name>.csv`, flushed on return; the first rows written fix its columns (see `append_rows`)."""
@@ -145,6 +161,11 @@ class RunDirectory:
         return self.path / f"{name}.csv"
 
 
+def now() -> str:
+    """Return the moment, to the second, with its offset from universal time."""
+    return datetime.now().astimezone().isoformat(timespec="seconds")
+
+
 def is_run(path: str | Path) -> bool:
     """Whether there is a run in this directory, sound or not."""
     return (Path(path) / MANIFEST).exists()
@@ -175,14 +196,14 @@ def default_directory(task_name: str, algorithm: str) -> Path:
     return path
 
 
-def _claim(path: Path, manifest: dict[str, Any]) -> None:
+def _claim(path: Path, manifest: bytes) -> None:
     """Make `path` a run, or raise and leave it as it was."""
     _refuse_occupied(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
         # Of two processes that found the same empty directory, only one gets past this line.
-        create_atomically(path / MANIFEST, _encode(manifest))
+        create_atomically(path / MANIFEST, manifest)
     except FileExistsError:
         _refuse_occupied(path)
         raise
@@ -205,39 +226,3 @@ def _refuse_occupied(path: Path) -> None:
         raise InputError(f"{path} is a file; choose another directory")
     if path.exists() and not all(_is_left_over(entry) for entry in path.iterdir()):
         raise InputError(f"{path} is not empty and holds no run; choose a new or an empty directory")
-
-
-def _as_json(manifest: dict[str, Any]) -> dict[str, Any]:
-    """Return what reading the written manifest gives back; refuse what could not be opened again."""
-    try:
-        plain = json.loads(json.dumps(manifest, default=_plain))
-    except TypeError as error:
-        raise InputError(f"the manifest cannot hold this: {error}; use numbers, strings, lists and dicts") from None
-    if problem := _manifest_problem(plain):
-        raise ValueError(f"not a manifest: {problem}")
-    return plain
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    raise TypeError(f"{value!r} is a {type(value).__name__}")
-
-
-def _encode(manifest: dict[str, Any]) -> bytes:
-    return (json.dumps(manifest, indent=2) + "\n").encode()
-
-
-def _manifest_problem(manifest: Any) -> str | None:
-    if not isinstance(manifest, dict):
-        return "it is not a JSON object"
-    version = manifest.get("schema_version")
-    if version != SCHEMA_VERSION:
-        return f"its schema version is {version!r}, and this csac reads {SCHEMA_VERSION}"
-    for field, kind in REQUIRED_FIELDS.items():
-        value = manifest.get(field)
-        if not isinstance(value, kind) or isinstance(value, bool):
-            return f"{field!r} is {value!r}, not of type {kind.__name__}"
-    return None

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from csac.training.seed_files import Files
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 FOLDER = "checkpoint"
 BEST = ".best.safetensors"
 

@@ -80,7 +80,7 @@ class Recorder:
         # One that was lost is followed by the best of later evaluations.
         self._best = {k: v for k, v in _best_means(run.evaluations).items() if self._policy_file(k, ".best").exists()}
         # Told once, after the first evaluation of the run.
-        self._unheard = set() if len(run.evaluations) else set(run.manifest.get("events", ()))
+        self._unheard = set() if len(run.evaluations) else set(run.manifest.events)
         self._info_names: set[str] = set()
         self._perturbations = [(step, text) for step, text in perturbations if step >= begin]  # still to be told
 
@@ -179,6 +179,7 @@ class Recorder:
         # Said before, so that no checkpoint is ever taken for exact that is not.
         self.run.update_manifest(steps_done=step, inexact_seeds=sorted(self.inexact))
         self.checkpoints.commit(step, files, values)
+        self.run.update_manifest(last_checkpoint=step)
         for earlier in [other for other in self._saved if other <= step]:
             del self._saved[earlier]
 

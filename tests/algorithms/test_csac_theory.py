@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp, softmax
 
 from csac.algorithms import CSAC, SAC
-from csac.algorithms.csac import regularised_value
+from csac.algorithms import csac as csac_file
 from csac.types import Spec, Transition
 
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(80)
@@ -35,7 +37,9 @@ def actor_losses(algorithm, parameters, reference, noises):
 
     def loss(noise):
         actor, previous = (lambda _: parameters), (lambda _: reference)
-        return algorithm.actor_loss(actor, previous, (critic, critic), ONE_OBSERVATION, noise[None])[0]
+        return algorithm.actor_loss(actor, ONE_OBSERVATION, noise[None], reference=previous, critics=(critic, critic))[
+            0
+        ]
 
     return jax.vmap(loss)(noises)
 
@@ -163,41 +167,133 @@ def test_descending_the_actor_loss_reaches_the_exact_improvement(estimator, sigm
         assert float(loss(reached)) == pytest.approx(expected_loss, abs=1e-6)
 
 
+# A small task with a table for its policy in place of the tanh-Gaussian: seven actions, PRE_TANH before
+# the tanh. The noise that CSAC's equations are given chooses one of them: expectations are sums, exact to rounding.
 STATES, ACTIONS, DISCOUNT = 4, 7, 0.9
 GENERATOR = np.random.default_rng(0)
 REWARD = GENERATOR.normal(size=(STATES, ACTIONS))
 DYNAMICS = GENERATOR.dirichlet(np.full(STATES, 0.3), size=(STATES, ACTIONS))  # [state, action, next state]
 FIRST_Q = GENERATOR.normal(size=(STATES, ACTIONS))
 FIRST_POLICY = np.log(GENERATOR.dirichlet(np.ones(ACTIONS), size=STATES))  # log π_(-1)
+SECOND_CRITIC = GENERATOR.uniform(0.0, 1.0, size=(STATES, ACTIONS))  # how far it lies above the first
+PRE_TANH = np.linspace(-2.0, 2.0, ACTIONS)
 
 
-def expected_value(q, log_policy, log_reference, sigma, tau):
-    """The policy's mean of the code's bracket [state]: as an actor's objective, and as what a critic looks ahead to."""
-    bracket = regularised_value(q, log_policy, log_policy - log_reference, sigma, tau)
-    return jnp.sum(jnp.exp(log_policy) * bracket, axis=1)
+class Table(NamedTuple):
+    """The distribution of actions at one state: the part of TanhGaussian's interface that CSAC uses."""
+
+    log_probs: jax.Array  # [action]
+
+    def pre_tanh(self, noise):
+        return noise
+
+    def log_prob(self, noise):
+        return self.log_probs[choice(noise)]
 
 
-def improve(q, log_reference, sigma, tau):
-    """Maximise the code's bracket over all policies: log π.
+def choice(pre_tanh):
+    """Which of the actions lies here."""
+    return jnp.argmin(jnp.abs(pre_tanh - PRE_TANH))
 
-    The objective is (linear in π) - (τ + σ) Σ π log π, so one mirror step of size β = 1 / (τ + σ) from any policy, here
-    the uniform one, ends in the maximum.
+
+def table_kl(policy, reference):
+    return jnp.sum(jnp.exp(policy.log_probs) * (policy.log_probs - reference.log_probs))
+
+
+def table_log_ratio(policy, reference, noise):
+    return policy.log_prob(noise) - reference.log_prob(noise)
+
+
+def table_policy_at(actor, observation):
+    return Table(actor(observation))
+
+
+@pytest.fixture
+def tables(monkeypatch):
+    """CSAC with policies that are tables."""
+    monkeypatch.setattr(csac_file, "policy_at", table_policy_at)
+    monkeypatch.setattr(csac_file, "kl", table_kl)
+    monkeypatch.setattr(csac_file, "log_ratio", table_log_ratio)
+
+
+def actor_of(log_policy):
+    """A network whose outputs are those of this table [state, action]."""
+    return lambda observation: log_policy[observation[0].astype(int)]
+
+
+def critics_of(q):
+    """Two networks: the values of this table [state, action], and larger ones."""
+
+    def critic(table):
+        return lambda inputs: table[inputs[0].astype(int), choice(jnp.arctanh(inputs[1]))][None]
+
+    return critic(q), critic(q + SECOND_CRITIC)
+
+
+def expected_loss(algorithm, log_policy, log_reference, q):
+    """The mean of `actor_loss` over the policy's actions [state]."""
+
+    def loss(state, noise):
+        networks = {"reference": actor_of(log_reference), "critics": critics_of(q)}
+        return algorithm.actor_loss(actor_of(log_policy), state[None], noise[None], **networks)[0]
+
+    losses = jax.vmap(jax.vmap(loss, (None, 0)), (0, None))(jnp.arange(STATES), jnp.asarray(PRE_TANH))
+    return jnp.sum(jnp.exp(log_policy) * losses, axis=1)
+
+
+def expected_target(algorithm, log_policy, log_reference, q):
+    """The mean of `critic_target` over next states and over the policy's actions there [state, action]."""
+
+    def target(reward, next_state, noise):
+        nothing = jnp.zeros(())
+        transition = Transition(None, None, reward, next_state[None], nothing, nothing)
+        return algorithm.critic_target(
+            transition,
+            noise[None],
+            actor=actor_of(log_policy),
+            reference=actor_of(log_reference),
+            target_critics=critics_of(q),
+        )
+
+    each_action = jax.vmap(target, (None, None, 0))
+    each_next_state = jax.vmap(each_action, (None, 0, None))
+    each_reward = jax.vmap(jax.vmap(each_next_state, (0, None, None)), (0, None, None))
+    targets = each_reward(jnp.asarray(REWARD), jnp.arange(STATES), jnp.asarray(PRE_TANH))  # [s, a, s', a']
+    return jnp.einsum("ijk,kl,ijkl->ij", DYNAMICS, jnp.exp(log_policy), targets)
+
+
+def improve(algorithm, log_reference, q):
+    """Minimise the mean of `actor_loss` over all policies: log π.
+
+    It is (linear in π) + (τ + σ) Σ π log π, so one mirror step of size β = 1 / (τ + σ) from any policy, here the
+    uniform one, ends in the minimum.
     """
-    log_policy = jnp.full_like(q, -jnp.log(q.shape[1]))
-    slope = jax.grad(lambda policy: expected_value(q, jnp.log(policy), log_reference, sigma, tau).sum())(
+    log_policy = jnp.full_like(q, -jnp.log(ACTIONS))
+    slope = jax.grad(lambda policy: expected_loss(algorithm, jnp.log(policy), log_reference, q).sum())(
         jnp.exp(log_policy)
     )
-    return jax.nn.log_softmax(log_policy + slope / (tau + sigma), axis=1)
+    size = 1.0 / (algorithm.entropy_weight + algorithm.relative_entropy_weight)
+    return jax.nn.log_softmax(log_policy - size * slope, axis=1)
 
 
-def iterate(sigma, tau, iterations):
-    """The equations, exactly: yields (Q_k, log π_k, V_k). The critic's reference is π_(k-1), the actor's is π_k."""
+def iterate(sigma, tau, iterations, estimator: Any = "sampled"):
+    """CSAC's own equations, exactly: yields (Q_k, log π_k, V_k).
+
+    The actor descends towards π_k with π_(k-1) as its reference, and the critic's target is taken with π_k against
+    π_(k-1).
+    """
+    algorithm = CSAC(
+        entropy_weight=sigma,
+        relative_entropy_weight=tau,
+        relative_entropy_estimator=estimator,
+        discount=DISCOUNT,
+    )
 
     @jax.jit
     def step(q, log_before):
-        log_policy = improve(q, log_before, sigma, tau)
-        value = expected_value(q, log_policy, log_before, sigma, tau)
-        return log_policy, value, REWARD + DISCOUNT * DYNAMICS @ value
+        log_policy = improve(algorithm, log_before, q)
+        value = -expected_loss(algorithm, log_policy, log_before, q)
+        return log_policy, value, expected_target(algorithm, log_policy, log_before, q)
 
     with jax.enable_x64(True):
         q, log_policy = jnp.array(FIRST_Q), jnp.array(FIRST_POLICY)
@@ -215,30 +311,37 @@ def soft_value_iteration(sigma):
     return q
 
 
+@pytest.mark.usefixtures("tables")
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize(("sigma", "tau"), [(0.2, 0.5), (0.5, 0.05), (0.2, 5.0), (0.0, 0.5), (0.2, 0.0)])
-def test_the_equations_are_conservative_value_iteration(sigma, tau):
+def test_target_and_loss_are_conservative_value_iteration(sigma, tau, estimator):
     # CVI (Kozuno et al. 2019) knows only preferences P, with m P = (1/β) log Σ exp(βP):
     #   P_(k+1) = r + γ E[m P_k] + α (P_k - m P_k), from P_0 = τ log π_(-1) + Q_0,
     # its policy is π_k ∝ exp(βP_k) and its value m P_k. With σ = 0, α = 1: that is DPP. With τ = 0, α = 0: SAC.
     alpha, beta = tau / (tau + sigma), 1.0 / (tau + sigma)
-    preference = tau * FIRST_POLICY + FIRST_Q
-    for _, log_policy, value in iterate(sigma, tau, 40):
+    log_before, preference = FIRST_POLICY, tau * FIRST_POLICY + FIRST_Q
+    for q, log_policy, value in iterate(sigma, tau, 40, estimator):
+        np.testing.assert_allclose(q, preference - tau * log_before, atol=1e-9)
         soft_maximum = logsumexp(beta * preference, axis=1) / beta
         np.testing.assert_allclose(np.exp(log_policy), softmax(beta * preference, axis=1), atol=1e-9)
         np.testing.assert_allclose(value, soft_maximum, atol=1e-9)
+        log_before = log_policy
         preference = REWARD + DISCOUNT * DYNAMICS @ soft_maximum + alpha * (preference - soft_maximum[:, None])
 
 
+@pytest.mark.usefixtures("tables")
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("tau", [0.0, 0.05, 0.5, 5.0])
-def test_the_fixed_point_is_that_of_sac_whatever_the_relative_entropy_weighs(tau):
+def test_the_fixed_point_is_that_of_sac_whatever_the_relative_entropy_weighs(tau, estimator):
     # At a fixed point π^(1-α) ∝ exp(βQ), and β / (1 - α) = 1/σ; the log-ratio is zero. α is 0.96 for τ = 5.
     sigma = 0.2
-    *_, (q, log_policy, _) = iterate(sigma, tau, 1000)
+    *_, (q, log_policy, _) = iterate(sigma, tau, 1000, estimator)
     expected = soft_value_iteration(sigma)
     np.testing.assert_allclose(q, expected, atol=1e-8)
     np.testing.assert_allclose(np.exp(log_policy), softmax(expected / sigma, axis=1), atol=1e-8)
 
 
+@pytest.mark.usefixtures("tables")
 def test_relative_entropy_slows_the_policy_down():
     """With a larger weight the policy has moved less from its start after a few iterations."""
 
@@ -249,6 +352,7 @@ def test_relative_entropy_slows_the_policy_down():
     assert moved(50.0) < moved(5.0) < moved(0.5)
 
 
+@pytest.mark.usefixtures("tables")
 def test_dynamic_policy_programming_finds_the_optimal_policy():
     q = np.zeros((STATES, ACTIONS))
     for _ in range(500):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
 from csac.algorithms import ALGORITHMS, CSAC, SAC
@@ -56,6 +59,40 @@ def test_the_edges_of_the_ranges_are_accepted():
     CSAC(reference_period=1, batch_size=1, replay_size=1, warmup_steps=0, max_gradient_norm=0, actor_hidden_sizes=())
     SAC(target_entropy=None)
     SAC(target_entropy=-3, temperature="fixed", entropy_weight=0)
+
+
+def test_numbers_of_numpy_are_numbers():
+    given: dict[str, Any] = {
+        "discount": np.float32(0.5),
+        "target_rate": np.float64(0.25),
+        "batch_size": np.int64(8),
+        "max_gradient_norm": np.int32(1),
+        "actor_hidden_sizes": [np.int64(8), 4],
+        "temperature": np.str_("fixed"),
+        "target_entropy": np.float16(-2),
+    }
+    ours, plain = SAC(**given), SAC("fixed", 1.0, -2.0, 0.5, 0.25, actor_hidden_sizes=(8, 4), batch_size=8)
+    assert ours == dataclasses.replace(plain, max_gradient_norm=1)
+    assert json.loads(json.dumps(vars(ours)))["discount"] == 0.5  # as the manifest holds it
+    assert hash(ours) is not None  # a static argument of compiled programs
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("discount", np.float32("nan"), "a finite number, not nan"),
+        ("discount", np.float64(1.5), "less than 1, not 1.5"),
+        ("discount", np.True_, "a finite number, not True"),
+        ("discount", np.array([0.5]), "a finite number"),
+        ("batch_size", np.float64(8), "a whole number, not 8.0"),
+        ("actor_hidden_sizes", (np.int64(0),), "at least 1"),
+        ("actor_hidden_sizes", np.array([8, 8]), "a tuple"),
+    ],
+)
+def test_bad_values_of_numpy_are_refused(name, value, words):
+    settings: dict[str, Any] = {name: value}
+    with pytest.raises(InputError, match=words):
+        SAC(**settings)
 
 
 def test_an_automatic_temperature_cannot_begin_at_zero():

@@ -15,7 +15,8 @@ import scipy.stats
 
 from csac.algorithms import PPO
 from csac.algorithms.distributions import Gaussian
-from csac.algorithms.ppo import Sample, State, Statistics, explained_variance, policy_at
+from csac.algorithms.ppo import Sample, State, explained_variance, policy_at
+from csac.algorithms.statistics import Statistics
 from csac.types import InputError, Normaliser, Spec, Transition
 
 if TYPE_CHECKING:
@@ -228,7 +229,7 @@ def test_linear_learning_rate():
     assert float(update(SMALL, state, rollout(range(8)), 5)[1]["learning_rate"]) == pytest.approx(1.5e-4)
     constant = replace(SMALL, learning_rate_schedule="constant")
     assert float(constant.learning_rate_at(jnp.int32(9), state.total_updates)) == pytest.approx(3e-4)
-    assert (SMALL.has_schedule, constant.has_schedule) == (True, False)
+    assert (SMALL.cadence.has_schedule, constant.cadence.has_schedule) == (True, False)
 
 
 def test_a_step_is_as_long_as_the_learning_rate_says():

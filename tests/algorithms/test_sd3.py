@@ -126,7 +126,9 @@ def weighted(values: list[float], weights: list[float]) -> float:
 )
 def test_the_critic_target(settings, terminated, truncated, value):
     step = transition(terminated=terminated, truncated=truncated)
-    target = SD3(discount=0.9, **settings).critic_target(always(0.6), TARGET_CRITICS, step, NOISE)
+    target = SD3(discount=0.9, **settings).critic_target(
+        step, NOISE, target_actor=always(0.6), target_critics=TARGET_CRITICS
+    )
     assert float(target) == pytest.approx(2.0 + 0.9 * value, abs=1e-5)
 
 
@@ -134,7 +136,7 @@ def test_the_losses_are_those_of_one_pair():
     # Q(1, 0.5) = 1 + 2·0.5 = 2 with target 3, and Q(1, 0.3) = 1.6.
     loss, metrics = critic_loss(TARGET_CRITICS[0], transition(), jnp.float32(3.0))
     assert (float(loss), float(metrics["q_mean"])) == pytest.approx((1.0, 2.0))
-    assert float(actor_loss(always(0.3), TARGET_CRITICS[0], jnp.ones(1))) == pytest.approx(-1.6)
+    assert float(actor_loss(always(0.3), jnp.ones(1), critic=TARGET_CRITICS[0])[0]) == pytest.approx(-1.6)
 
 
 def pair(algorithm: SD3, target_value: float) -> Pair:
@@ -181,8 +183,8 @@ def test_the_second_pair_sees_the_new_target_of_the_first():
 
 def test_an_update_is_given_a_batch_for_each_pair():
     algorithm = SD3(batch_size=32, **LINEAR)
-    assert algorithm.transitions_per_update == 64
-    assert SD3().transitions_per_update == 512
+    assert algorithm.cadence.transitions_per_update == 64
+    assert SD3().cadence.transitions_per_update == 512
 
 
 def test_targets_in_groups_are_in_their_places(monkeypatch):

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from csac.algorithms.critics import critic_loss
 from csac.algorithms.networks import MLP
-from csac.algorithms.td3 import TD3, actor_loss, critic_loss
+from csac.algorithms.td3 import TD3
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.types import InputError, Layer, Spec, Transition
@@ -85,7 +86,9 @@ def test_target_actions_are_smoothed_and_clipped_twice(action, noise, expected):
 )
 def test_the_critic_target(noise, terminated, truncated, expected):
     step = transition(terminated=terminated, truncated=truncated)
-    target = TD3(discount=0.9).critic_target(always(0.3), TARGET_CRITICS, step, jnp.array([noise]))
+    target = TD3(discount=0.9).critic_target(
+        step, jnp.array([noise]), target_actor=always(0.3), target_critics=TARGET_CRITICS
+    )
     assert float(target) == pytest.approx(expected, abs=1e-5)
 
 
@@ -93,8 +96,9 @@ def test_the_losses():
     # Q₁(1, 0.5) = 2 and Q₂(1, 0.5) = 2.5 with target 3: 1² + 0.5². The actor gets Q₁ at 0.8 too, where Q₂ is smaller.
     loss, metrics = critic_loss(TARGET_CRITICS, transition(), jnp.float32(3.0))
     assert (float(loss), float(metrics["q_mean"])) == pytest.approx((1.25, 2.0))
-    assert float(actor_loss(always(0.3), TARGET_CRITICS, jnp.ones(1))) == pytest.approx(-1.6)
-    assert float(actor_loss(always(0.8), TARGET_CRITICS, jnp.ones(1))) == pytest.approx(-2.6)
+    for action, expected in ((0.3, -1.6), (0.8, -2.6)):
+        loss, _ = TD3().actor_loss(always(action), jnp.ones(1), critics=TARGET_CRITICS)
+        assert float(loss) == pytest.approx(expected)
 
 
 def linear_state(algorithm: TD3):

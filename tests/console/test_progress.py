@@ -16,6 +16,7 @@ from csac.console.tables import (
     short,
 )
 from csac.evaluation.evaluator import EvaluationEpisode
+from csac.record.manifest import Manifest, State
 from csac.record.run import RunDirectory
 
 DIRECTORY = "runs/Hopper-v4/csac/now"
@@ -58,20 +59,20 @@ def lines(console):
     return console.file.getvalue().splitlines()
 
 
-def make_run(path, returns, failures=(), state="finished"):
+def make_run(path, returns, failures=(), state: State = "finished"):
     """A run whose evaluations at 10, 20, ... have one episode each, with `returns` [seed][point], and two episodes."""
     steps_done = 10 * max(len(line) for line in returns)
     run = RunDirectory.create(
         path,
-        {
-            "task": "Hopper-v4",
-            "algorithm": "csac",
-            "seeds": list(range(len(returns))),
-            "steps": 1000,
-            "steps_done": steps_done,
-            "state": state,
-            "failures": dict.fromkeys(failures, "step 20: reward is nan"),
-        },
+        Manifest(
+            task="Hopper-v4",
+            algorithm="csac",
+            seeds=tuple(range(len(returns))),
+            steps=1000,
+            steps_done=steps_done,
+            state=state,
+            failures=dict.fromkeys(failures, "step 20: reward is nan"),
+        ),
     )
     rows = [
         {"seed": seed, "step": 10 * (point + 1), "episode": 0, "return": value, "length": 7, "success": None}
@@ -295,7 +296,7 @@ def test_a_return_of_nothing_has_no_share_and_is_in_the_other_means(tmp_path):
 
 
 def test_a_failed_seed_is_shown_and_not_in_the_mean_of_what_it_cost(tmp_path):
-    run = make_run(tmp_path / "run", [[10.0, 5.0, 9.0], [20.0, 10.0, 18.0], [30.0, 1.0]], failures=["2"])
+    run = make_run(tmp_path / "run", [[10.0, 5.0, 9.0], [20.0, 10.0, 18.0], [30.0, 1.0]], failures=[2])
     run.update_manifest(perturbations=["friction=1.5@10"])
     (table,) = (text_of(table) for table in recovery_tables(run))
     assert [line.split()[0] for line in table[2:]] == ["0", "1", "2", "mean", "±"]
@@ -324,7 +325,7 @@ def test_evaluations_are_summed_up_per_seed():
 def test_runs_are_listed_with_what_is_known_of_them(tmp_path):
     done = make_run(tmp_path / "a", [[1.0, 4.0], [2.0, 8.0]])
     new = RunDirectory.create(
-        tmp_path / "b", {"task": "Ant-v4", "algorithm": "sac", "seeds": [0], "steps": 2_500_000, "state": "running"}
+        tmp_path / "b", Manifest(task="Ant-v4", algorithm="sac", seeds=(0,), steps=2_500_000, state="running")
     )
     damaged = make_run(tmp_path / "c", [[1.0]])
     (damaged.path / "evaluations.csv").write_text("not a table\n")

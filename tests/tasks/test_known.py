@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import runpy
 import shlex
@@ -29,6 +30,7 @@ from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, _number
 from csac.evaluation.play import evaluate_run
 from csac.evaluation.pool import EvaluationPool, choose_processes
+from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.record.tables import read_rows
 from csac.tasks import known
@@ -71,8 +73,16 @@ def policy_for(task: str, width: int = 8, seed: int = 0) -> Policy:
 
 def make_run(path: Path, task: str, events: tuple[str, ...] = (), seeds: tuple[int, ...] = (0,), arguments: Any = None):
     """A finished run with a random policy for each seed."""
-    manifest = {"task": task, "algorithm": "sac", "seeds": list(seeds), "steps": 9, "steps_done": 9}
-    run = RunDirectory.create(path, {**manifest, "events": list(events), "environment_arguments": arguments or {}})
+    manifest = Manifest(
+        task=task,
+        algorithm="sac",
+        seeds=seeds,
+        steps=9,
+        steps_done=9,
+        events=events,
+        environment_arguments=arguments or {},
+    )
+    run = RunDirectory.create(path, manifest)
     (path / "policy").mkdir()
     for seed in seeds:
         policy = policy_for(task, seed=seed)
@@ -280,18 +290,18 @@ def test_silence_is_not_asked_of_other_tasks():
 @pytest.mark.parametrize(("task", "inputs"), [(QUAD, 27), (REACH, 12)])
 def test_a_robots_run_is_stopped_and_goes_on(tmp_path, task, inputs):
     run = train(TINY, task, steps=40, directory=tmp_path / "run", **SHORT)
-    assert run.manifest["events"] == list(known.events_of(task))
-    assert run.manifest["inexact_seeds"] == [0]
-    assert {"pybullet"} <= run.manifest["versions"].keys()
+    assert run.manifest.events == list(known.events_of(task))
+    assert run.manifest.inexact_seeds == [0]
+    assert {"pybullet"} <= run.manifest.versions.keys()
     before = run.evaluations
 
     reporter = Notes()
     grown = resume(tmp_path / "run", steps=60, reporter=reporter)
 
     assert "note: this task cannot be saved in mid-episode: seeds 0 begin their episode anew" in reporter.notes
-    assert (grown.manifest["state"], grown.manifest["steps_done"]) == ("finished", 60)
-    assert grown.manifest["history"][0]["exact"] is False
-    assert grown.manifest["events"] == run.manifest["events"]
+    assert (grown.manifest.state, grown.manifest.steps_done) == ("finished", 60)
+    assert grown.manifest.history[0].exact is False
+    assert grown.manifest.events == run.manifest.events
     rows = grown.evaluations
     assert rows.dtype.names == before.dtype.names
     for name in before.dtype.names or ():  # one by one: the NaN of a record equals nothing
@@ -406,7 +416,7 @@ def cases(tmp_path_factory):
 
 def test_events_are_columns_after_success(cases):
     run, _ = cases
-    assert run.manifest["events"] == ["crashed", "stops", "nothing"]
+    assert run.manifest.events == ("crashed", "stops", "nothing")
     lines = (run.path / "evaluations.csv").read_text().splitlines()
     assert lines[0] == "seed,step,episode,return,length,success,crashed,stops,nothing"
     expected = []
@@ -438,12 +448,12 @@ def test_a_name_that_nobody_says_is_noted_once(cases):
 def test_events_stay_in_a_longer_run_and_in_a_fork(cases, tmp_path):
     source = cases[0].path
     forked = train(TINY, "probes:Cases-v0", steps=60, directory=tmp_path / "fork", start_from=source, **SHORT)
-    assert forked.manifest["events"] == ["crashed", "stops", "nothing"]
+    assert forked.manifest.events == ("crashed", "stops", "nothing")
     assert forked.evaluations.dtype.names == cases[0].evaluations.dtype.names
     assert len(forked.evaluations) == 6
     grown = resume(tmp_path / "fork", steps=80)
     assert len(grown.evaluations) == 8
-    assert grown.manifest["events"] == ["crashed", "stops", "nothing"]
+    assert grown.manifest.events == ("crashed", "stops", "nothing")
     for change, events in (({"start_from": source, "directory": tmp_path / "x"}, ["stops"]), ({"resume": True}, [])):
         arguments = {"directory": tmp_path / "fork", "steps": 80, **SHORT, **change}
         with pytest.raises(InputError, match=r"events is \['crashed', 'stops', 'nothing'\], not \["):
@@ -452,9 +462,11 @@ def test_events_stay_in_a_longer_run_and_in_a_fork(cases, tmp_path):
 
 def test_a_run_of_a_csac_that_knew_no_events_goes_on(cases, tmp_path):
     run = train(TINY, "probes:Endless-v0", steps=20, directory=tmp_path / "run", **SHORT)
-    del run.manifest["events"]
-    run.update_manifest()
-    assert resume(run.path, steps=40).manifest["state"] == "finished"
+    path = run.path / "manifest.json"
+    older = json.loads(path.read_text())
+    del older["events"]
+    path.write_text(json.dumps(older))
+    assert resume(run.path, steps=40).manifest.state == "finished"
 
 
 def test_the_report_says_how_the_last_episodes_ended(cases, capsys):
@@ -681,7 +693,7 @@ def test_the_example_of_the_documentation_runs(tmp_path, capsys, monkeypatch):
     example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "own_task.py"))
     example["main"](tmp_path / "run", 600)
     run = RunDirectory.open(tmp_path / "run")
-    assert run.manifest["events"] == ["off_the_rail", "reversals"]
+    assert run.manifest.events == ["off_the_rail", "reversals"]
     assert (run.evaluations.dtype.names or ())[-3:] == ("success", "off_the_rail", "reversals")
-    assert run.manifest["inexact_seeds"] == []
+    assert run.manifest.inexact_seeds == []
     assert capsys.readouterr().out.startswith("success ")

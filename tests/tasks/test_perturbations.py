@@ -23,6 +23,7 @@ from trajectories import steps_of
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy, load
 from csac.evaluation.evaluator import Evaluator, evaluate
+from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import Perturbation, by_step, continued, lasting, perturbations_of, refuse_late, values_at
@@ -578,7 +579,7 @@ def test_the_beginning_is_perturbed_from_the_first_observation(tmp_path):
 
 
 def test_two_groups_tell_once_and_in_order(tmp_path):
-    manifest = {"task": "Hopper-v4", "algorithm": "csac", "seeds": [0, 1], "steps": 900}
+    manifest = Manifest(task="Hopper-v4", algorithm="csac", seeds=(0, 1), steps=900)
     record = RunDirectory.create(tmp_path / "run", manifest)
     recorder = Recorder(record, [[0], [1]], None, None, perturbations=[(0, "mass x 2"), (300, "friction x 2")])
 
@@ -603,7 +604,7 @@ def test_two_groups_tell_once_and_in_order(tmp_path):
 
 
 def test_what_a_run_does_not_reach_is_not_told(tmp_path):
-    manifest = {"task": "Hopper-v4", "algorithm": "csac", "seeds": [0], "steps": 900}
+    manifest = Manifest(task="Hopper-v4", algorithm="csac", seeds=(0,), steps=900)
     record = RunDirectory.create(tmp_path / "run", manifest)
     recorder = Recorder(record, [[0]], None, None, perturbations=[(300, "friction x 2")])
     recorder.handle(0, messages.Ended(300, {}))
@@ -638,7 +639,7 @@ def test_a_run_is_the_same_until_it_is_perturbed(plain, perturbed):
 
 
 def test_a_run_says_what_it_was_perturbed_by(perturbed):
-    assert perturbed.manifest["perturbations"] == [
+    assert perturbed.manifest.perturbations == [
         "friction=2@200",
         "observation_noise=0.05@200",
         "mass=1.5@250",
@@ -669,7 +670,7 @@ def test_a_perturbed_run_that_crashed_goes_on_and_leaves_the_same_files(tmp_path
     with pytest.raises(Crash):
         run(tmp_path / "run", perturbations=GIVEN, on_evaluation=crash_at(crash + 50), **LONG)
     finished = resume(tmp_path / "run")
-    assert finished.manifest["history"][0]["step"] == crash // 100 * 100
+    assert finished.manifest.history[0].step == crash // 100 * 100
     assert contents(tmp_path / "run") == contents(perturbed.path)
     curves = [(path / "curve.png").read_bytes() for path in (tmp_path / "run", perturbed.path)]
     assert curves[0] == curves[1]
@@ -679,10 +680,9 @@ def test_a_perturbed_run_that_crashed_goes_on_and_leaves_the_same_files(tmp_path
 def test_a_fork_that_is_perturbed_equals_a_run_that_was_from_the_start(tmp_path, plain, perturbed, step):
     forked = run(tmp_path / "run", start_from=f"{plain.path}@{step}", perturbations=GIVEN, **LONG)
     assert contents(forked.path) == contents(perturbed.path)
-    assert forked.manifest["perturbations"] == perturbed.manifest["perturbations"]
-    assert forked.manifest["forked_from"]["changes"] == [
-        f"perturbations is [], not {perturbed.manifest['perturbations']!r}"
-    ]
+    assert forked.manifest.perturbations == perturbed.manifest.perturbations
+    changes = (f"perturbations is [], not {list(perturbed.manifest.perturbations)!r}",)
+    assert forked.manifest.forked_from == Origin(str(plain.path), step, changes)
 
 
 def test_a_fork_that_is_not_perturbed_equals_going_on(tmp_path, plain):
@@ -695,12 +695,12 @@ def test_a_fork_of_a_perturbed_run_keeps_what_had_happened(tmp_path, perturbed):
     whole = run(tmp_path / "same", start_from=f"{perturbed.path}@300", **LONG)
     assert contents(whole.path) == contents(perturbed.path)
     other = run(tmp_path / "other", start_from=f"{perturbed.path}@300", perturbations=(), **LONG)
-    assert other.manifest["perturbations"] == perturbed.manifest["perturbations"][:4]
+    assert other.manifest.perturbations == perturbed.manifest.perturbations[:4]
     rows, before = other.evaluations, perturbed.evaluations
     np.testing.assert_array_equal(rows["return"][rows["step"] <= 400], before["return"][before["step"] <= 400])
     assert contents(other.path)["evaluations.csv"] != contents(perturbed.path)["evaluations.csv"]
     again = run(tmp_path / "other", start_from=f"{perturbed.path}@300", resume=True, **LONG)
-    assert again.manifest["perturbations"] == other.manifest["perturbations"]
+    assert again.manifest.perturbations == other.manifest.perturbations
     with pytest.raises(InputError, match=r"friction=1@430 .*the run ends at step 400; was planned in the run"):
         run(tmp_path / "short", start_from=f"{perturbed.path}@300", steps=400)
 
@@ -725,7 +725,7 @@ def test_a_run_from_before_there_were_perturbations_goes_on(tmp_path):
     fields = json.loads(path.read_text())
     del fields["perturbations"]
     path.write_text(json.dumps(fields))
-    assert resume(old.path, steps=70).manifest["steps_done"] == 70
+    assert resume(old.path, steps=70).manifest.steps_done == 70
 
 
 @pytest.mark.parametrize(

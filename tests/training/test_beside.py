@@ -104,10 +104,11 @@ def test_a_run_that_crashed_goes_on_as_if_it_had_not(tmp_path):
             **settings,
         )
     resumed = resume(tmp_path / "run", evaluation_processes=1)
-    assert [entry["step"] for entry in resumed.manifest["history"]] == [260]
+    assert [entry.step for entry in resumed.manifest.history] == [260]
     assert contents(tmp_path / "run") == contents(tmp_path / "whole")
 
 
+@pytest.mark.filterwarnings("ignore:seed . of .* failed at:RuntimeWarning")
 @pytest.mark.parametrize("most", [0.0, -2.0], ids=["one seed fails", "both fail"])
 def test_a_failing_evaluation_stops_its_seed_where_it_would_in_line(tmp_path, most):
     """Their policies differ, so one seed's actions are above 0 sooner. Training goes on until it is known."""

@@ -26,10 +26,12 @@ from csac import cli
 from csac.algorithms import CSAC
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
+from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.record.tensorboard import TensorBoardLog
 from csac.tasks.seeds import SeedEnvironments
 from csac.training.checkpoint import (
+    SCHEMA_VERSION,
     Checkpoint,
     Checkpoints,
     Damaged,
@@ -260,7 +262,7 @@ def forge(place: Path, fields: Any) -> None:
 
 
 def forged(content: bytes, name: str) -> dict[str, Any]:
-    return {"schema_version": 2, "step": 5, "files": {name: facts_of(content)}, "values": {}}
+    return {"schema_version": SCHEMA_VERSION, "step": 5, "files": {name: facts_of(content)}, "values": {}}
 
 
 def facts_of(content: bytes) -> dict[str, Any]:
@@ -443,7 +445,7 @@ def test_what_an_interrupted_write_left_is_removed(tmp_path):
 
 @pytest.fixture
 def recorder(tmp_path):
-    manifest = {"task": "t", "algorithm": "a", "seeds": [0, 1], "steps": 900}
+    manifest = Manifest(task="t", algorithm="a", seeds=(0, 1), steps=900)
     run = RunDirectory.create(tmp_path / "run", manifest)
     return Recorder(run, [[0], [1]], None, None, Checkpoints(tmp_path / "run" / "checkpoint", 2))
 
@@ -569,6 +571,7 @@ TRAIN = [
     *("--evaluation-interval", "100", "--evaluation-episodes", "1", "--checkpoint-interval", "100"),
 ]
 SHORT: dict[str, Any] = {"steps": 400, "evaluation_interval": 100, "evaluation_episodes": 1, "checkpoint_interval": 100}
+LONGER: dict[str, Any] = {**SHORT, "steps": 500}
 
 
 def tables(run: Path) -> dict[str, bytes]:
@@ -625,7 +628,7 @@ def test_a_full_disk_ends_the_run_and_it_goes_on_later(tmp_path, uninterrupted, 
     check_one_clear_line(capsys, path, "No space left on device")
     assert max(steps_in(path / "checkpoint")) == begin
     assert not [name for name in path.rglob(".*") if name.name != ".lock"]
-    assert resume(path).manifest["history"][0]["step"] == begin
+    assert resume(path).manifest.history[0].step == begin
     assert tables(path) == uninterrupted
 
 
@@ -661,7 +664,7 @@ def consume(items: Iterable[Any]) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX permissions")
 def test_a_run_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
-    RunDirectory.create(tmp_path / "run", {"task": "t", "algorithm": "a", "seeds": [0], "steps": 1})
+    run = RunDirectory.create(tmp_path / "run", Manifest(task="t", algorithm="a", seeds=(0,), steps=1))
 
     def read_only(*_: Any) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
@@ -669,7 +672,7 @@ def test_a_run_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("builtins.open", read_only)
     with (
         pytest.raises(InputError, match=r"cannot write to .*run: Read-only file system"),
-        RunDirectory(tmp_path / "run", {}).locked(),
+        run.locked(),
     ):
         pass
 
@@ -681,7 +684,7 @@ def test_a_run_killed_while_it_was_created_can_be_created(tmp_path):
     """Its manifest has its name once it is whole: before, there are only hidden files."""
     for left_over in (".manifest.json.4711.new", "..manifest.json.4711.new.4711"):
         (tmp_path / left_over).write_bytes(b"{")
-    RunDirectory.create(tmp_path, {"task": "t", "algorithm": "a", "seeds": [0], "steps": 1})
+    RunDirectory.create(tmp_path, Manifest(task="t", algorithm="a", seeds=(0,), steps=1))
 
 
 def test_a_manifest_is_never_seen_empty(tmp_path, monkeypatch):
@@ -691,7 +694,7 @@ def test_a_manifest_is_never_seen_empty(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", killed)
     with pytest.raises(KeyboardInterrupt):
-        RunDirectory.create(tmp_path / "run", {"task": "t", "algorithm": "a", "seeds": [0], "steps": 1})
+        RunDirectory.create(tmp_path / "run", Manifest(task="t", algorithm="a", seeds=(0,), steps=1))
 
 
 def test_a_fork_killed_before_it_had_its_checkpoint_does_not_begin_from_nothing(tmp_path, monkeypatch):
@@ -708,7 +711,7 @@ def test_a_fork_killed_before_it_had_its_checkpoint_does_not_begin_from_nothing(
                 "Hopper-v4",
                 directory=tmp_path / "fork",
                 start_from=first.path,
-                **{**SHORT, "steps": 500},
+                **LONGER,
             )
     with pytest.raises(InputError, match="remove it and train --from again"):
         resume(tmp_path / "fork")
@@ -716,7 +719,7 @@ def test_a_fork_killed_before_it_had_its_checkpoint_does_not_begin_from_nothing(
 
 def test_a_fork_that_wants_no_checkpoints_begins_with_one_all_the_same(tmp_path):
     first = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "first", **SHORT)
-    plain = {**SHORT, "steps": 500, "checkpoint_interval": 0}
+    plain: dict[str, Any] = {**LONGER, "checkpoint_interval": 0}
     fork = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "fork", start_from=first.path, **plain)
     resume(first.path, steps=500)
     assert tables(fork.path) == tables(first.path)
@@ -730,7 +733,7 @@ def test_a_stranger_s_checkpoint_is_refused_in_one_line(tmp_path):
         files = SeedFiles(place, 0, {}).write(step, Snapshot({"learner.x": np.zeros(2)}, {"learner": []}), ring(4, 0))
         Checkpoints(place, 0).commit(step, files, {})
     with pytest.raises(InputError, match="no such array"):
-        train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "fork", start_from=first.path, **{**SHORT, "steps": 500})
+        train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "fork", start_from=first.path, **LONGER)
     with pytest.raises(InputError, match=r"step_400\.json is not what csac writes"):
         resume(first.path, steps=500)
 

@@ -26,8 +26,8 @@ THRESHOLD = -250.0
 
 
 class Climbing(CSAC):
-    def actor_loss(self, *arguments):
-        loss, metrics = super().actor_loss(*arguments)
+    def actor_loss(self, *arguments, **networks):
+        loss, metrics = super().actor_loss(*arguments, **networks)
         return -loss, metrics
 
 

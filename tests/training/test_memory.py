@@ -16,7 +16,7 @@ from trainer import run
 from csac.algorithms import CSAC, SAC
 from csac.algorithms.memory import Replay, Rollout, pack, row_width, unpack
 from csac.tasks.seeds import training_seed
-from csac.types import Layer, PolicyNetwork, PolicyParameters, Spec, Transition
+from csac.types import Cadence, Layer, PolicyNetwork, PolicyParameters, Spec, Transition
 
 SPEC = Spec(2, 1)
 
@@ -103,12 +103,11 @@ class Watcher:
     updates_per_interval: int = 2
     batch_size: int = 16
     update_interval: int = 1
-    has_schedule = False
     name: ClassVar[str] = "watcher"
 
     @property
-    def transitions_per_update(self):
-        return self.batch_size
+    def cadence(self):
+        return Cadence(self.warmup_steps, self.update_interval, self.updates_per_interval, self.batch_size)
 
     def memory(self, spec, steps):
         return Replay.create(steps, spec, self.update_interval)

@@ -12,8 +12,8 @@ import pytest
 from trainer import run
 
 from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
+from csac.algorithms.critics import q_values
 from csac.algorithms.distributions import TanhGaussian, policy_at
-from csac.algorithms.networks import q_values
 from csac.algorithms.ppo import value_at
 
 DISCOUNT = 0.9

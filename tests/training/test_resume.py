@@ -18,6 +18,7 @@ import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
 from resuming import LEARNERS, ROLLOUT, Crash, contents, crash_at, run
 
+from csac.record.manifest import Origin
 from csac.record.run import RunDirectory
 from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, steps_in
@@ -38,11 +39,12 @@ def advance(group: Group, until: int) -> list[messages.GroupMessage]:
 
 def everything(group: Group) -> list[np.ndarray]:
     """What a group has learnt, remembers and does next."""
-    leaves = jax.tree.leaves(group.learner._carry)
-    return [np.asarray(leaf) for leaf in leaves] + [group._actions, group._observations, group.learner._waiting]
+    learner, seeds = group.learner, range(len(group.seeds))
+    leaves = jax.tree.leaves([(learner.carry(index), learner.waiting(index)) for index in seeds])
+    return [*leaves, group._actions, group._observations]
 
 
-@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda learner: f"{learner.name}-{learner.update_interval}")
+@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda learner: f"{learner.name}-{learner.cadence.update_interval}")
 def test_a_group_goes_on_bit_for_bit(tmp_path, algorithm):
     check_that_a_group_goes_on(tmp_path, algorithm, (3,))
 
@@ -87,8 +89,8 @@ def test_seeds_may_be_grouped_otherwise(tmp_path):
     alone = group(tmp_path, LEARNERS[0], (4,), 300, begin=150)
     advance(together, 170)
     advance(alone, 170)
-    ours = jax.tree.leaves(alone.learner._carry[0])
-    theirs = [leaf[1] for leaf in jax.tree.leaves(together.learner._carry[0])]
+    ours = jax.tree.leaves(alone.learner.carry(0).state)
+    theirs = jax.tree.leaves(together.learner.carry(1).state)
     for our, their in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(our, their, rtol=1e-3, atol=1e-5)
 
@@ -120,9 +122,9 @@ def test_a_crashed_run_goes_on_and_leaves_the_same_files(tmp_path, uninterrupted
     assert len(contents(tmp_path / "run")["evaluations.csv"]) > 0
     finished = resume(tmp_path / "run")
     assert contents(tmp_path / "run") == uninterrupted
-    assert finished.manifest["state"] == "finished"
-    (entry,) = finished.manifest["history"]
-    assert (entry["step"], entry["exact"], entry["complaints"]) == (240, True, [])
+    assert finished.manifest.state == "finished"
+    (entry,) = finished.manifest.history
+    assert (entry.step, entry.exact, entry.complaints) == (240, True, ())
 
 
 def test_the_same_call_again_with_resume_goes_on(tmp_path, uninterrupted):
@@ -142,7 +144,7 @@ def test_a_run_that_crashed_after_its_last_checkpoint_is_finished(tmp_path, unin
         with pytest.raises(Crash):
             run(tmp_path / "run")
     assert steps_in(tmp_path / "run" / "checkpoint") == [480, 500]
-    assert resume(tmp_path / "run").manifest["state"] == "finished"
+    assert resume(tmp_path / "run").manifest.state == "finished"
     assert contents(tmp_path / "run") == uninterrupted
     assert (tmp_path / "run" / "curve.png").exists()
 
@@ -152,15 +154,27 @@ def test_a_signal_that_comes_too_late_stops_nothing(tmp_path, uninterrupted):
         if step == 500:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    assert run(tmp_path / "run", on_evaluation=send).manifest["state"] == "finished"
+    assert run(tmp_path / "run", on_evaluation=send).manifest.state == "finished"
     assert contents(tmp_path / "run") == uninterrupted
 
 
 def test_a_run_that_crashed_before_its_first_checkpoint_begins_anew(tmp_path, uninterrupted):
     with pytest.raises(Crash):
         run(tmp_path / "run", on_evaluation=crash_at(100))
-    assert resume(tmp_path / "run").manifest["history"][0]["step"] == 0
+    assert resume(tmp_path / "run").manifest.history[0].step == 0
     assert contents(tmp_path / "run") == uninterrupted
+
+
+def test_results_without_a_checkpoint_are_not_thrown_away(tmp_path, finished):
+    """Neither where the checkpoints were removed nor where there were to be none."""
+    shutil.rmtree(finished / "checkpoint")
+    run(tmp_path / "none", steps=130, checkpoint_interval=0)
+    for path in (finished, tmp_path / "none"):
+        before = contents(path)
+        with pytest.raises(InputError, match="has results and no checkpoint to go on from"):
+            resume(path, steps=200)
+        assert contents(path) == before
+        assert len(RunDirectory.open(path).rows("metrics"))
 
 
 def test_more_steps_go_on_where_the_run_ended(tmp_path):
@@ -175,10 +189,10 @@ def test_more_steps_go_on_where_the_run_ended(tmp_path):
 
 def test_a_run_from_before_there_were_update_intervals_goes_on(tmp_path):
     older = run(tmp_path / "run", steps=120)
-    hyperparameters = dict(older.manifest["hyperparameters"])
+    hyperparameters = dict(older.manifest.hyperparameters)
     assert hyperparameters.pop("update_interval") == 1
     older.update_manifest(hyperparameters=hyperparameters)
-    assert resume(tmp_path / "run", steps=130).manifest["steps_done"] == 130
+    assert resume(tmp_path / "run", steps=130).manifest.steps_done == 130
     with pytest.raises(InputError, match="update_interval is 1, not 5"):
         run(tmp_path / "run", replace(LEARNERS[0], update_interval=5), steps=130, resume=True)
 
@@ -193,8 +207,8 @@ def test_an_episode_that_cannot_be_saved_is_said(tmp_path):
     with pytest.raises(Crash):
         run(tmp_path / "run", task="Pendulum-v1", on_evaluation=crash_at(300))
     finished = resume(tmp_path / "run")
-    assert finished.manifest["inexact_seeds"] == [0]
-    assert not finished.manifest["history"][0]["exact"]
+    assert finished.manifest.inexact_seeds == (0,)
+    assert not finished.manifest.history[0].exact
 
 
 def test_a_failed_seed_stays_failed_and_the_others_go_on(tmp_path):
@@ -208,9 +222,10 @@ def test_a_failed_seed_stays_failed_and_the_others_go_on(tmp_path):
             environment_arguments=arguments,
             on_evaluation=crash_at(300),
         )
-    finished = resume(tmp_path / "run")
-    assert list(finished.manifest["failures"]) == ["0"]
-    assert finished.manifest["failures"]["0"].startswith("step 130: step raised")
+    with pytest.warns(RuntimeWarning, match=r"seed 0 of .*run failed at step 130: step raised"):
+        finished = resume(tmp_path / "run")
+    assert list(finished.manifest.failures) == [0]
+    assert finished.manifest.failures[0].startswith("step 130: step raised")
     evaluations = finished.evaluations
     assert evaluations["step"][evaluations["seed"] == 1].max() == 500
     assert evaluations["step"][evaluations["seed"] == 0].max() == 100
@@ -264,9 +279,9 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(tmp_path, unin
     folder = tmp_path / "run" / "checkpoint"
     assert steps_in(folder) == [240, 360]
     flip(folder / "step_360.seed_0.safetensors")
-    entry = resume(tmp_path / "run").manifest["history"][0]
-    assert entry["step"] == 240
-    assert "step_360.seed_0.safetensors has changed" in entry["complaints"][0]
+    entry = resume(tmp_path / "run").manifest.history[0]
+    assert entry.step == 240
+    assert "step_360.seed_0.safetensors has changed" in entry.complaints[0]
     assert contents(tmp_path / "run") == uninterrupted
 
 
@@ -295,9 +310,9 @@ def test_a_table_that_was_changed_is_told_of_and_restored(tmp_path, finished, sp
     before = path.read_bytes()
     path.write_bytes(spoil(before))
     assert path.read_bytes() != before
-    (entry,) = resume(finished, steps=200).manifest["history"]
-    assert entry["complaints"] == [f"{path} had changed since the checkpoint; it is restored"]
-    assert entry["exact"]
+    (entry,) = resume(finished, steps=200).manifest.history
+    assert entry.complaints == [f"{path} had changed since the checkpoint; it is restored"]
+    assert entry.exact
     assert path.read_bytes().startswith(before)
 
 
@@ -305,22 +320,22 @@ def test_tables_that_are_gone_come_back(finished):
     before = {path: path.read_bytes() for path in finished.glob("*.csv")}
     for path in before:
         path.unlink()
-    assert len(resume(finished, steps=200).manifest["history"][0]["complaints"]) == len(before) == 3
+    assert len(resume(finished, steps=200).manifest.history[0].complaints) == len(before) == 3
     assert all(path.read_bytes().startswith(content) for path, content in before.items())
 
 
 def test_a_table_s_copy_that_is_damaged_is_not_needed(finished):
     (finished / "checkpoint" / "step_130.evaluations.csv").write_bytes(b"")
-    (entry,) = resume(finished, steps=200).manifest["history"]
-    assert (entry["step"], entry["complaints"]) == (130, [])
+    (entry,) = resume(finished, steps=200).manifest.history
+    assert (entry.step, entry.complaints) == (130, [])
 
 
 def test_a_table_that_is_damaged_with_its_copy_costs_a_checkpoint_and_no_more(tmp_path, finished):
     for path in (finished / "evaluations.csv", finished / "checkpoint" / "step_130.evaluations.csv"):
         path.write_bytes(path.read_bytes()[:-2])
-    (entry,) = resume(finished, steps=200).manifest["history"]
-    assert entry["step"] == 120
-    assert "step_130.evaluations.csv has" in entry["complaints"][0]
+    (entry,) = resume(finished, steps=200).manifest.history
+    assert entry.step == 120
+    assert "step_130.evaluations.csv has" in entry.complaints[0]
     run(tmp_path / "whole", steps=200)
     assert (finished / "evaluations.csv").read_bytes() == (tmp_path / "whole" / "evaluations.csv").read_bytes()
 
@@ -330,8 +345,8 @@ def test_a_best_policy_that_is_damaged_once_comes_back(finished, where):
     best = finished / "policy" / "seed_0.best.safetensors"
     before = best.read_bytes()
     flip(finished / where)
-    (entry,) = resume(finished, steps=140).manifest["history"]
-    assert (entry["step"], entry["complaints"]) == (130, [])
+    (entry,) = resume(finished, steps=140).manifest.history
+    assert (entry.step, entry.complaints) == (130, [])
     assert Checkpoint.open(finished / "checkpoint", 130).read("step_130.seed_0.best.safetensors") == before
 
 
@@ -341,9 +356,9 @@ def test_a_best_policy_that_is_lost_is_followed_by_the_best_of_later_evaluations
     for path in [best, *finished.glob("checkpoint/*.best.safetensors")]:
         flip(path)
     resumed = resume(finished, steps=140)
-    (entry,) = resumed.manifest["history"]
-    assert entry["step"] == 130
-    assert "seed_0.best.safetensors has changed" in entry["complaints"][0]
+    (entry,) = resumed.manifest.history
+    assert entry.step == 130
+    assert "seed_0.best.safetensors has changed" in entry.complaints[0]
     assert best.read_bytes() == (finished / "policy" / "seed_0.safetensors").read_bytes()  # evaluated once since
 
 
@@ -352,9 +367,9 @@ def test_transitions_that_are_damaged_in_one_place_are_mended(tmp_path, finished
     shard = sorted(finished.glob("checkpoint/replay/*.safetensors"))[0]
     before = shard.read_bytes()
     shard.write_bytes(before[:1000] + bytes(4096) + before[5096:])
-    (entry,) = resume(finished, steps=500).manifest["history"]
-    assert (entry["step"], entry["exact"]) == (130, True)
-    assert entry["complaints"] == [f"{shard} was damaged in one place; it is mended from its parity"]
+    (entry,) = resume(finished, steps=500).manifest.history
+    assert (entry.step, entry.exact) == (130, True)
+    assert entry.complaints == [f"{shard} was damaged in one place; it is mended from its parity"]
     assert contents(finished)["policy/seed_0.safetensors"] == uninterrupted["policy/seed_0.safetensors"]
 
 
@@ -400,16 +415,15 @@ def test_a_fork_without_a_change_is_the_same_run(tmp_path, uninterrupted):
     forked = run(tmp_path / "second", steps=500, start_from=f"{tmp_path / 'first'}@240")
     ours, theirs = contents(forked.path), uninterrupted
     assert {name: ours[name] for name in theirs} == theirs
-    assert forked.manifest["forked_from"]["step"] == 240
-    assert forked.manifest["forked_from"]["changes"] == []
+    assert forked.manifest.forked_from == Origin(str(tmp_path / "first"), 240)
 
 
 def test_a_fork_may_change_hyperparameters_and_says_so(tmp_path):
     run(tmp_path / "first", steps=300)
     changed = replace(LEARNERS[0], entropy_weight=0.9)
     forked = run(tmp_path / "second", changed, steps=400, start_from=tmp_path / "first")
-    assert forked.manifest["forked_from"]["changes"] == ["entropy_weight is 0.2, not 0.9"]
-    assert forked.manifest["forked_from"]["step"] == 300
+    changes = ("entropy_weight is 0.2, not 0.9",)
+    assert forked.manifest.forked_from == Origin(str(tmp_path / "first"), 300, changes)
     rows, before = forked.evaluations, RunDirectory.open(tmp_path / "first").evaluations
     np.testing.assert_array_equal(rows["return"][rows["step"] <= 300], before["return"])
     assert rows["step"].max() == 400
@@ -439,7 +453,7 @@ def test_a_run_of_a_function_goes_on_through_train(tmp_path):
         run(tmp_path / "run", task=probes.Endless, on_evaluation=crash_at(200))
     with pytest.raises(InputError, match="a Python function"):
         resume(tmp_path / "run")
-    assert run(tmp_path / "run", task=probes.Endless, resume=True).manifest["state"] == "finished"
+    assert run(tmp_path / "run", task=probes.Endless, resume=True).manifest.state == "finished"
 
 
 def test_a_manifest_that_lacks_something_is_refused(tmp_path, finished):
@@ -447,7 +461,7 @@ def test_a_manifest_that_lacks_something_is_refused(tmp_path, finished):
     fields = json.loads(path.read_text())
     del fields["evaluation"]
     path.write_text(json.dumps(fields))
-    with pytest.raises(InputError, match="does not say how to go on"):
+    with pytest.raises(InputError, match="broken: 'evaluation' is missing"):
         resume(tmp_path / "run", steps=260)
 
 
@@ -456,6 +470,6 @@ def test_a_diverged_seed_names_its_first_bad_array_and_is_not_saved(tmp_path):
     settings = messages.Settings(wild, "Hopper-v4", {}, 300, 1000, 1, tmp_path / "checkpoint", 50)
     told = [message for _, message in run_groups(settings, [[0]], lambda: False)]
     (failed,) = [message for message in told if isinstance(message, messages.Failed)]
-    assert "actor.layers[0].weight is not finite" in failed.reason
+    assert "actor.layers.0.weight is not finite" in failed.reason
     assert 40 <= failed.step <= 50
     assert not [message for message in told if isinstance(message, messages.Saved) and message.step >= failed.step]

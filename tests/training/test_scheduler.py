@@ -22,4 +22,4 @@ def test_a_run_that_has_enough_ends_at_that_very_step(tmp_path, interval):
 
     finished = run(tmp_path / "run", SAC(**SMALL), 500, "Pendulum-v1", evaluation_interval=interval, stop_when=enough)
     assert told == [interval, 2 * interval]
-    assert (finished.manifest["steps_done"], finished.manifest["state"]) == (2 * interval, "finished")
+    assert (finished.manifest.steps_done, finished.manifest.state) == (2 * interval, "finished")

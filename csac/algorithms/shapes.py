@@ -1,0 +1,14 @@
+"""The shapes that equations speak of, for one example and one seed; a name stands for a size."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+Scalar: TypeAlias = Float[Array, ""]
+Scalars: TypeAlias = Float[Array, " n"]
+Observation: TypeAlias = Float[Array, " observation"]
+Action: TypeAlias = Float[Array, " action"]
+Count: TypeAlias = Int[Array, ""]
+Key: TypeAlias = PRNGKeyArray

@@ -1,0 +1,39 @@
+"""Running statistics, by which observations and rewards are brought to a common scale."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from csac.algorithms.shapes import Scalar
+
+# Added to variances and to the spread of advantages, as in SB3 and CleanRL: what never varies is divided by little.
+EPSILON = 1e-8
+
+
+class Statistics(NamedTuple):
+    """Mean and spread of everything absorbed so far; the identity, 0 and 1, before there is any."""
+
+    count: Scalar
+    mean: Float[Array, "..."]
+    variance: Float[Array, "..."]
+    std: Float[Array, "..."]  # sqrt(variance + epsilon), kept because it is needed at every step and changes at few
+
+    @classmethod
+    def create(cls, shape: tuple[int, ...]) -> Statistics:
+        """Return the statistics of nothing."""
+        return cls(jnp.zeros(()), jnp.zeros(shape), jnp.ones(shape), jnp.ones(shape))
+
+    def absorb(self, values: Float[Array, "n ..."]) -> Statistics:
+        """Return the statistics of all values so far and of these (Chan, Golub, LeVeque 1979)."""
+        count = self.count + len(values)
+        shares = self.count / count, len(values) / count
+        # Differences to the old mean, because they are small: little is rounded away where the mean itself is large.
+        differences = jax.vmap(jnp.subtract, in_axes=(0, None))(values, self.mean)
+        shift = jnp.mean(differences, axis=0)
+        within = shares[0] * self.variance + shares[1] * jnp.var(differences, axis=0)
+        variance = within + shares[0] * shares[1] * shift**2
+        return Statistics(count, self.mean + shares[1] * shift, variance, jnp.sqrt(variance + EPSILON))

@@ -1,0 +1,116 @@
+"""The options of a run, checked: each is declared here once, for Python and for the command line. No JAX."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
+
+import numpy as np
+
+from csac.record.manifest import SEED_LIMIT, STEPS_LIMIT
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from csac.tasks.perturbations import Perturbation
+
+MOST_SEEDS = 10_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """How a run is made: the keyword arguments of `train` that are flags of `csac train` as they stand.
+
+    Raises:
+        InputError: a number outside its range.
+    """
+
+    steps: int = 1_000_000
+    """Environment steps per seed, warm-up included."""
+    seeds: int = 1
+    """How many independent seeds to train."""
+    first_seed: int = 0
+    """Label of the first seed; the others follow."""
+    device: Literal["cpu", "gpu"] = "cpu"
+    """Where the networks learn."""
+    evaluation_interval: int = 5_000
+    """Environment steps between two evaluations; there is one at the last step as well."""
+    evaluation_episodes: int = 10
+    """Episodes of each evaluation."""
+    checkpoint_interval: int = 50_000
+    """Environment steps between checkpoints; there is one every ten minutes and at the end as well. 0 makes none."""
+    keep_checkpoints: int = 2
+    """How many of the newest checkpoints to keep; 0 keeps all."""
+
+    def __post_init__(self) -> None:
+        if self.device not in ("cpu", "gpu"):
+            raise InputError(f"device must be cpu or gpu, not {self.device!r}")
+        for name, least, most in (
+            ("steps", 1, STEPS_LIMIT),
+            ("seeds", 1, MOST_SEEDS),
+            ("first_seed", 0, SEED_LIMIT - 1),
+            ("evaluation_interval", 1, STEPS_LIMIT),
+            ("evaluation_episodes", 1, STEPS_LIMIT),
+            ("checkpoint_interval", 0, STEPS_LIMIT),
+            ("keep_checkpoints", 0, STEPS_LIMIT),
+        ):
+            check_whole(name, getattr(self, name), least, most)
+        if self.labels[-1] >= SEED_LIMIT:
+            raise InputError(
+                f"first_seed={self.first_seed} leaves no labels for {self.seeds} seeds: the last is 2^32 - 1"
+            )
+
+    @property
+    def labels(self) -> list[int]:
+        """The labels of the seeds, in order."""
+        return list(range(self.first_seed, self.first_seed + self.seeds))
+
+
+class PlanOptions(TypedDict, total=False):
+    """The keyword arguments of `train` that say what is trained and how, as `Options` and `Plan` explain them."""
+
+    steps: int
+    seeds: int
+    first_seed: int
+    device: Literal["cpu", "gpu"]
+    evaluation_interval: int
+    evaluation_episodes: int
+    checkpoint_interval: int
+    keep_checkpoints: int
+    environment_arguments: dict[str, Any] | None
+    perturbations: str | Perturbation | Iterable[str | Perturbation] | None
+    events: Sequence[str] | None
+    groups: int | None
+    evaluation_processes: int | None
+
+
+def checked_options(given: PlanOptions) -> tuple[Options, dict[str, Any]]:
+    """Return the options that are numbers, checked, and the others as they were given.
+
+    Raises:
+        InputError: there is no option of that name, or a number outside its range.
+    """
+    if unknown := given.keys() - PlanOptions.__annotations__.keys():
+        similar = difflib.get_close_matches(min(unknown), PlanOptions.__annotations__, n=1)
+        hint = f": did you mean {similar[0]}?" if similar else ""
+        raise InputError(f"train takes no {min(unknown)}{hint}")
+    names = {item.name for item in dataclasses.fields(Options)}
+    simple: Any = {name: value for name, value in given.items() if name in names}
+    return Options(**simple), {name: value for name, value in given.items() if name not in names}
+
+
+def check_whole(name: str, value: object, least: int, most: int) -> None:
+    """Raise InputError for what is not a whole number between these two."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name} must be a whole number of {_least(least)}, not {value!r:.40}")
+    if value > most:
+        raise InputError(
+            f"{name} must be at most {most:,}, not {value:.3g}" if value < 1e300 else f"{name} is too large"
+        )
+
+
+def _least(least: int) -> str:
+    return "at least 1" if least == 1 else f"{least} or more"

@@ -1,0 +1,62 @@
+"""Where a run is made: the machine, the versions, csac's own commit. What the manifest remembers of it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from csac import __version__
+from csac.processes import usable_cores
+from csac.record.manifest import Machine
+from csac.tasks.known import adapter_of
+
+if TYPE_CHECKING:
+    from csac.tasks.making import Task
+
+
+def surroundings(task: Task, command: str | None) -> dict[str, Any]:
+    """Return these fields of a manifest."""
+    return {
+        "machine": Machine(_processor(), len(usable_cores()), platform.node()),
+        "versions": _versions(task),
+        "commit": _commit(),
+        "command": command,
+        "process": os.getpid(),
+    }
+
+
+def _versions(task: Task) -> dict[str, str]:
+    robots = ("pybullet", "PyFlyt", "panda-gym") if adapter_of(task) else ()
+    versions = {"csac": __version__, "python": platform.python_version()}
+    for package in ("jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco", *robots):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+def _processor() -> str:
+    """Return the processor's model, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()
+
+
+def _commit() -> str | None:
+    """Return the commit of csac's own checkout, if it runs from one."""
+    try:
+        folder = Path(__file__).parent
+        result = subprocess.run(
+            ["git", "-C", folder, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return result.stdout.strip() or None

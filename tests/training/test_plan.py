@@ -1,0 +1,73 @@
+"""What is asked for is checked before anything is made of it, and each option is declared once."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from typing import Any
+
+import numpy as np
+import pytest
+
+from csac import SAC, train
+from csac.training.options import Options, PlanOptions, checked_options
+from csac.training.plan import Plan
+from csac.types import InputError
+
+
+def test_the_options_of_train_are_those_of_a_plan():
+    given = {item.name for item in dataclasses.fields(Plan)} - {"algorithm", "task", "task_name"}
+    assert set(PlanOptions.__annotations__) == given
+    assert not set(PlanOptions.__annotations__) & inspect.signature(train).parameters.keys()
+
+
+def test_what_is_not_given_is_as_declared():
+    options, others = checked_options({"steps": 30, "groups": None})
+    assert options == Options(steps=30)
+    assert others == {"groups": None}
+    assert (options.labels, Options(first_seed=7, seeds=2).labels) == ([0], [7, 8])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"steps": 0}, "steps must be a whole number of at least 1, not 0"),
+        ({"steps": 1e6}, "steps must be a whole number of at least 1, not 1000000.0"),
+        ({"steps": 10**300}, "steps must be at most 1,000,000,000,000,000, not 1e.300"),
+        ({"seeds": True}, "seeds must be a whole number of at least 1, not True"),
+        ({"seeds": 10**9}, "seeds must be at most 10,000"),
+        ({"first_seed": 2**32}, "first_seed must be at most 4,294,967,295"),  # its streams would be seed 0's
+        ({"first_seed": 2**32 - 1, "seeds": 2}, "leaves no labels for 2 seeds"),
+        ({"checkpoint_interval": -1}, "checkpoint_interval must be a whole number of 0 or more, not -1"),
+        ({"device": "tpu"}, "device must be cpu or gpu, not 'tpu'"),
+        ({"step": 5}, "train takes no step: did you mean steps?"),
+        ({"zebra": 5}, "train takes no zebra$"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(given: Any, message):
+    with pytest.raises(InputError, match=message):
+        checked_options(given)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "message"),
+    [
+        ("sac", r"sac is no algorithm with hyperparameters: give SAC\(\)"),
+        (SAC, r"SAC is no algorithm with hyperparameters: give SAC\(\)"),
+        (None, r"None is no algorithm with hyperparameters: give CSAC\(\)"),
+    ],
+)
+def test_a_name_or_a_class_is_no_algorithm(tmp_path, algorithm: Any, message):
+    with pytest.raises(InputError, match=message):
+        train(algorithm, "Pendulum-v1", directory=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_batch_that_does_not_fit_is_refused_with_what_it_needs(tmp_path):
+    with pytest.raises(InputError, match=r"needs about [\d,.]+ GiB of memory and [\d.]+ GiB are available"):
+        train(SAC(batch_size=10**9, replay_size=2 * 10**9), "Pendulum-v1", steps=100, directory=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_numpy_numbers_are_numbers():
+    assert Options(steps=np.int64(5)).steps == 5  # pyright: ignore[reportArgumentType]
