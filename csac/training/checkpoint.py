@@ -78,6 +78,8 @@ class Checkpoint:
             if checksum != sha256(_encoded(fields)) or fields["step"] != step:
                 raise Damaged(f"{path} has changed since it was written")
             return cls(folder, step, _checked_files(fields["files"]), _checked_values(fields["values"]))
+        except Damaged:
+            raise
         except OSError as error:
             raise Damaged(f"{path} cannot be read: {error.strerror}") from error
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
