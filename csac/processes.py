@@ -11,11 +11,16 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
+from csac.types import InputError
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
 # A process whose pipe is closed is about to end: its exit code says why.
 SECONDS_TO_END = 10.0
+
+# How a process ends that was to train, and whose import of the user's script trains already.
+UNGUARDED = 97
 
 _PR_SET_PDEATHSIG = 1
 
@@ -43,6 +48,12 @@ def die_with_parent() -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
+def end_if_unguarded() -> None:
+    """End this process at once, and silently, if it is importing the script of its parent: that one says why."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        os._exit(UNGUARDED)
+
+
 class Child:
     """A process that runs `work(connection, *arguments)`, and this end of the pipe to it."""
 
@@ -65,10 +76,19 @@ class Child:
             self.connection.send(message)
 
     def cause_of_death(self) -> str:
-        """Wait until a process that speaks no more is gone; return how it ended, as the end of a sentence."""
+        """Wait until a process that speaks no more is gone; return how it ended, as the end of a sentence.
+
+        Raises:
+            InputError: it imported the user's script, which has no guard.
+        """
         self.process.join(SECONDS_TO_END)
         code = self.process.exitcode
         self.kill()
+        if code == UNGUARDED:
+            raise InputError(
+                "this script starts processes that import it, and would run anew in each of them: put what it runs "
+                'under `if __name__ == "__main__":`, or use groups=1 and evaluation_processes=0'
+            )
         return "its process spoke no more and was killed" if code is None else cause_of_death(code)
 
     def kill(self) -> None:

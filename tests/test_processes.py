@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
 import sys
 from multiprocessing.connection import Connection
 
@@ -45,3 +46,16 @@ def test_a_process_that_ended_is_not_said_to_have_been_killed():
 )
 def test_what_is_known_of_an_end_is_said(exit_code, cause):
     assert cause_of_death(exit_code) == cause
+
+
+def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
+    """Each of its processes imports it, and would train anew; they say nothing."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from csac import SAC, train\n"
+        "train(SAC(batch_size=8), 'Pendulum-v1', steps=100, seeds=2, groups=2, directory='run')\n"
+    )
+    result = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    lines = result.stderr.strip().splitlines()
+    assert "InputError: this script starts processes that import it" in lines[-1]
+    assert sum(line.startswith("Traceback") for line in lines) == 1

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.driver import Driver, make_learner
-from csac.training.checkpoint import Checkpoints, SeedFiles, newest_sound
+from csac.training.checkpoint import Checkpoints, newest_sound
+from csac.training.seed_files import SeedFiles
 from csac.types import Ring
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import traceback
 from collections import deque
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
@@ -206,10 +207,9 @@ class _Worker(Child):
         super().__init__(_work, evaluator, cores, daemon=True)
 
     def answer(self) -> Answer:
-        try:
+        with suppress(EOFError, OSError):
             return self.connection.recv()
-        except (EOFError, OSError):
-            return ProcessDied(f"the evaluation was broken off: {self.cause_of_death()}")
+        return ProcessDied(f"the evaluation was broken off: {self.cause_of_death()}")
 
 
 def _work(connection: Connection, evaluator: Evaluator, cores: Sequence[int] | None) -> None:

@@ -6,6 +6,7 @@ import csv
 import io
 import operator
 import os
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -36,7 +37,7 @@ def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
     with open(path, "ab+") as file:
         _drop_torn_line(file)
         file.seek(0)
-        header = next(csv.reader([file.readline().decode()]))
+        header = _header(path, file.readline())
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         if not header:
@@ -44,6 +45,13 @@ def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
             writer.writerow(header)
         writer.writerows(_cells(path, header, row) for row in rows)
         file.write(text.getvalue().encode())
+
+
+def _header(path: Path, line: bytes) -> list[str]:
+    try:
+        return next(csv.reader([line.decode()]))
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(f"{path} is not a table of a run: its first line is no header; restore it") from None
 
 
 def check_new(path: Path) -> None:
@@ -95,7 +103,7 @@ def read_rows(path: str | Path) -> np.ndarray:
         return structured(COLUMNS.get(path.stem, ("seed", "step")), [])
     if len(set(header)) < len(header) or not {"seed", "step"} <= set(header):
         raise InputError(
-            f"{path} is not a table of a run: its header is {','.join(header)!r}; give one that csac wrote"
+            f"{path} is not a table of a run: its header is {','.join(header)[:100]!r}; give one that csac wrote"
         )
     for number, cells in enumerate(body, start=2):
         if len(cells) != len(header):
@@ -103,16 +111,24 @@ def read_rows(path: str | Path) -> np.ndarray:
     try:
         return structured(header, body)
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path} is damaged ({error}); remove the line that holds it") from None
+        raise InputError(f"{path} is damaged ({_short(error)}); remove the line that holds it") from None
 
 
 def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarray:
-    """Return cells as a structured array [row]; ValueError where one is not the number its column asks for."""
+    """Return cells as a structured array [row].
+
+    Raises ValueError or OverflowError where one is not the number that its column asks for, or a name is no column's.
+    """
     rows = np.empty(len(body), [(name, np.int64 if name in INTEGER_COLUMNS else np.float64) for name in header])
     for index, name in enumerate(header):
         convert = int if name in INTEGER_COLUMNS else _float
         rows[name] = [convert(cells[index]) for cells in body]
     return rows
+
+
+def _short(error: Exception) -> str:
+    """Return what an error says; a cell may be as long as the file."""
+    return textwrap.shorten(str(error), 100, placeholder=" ...") if len(str(error)) < 10_000 else "a huge cell"
 
 
 def _float(cell: str) -> float:

@@ -150,12 +150,17 @@ class SeedEnvironments:
     def take_back(self, index: int, saved: Snapshot) -> bool:
         """Let the seed at this place go on from `save`; return false where its episode had to start anew.
 
-        A seed whose environment fails here is reported by the next `step`.
+        A seed whose environment fails here is reported by the next `step`. Raises KeyError or ValueError where this is
+        not what `save` returns.
         """
         arrays, values = dict(saved.arrays), saved.values
+        _check_saved(values)
+        observation = arrays.pop("observation")
+        if observation.shape != self._observation[index].shape:
+            raise ValueError(f"an observation has shape {observation.shape}")
         self._begun[index] = values["episodes_begun"]
         self._observation, self._reward = self._observation.copy(), self._reward.copy()
-        self._observation[index], self._reward[index] = arrays.pop("observation"), values["reward"]
+        self._observation[index], self._reward[index] = observation, values["reward"]
         if not values["alive"]:
             self.stop(index)
         elif values["exact"]:
@@ -202,3 +207,13 @@ class SeedEnvironments:
         self._rest(index)
         details = "".join(traceback.format_exception(error)) if error.__cause__ else ""
         self._failures.append(Failure(index, str(error), details))
+
+
+def _check_saved(values: Mapping[str, Any]) -> None:
+    """Raise KeyError or ValueError where values are not of the kinds that `SeedEnvironments.save` gives."""
+    flags, counts = ("alive", "exact"), ("episodes_begun", "episode_length")
+    wrong = [name for name in flags if type(values[name]) is not bool]
+    wrong += [name for name in counts if type(values[name]) is not int or not 0 <= values[name] < 2**53]
+    wrong += [name for name in ("reward", "episode_return") if type(values[name]) is not float]
+    if wrong or not isinstance(values["environment"], dict) or (values["exact"] and not values["episodes_begun"]):
+        raise ValueError(f"{' and '.join(wrong) or 'the environment'} cannot be what was saved")

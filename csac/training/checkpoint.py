@@ -14,8 +14,6 @@ is there twice, since two are kept. The JSON file is written last, so a checkpoi
 
 from __future__ import annotations
 
-import errno
-import hashlib
 import json
 import os
 import re
@@ -26,14 +24,17 @@ import numpy as np
 import safetensors.numpy
 
 from csac.record.files import write_atomically
-from csac.record.parity import mended, parity_of
-from csac.types import InputError, Ring, Snapshot
+from csac.record.parity import mended
+from csac.training.seed_files import content_of, is_unchanged, parity_name, sha256, shards_of
+from csac.types import InputError, Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-SCHEMA_VERSION = 2
+    from csac.training.seed_files import Files
+
+SCHEMA_VERSION = 3
 FOLDER = "checkpoint"
 BEST = ".best.safetensors"
 
@@ -42,59 +43,10 @@ _FILE_NAME = re.compile(
     rf"step_{_NUMBER}\.(seed_{_NUMBER}(\.best)?\.safetensors|(evaluations|episodes|metrics)\.csv)"
     rf"|replay/seed_{_NUMBER}\.{_NUMBER}-{_NUMBER}\.(safetensors|parity)"
 )
-_BLOCK = 4096  # bytes that are read at a time where the disk cannot read all
-
-Files = dict[str, dict[str, Any]]  # name below the folder -> {"bytes": size, "sha256": checksum}
 
 
 class Damaged(InputError):
     """A checkpoint's file is missing, cut off or changed. The message names it."""
-
-
-class SeedFiles:
-    """Writes the files of one seed, and remembers which transitions are on disk already.
-
-    Args:
-        folder: the run's checkpoint folder.
-        seed: the seed's label.
-        known: the files of the checkpoint that the run goes on from.
-    """
-
-    def __init__(self, folder: Path, seed: int, known: Mapping[str, dict[str, Any]]) -> None:
-        self.folder, self.seed = folder, seed
-        shards = [name for _, _, name in _shards(known, seed)]
-        self._shards = {name: known[name] for name in [*shards, *map(_parity_name, shards)] if name in known}
-
-    def write(self, step: int, saved: Snapshot, memory: Ring) -> Files:
-        """Write what is new at this step; return every file that the seed needs now.
-
-        Raises:
-            OSError: the disk is full, or the folder is gone.
-        """
-        for folder in (self.folder, self.folder / "replay"):  # not their parents: a run that was deleted stays so
-            folder.mkdir(exist_ok=True)
-        oldest = max(memory.count - len(memory.rows), 0)
-        self._write_new_rows(memory, oldest)
-        name = f"step_{step}.seed_{self.seed}.safetensors"
-        content = safetensors.numpy.save(
-            {key: np.asarray(array, order="C") for key, array in saved.arrays.items()},
-            metadata={"values": json.dumps(saved.values), "transitions": json.dumps([oldest, memory.count])},
-        )
-        return {name: write_file(self.folder, name, content), **self._shards}
-
-    def _write_new_rows(self, memory: Ring, oldest: int) -> None:
-        last = max((last for _, last, _ in _shards(self._shards, self.seed)), default=0)
-        first = max(last, oldest)
-        if first < memory.count:
-            rows = memory.rows[np.arange(first, memory.count) % len(memory.rows)]
-            content = safetensors.numpy.save({"rows": rows})
-            name = f"replay/seed_{self.seed}.{first}-{memory.count}.safetensors"
-            self._shards[name] = write_file(self.folder, name, content)
-            self._shards[_parity_name(name)] = write_file(self.folder, _parity_name(name), parity_of(content))
-        for _, last, name in _shards(self._shards, self.seed):
-            if last <= oldest:
-                del self._shards[name]
-                self._shards.pop(_parity_name(name), None)
 
 
 class Checkpoint:
@@ -123,9 +75,11 @@ class Checkpoint:
                     f"{path} is of schema {fields['schema_version']!r} and this csac reads {SCHEMA_VERSION}: "
                     "go on with the csac that wrote it"
                 )
-            if checksum != _sha256(_encoded(fields)) or fields["step"] != step:
+            if checksum != sha256(_encoded(fields)) or fields["step"] != step:
                 raise Damaged(f"{path} has changed since it was written")
             return cls(folder, step, _checked_files(fields["files"]), _checked_values(fields["values"]))
+        except Damaged:
+            raise
         except OSError as error:
             raise Damaged(f"{path} cannot be read: {error.strerror}") from error
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -148,12 +102,12 @@ class Checkpoint:
         """
         path, facts = self.folder / name, self.files[name]
         try:
-            content = _content(path)
+            content = content_of(path)
         except OSError as error:
             if (right := self._original(name)) is not None:
                 return right
             raise Damaged(f"{path} cannot be read: {error.strerror}") from error
-        if _is(content, facts):
+        if is_unchanged(content, facts):
             return content
         if (right := self._mended(name, content)) is not None:
             self.mended.add(name)
@@ -171,7 +125,7 @@ class Checkpoint:
     def memory(self, seed: int, rows: np.ndarray) -> None:
         """Put a seed's transitions into a ring [capacity, width]. Raises Damaged."""
         _, (reached, count) = self._read_seed(seed)
-        for first, last, name in sorted(_shards(self.files, seed)):
+        for first, last, name in sorted(shards_of(self.files, seed)):
             if last <= reached:
                 continue
             if first > reached:
@@ -203,18 +157,20 @@ class Checkpoint:
 
     def _mended(self, name: str, content: bytes) -> bytes | None:
         """Return the content of a damaged file of transitions as it was, if its parity can tell."""
-        parity, facts = _parity_name(name), self.files[name]
+        parity, facts = parity_name(name), self.files[name]
         if not name.startswith("replay/") or parity not in self.files:
             return None
         with suppress(OSError):
-            return mended(content, facts["bytes"], (self.folder / parity).read_bytes(), lambda guess: _is(guess, facts))
+            return mended(
+                content, facts["bytes"], (self.folder / parity).read_bytes(), lambda guess: is_unchanged(guess, facts)
+            )
         return None
 
     def _original(self, name: str) -> bytes | None:
         """Return what the file of the run that a file is a copy of holds, if that is still the same."""
         path = original_of(self.folder.parent, name)
         with suppress(OSError):
-            if path and _is(content := path.read_bytes()[: self.files[name]["bytes"]], self.files[name]):
+            if path and is_unchanged(content := path.read_bytes()[: self.files[name]["bytes"]], self.files[name]):
                 return content
         return None
 
@@ -241,7 +197,7 @@ class Checkpoints:
         """Make a checkpoint of files that are written already, then remove what no checkpoint needs any more."""
         values = {**values, "pinned": sorted(self.pinned)}
         fields = {"schema_version": SCHEMA_VERSION, "step": step, "files": files, "values": values}
-        content = json.dumps({**fields, "sha256": _sha256(_encoded(fields))}, indent=1).encode()
+        content = json.dumps({**fields, "sha256": sha256(_encoded(fields))}, indent=1).encode()
         write_atomically(self.folder / f"step_{step}.json", content)
         _sync_folder(self.folder)
         self.newest = step
@@ -334,70 +290,30 @@ def original_of(run: Path, name: str) -> Path | None:
     return run / "policy" / own if name.endswith(BEST) else None
 
 
-def write_file(folder: Path, name: str, content: bytes) -> dict[str, Any]:
-    """Write a file of a checkpoint; return its size and checksum for `Checkpoints.commit`."""
-    write_atomically(folder / name, content)
-    return {"bytes": len(content), "sha256": _sha256(content)}
-
-
-def _content(path: Path) -> bytes:
-    """Return the bytes of a file, with zeros for the blocks that the disk cannot read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        if error.errno != errno.EIO:
-            raise
-    with open(path, "rb", buffering=0) as file:
-        size = os.fstat(file.fileno()).st_size
-        return b"".join(_block(file.fileno(), place, min(_BLOCK, size - place)) for place in range(0, size, _BLOCK))
-
-
-def _block(descriptor: int, place: int, size: int) -> bytes:
-    try:
-        return os.pread(descriptor, size, place).ljust(size, b"\0")
-    except OSError:
-        return bytes(size)
-
-
-def _is(content: bytes, facts: dict[str, Any]) -> bool:
-    return len(content) == facts["bytes"] and _sha256(content) == facts["sha256"]
-
-
-def _parity_name(name: str) -> str:
-    """Return the name of the file that mends a file of transitions."""
-    return name.removesuffix(".safetensors") + ".parity"
-
-
-def _shards(files: Mapping[str, Any], seed: int) -> list[tuple[int, int, str]]:
-    """Return (first, last + 1, name) of each file of a seed's transitions."""
-    names = (re.fullmatch(rf"replay/seed_{seed}\.(\d+)-(\d+)\.safetensors", name) for name in files)
-    return [(int(match[1]), int(match[2]), match[0]) for match in names if match]
-
-
 def _checked_files(files: Any) -> Files:
     for name, facts in files.items():
         if not _FILE_NAME.fullmatch(name):
             raise ValueError(f"{name!r} is no file of a checkpoint")
-        if type(facts["bytes"]) is not int or not isinstance(facts["sha256"], str):
+        if not _is_count(facts["bytes"]) or not isinstance(facts["sha256"], str):
             raise TypeError(f"{name!r} has no size and checksum")
     return files
 
 
 def _checked_values(values: Any) -> dict[str, Any]:
     values = {"log_bytes": 0, "failures": {}, "pinned": [], **values}
-    if type(values["log_bytes"]) is not int or not all(type(step) is int for step in values["pinned"]):
+    if not _is_count(values["log_bytes"]) or not all(map(_is_count, values["pinned"])):
         raise TypeError("the log's size or pinned steps are not numbers")
     if not all(re.fullmatch(_NUMBER, seed) and isinstance(text, str) for seed, text in values["failures"].items()):
         raise TypeError("failures are not texts by the numbers of seeds")
     return values
 
 
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**53
+
+
 def _encoded(fields: dict[str, Any]) -> bytes:
     return json.dumps(fields, sort_keys=True).encode()
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
 
 
 def _sync_folder(folder: Path) -> None:

@@ -15,7 +15,7 @@ from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evalua
 from csac.evaluation.pool import EvaluationPool, ProcessDied
 from csac.tasks.perturbations import values_at
 from csac.tasks.seeds import SeedEnvironments
-from csac.training.checkpoint import Checkpoint, SeedFiles, taken_back
+from csac.training.checkpoint import Checkpoint, taken_back
 from csac.training.learner import Learner
 from csac.training.messages import (
     Boundary,
@@ -29,6 +29,7 @@ from csac.training.messages import (
     Saved,
     Settings,
 )
+from csac.training.seed_files import SeedFiles
 from csac.types import Snapshot
 
 if TYPE_CHECKING:
@@ -280,6 +281,8 @@ class Group:
         for index, seed in enumerate(self.seeds):
             saved = checkpoint.seed(seed)
             learnt.append(saved.part("learner"))
+            if saved.arrays["actions"].shape != actions[index].shape:
+                raise ValueError(f"the next action has shape {saved.arrays['actions'].shape}")
             actions[index] = saved.arrays["actions"]
             if not self.environments.take_back(index, saved.part("environment")):
                 anew.append(index)

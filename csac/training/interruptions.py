@@ -22,6 +22,8 @@ _CANNOT_WRITE = (
     errno.ENOENT,
     errno.EIO,
     errno.EFBIG,
+    errno.EMFILE,
+    errno.ENFILE,
 )
 
 

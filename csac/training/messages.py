@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from csac.record.run import Table
     from csac.tasks.making import Task
     from csac.tasks.perturbations import Perturbation
-    from csac.training.checkpoint import Files
+    from csac.training.seed_files import Files
     from csac.types import Algorithm
 
 

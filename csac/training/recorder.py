@@ -32,8 +32,9 @@ if TYPE_CHECKING:
     from csac.deploy.policy import Policy
     from csac.record.run import RunDirectory
     from csac.record.tensorboard import TensorBoardLog
-    from csac.training.checkpoint import Checkpoints, Files
+    from csac.training.checkpoint import Checkpoints
     from csac.training.messages import Message
+    from csac.training.seed_files import Files
 
 OVER = np.iinfo(np.int64).max  # the step of a group that is over: it holds nobody back
 

@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, get_args
 
 from csac.record.files import write_atomically
 from csac.record.run import Table
-from csac.training.checkpoint import BEST, FOLDER, Damaged, original_of, write_file
+from csac.training.checkpoint import BEST, FOLDER, Damaged, original_of
+from csac.training.seed_files import write_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from csac.training.checkpoint import Checkpoint, Files
+    from csac.training.checkpoint import Checkpoint
+    from csac.training.seed_files import Files
 
 LOG = "log.txt"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import count
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
@@ -190,9 +190,10 @@ class _Scheduler:
             worker.kill()
 
     def _receive(self, index: int, worker: _Worker) -> Message:
-        try:
-            message: Message = worker.connection.recv()
-        except (EOFError, OSError):  # the latter where it died in the middle of a message
+        message: Message | None = None
+        with suppress(EOFError, OSError):  # the latter where it died in the middle of a message
+            message = worker.connection.recv()
+        if message is None:
             return self._died(index, worker)
         worker.is_starting = False
         if isinstance(message, Boundary):

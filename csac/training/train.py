@@ -9,6 +9,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from csac.processes import end_if_unguarded
 from csac.record.run import RunDirectory, default_directory, is_run
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import by_step, perturbations_of, refuse_late
@@ -101,6 +102,7 @@ def train(
         Interrupted: on SIGINT or SIGTERM, after everything was saved.
         StorageFailure: the run directory can no longer be written; it is as sound as if the run had been killed.
     """
+    end_if_unguarded()
     check_algorithm(algorithm)
     watchers = Watchers(reporter, tensorboard, on_evaluation, stop_when)
     before = Before.find(directory, resume, start_from)

@@ -338,6 +338,37 @@ def test_what_is_no_table_at_all_is_refused(tmp_path):
         read_rows(tmp_path / "none.csv")
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xff\xfe1,2\n",
+        b"seed,step\n0,99999999999999999999\n",
+        b"seed,step\n0," + b"9" * 5_000 + b"\n",
+        b"seed,step\n0," + b"x" * 140_000 + b"\n",
+        b"seed,step,return\n0,1," + b"x" * 100_000 + b"\n",
+        b"\n\nseed,step\n0,1\n",
+        b"# mine\nseed,step\n0,1\n",
+        b"seed,step," + b"x" * 100_000 + b",\n0,1\n",
+        b"seed,step,\n0,1,2\n",
+        b"seed,step,return\n0,1,1_0\n" + b"0,\x001,2\n",
+    ],
+)
+def test_a_table_of_anything_else_is_refused_in_one_short_line(tmp_path, content):
+    (tmp_path / "evaluations.csv").write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_rows(tmp_path / "evaluations.csv")
+    assert len(str(caught.value)) < 400
+    assert "\n" not in str(caught.value)
+
+
+def test_no_row_is_added_to_what_is_no_table(run):
+    for content in (b"\xff\xfe\n", b"x" * 140_000 + b"\n"):
+        (run.path / "episodes.csv").write_bytes(content)
+        with pytest.raises(InputError, match="its first line is no header"):
+            run.append("episodes", [{"seed": 0, "step": 1, "return": 1.0, "length": 1}])
+        assert (run.path / "episodes.csv").read_bytes() == content
+
+
 def test_log_lines_follow_each_other(run):
     run.log("first")
     run.log("second\n")

@@ -35,7 +35,6 @@ from csac.training.checkpoint import (
     Checkpoint,
     Checkpoints,
     Damaged,
-    SeedFiles,
     newest_sound,
     remove_unfinished,
     steps_in,
@@ -43,6 +42,7 @@ from csac.training.checkpoint import (
 from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Rows, Saved, Settings
 from csac.training.recorder import Recorder
 from csac.training.scheduler import _Scheduler
+from csac.training.seed_files import SeedFiles
 from csac.training.train import resume, train
 from csac.types import InputError, Ring, Snapshot
 

@@ -13,8 +13,9 @@ import trainer  # noqa: F401  (its cache of compiled programs)
 
 from csac.algorithms import CSAC, TD3
 from csac.tasks.seeds import Steps
-from csac.training.checkpoint import Checkpoint, Checkpoints, Damaged, SeedFiles
+from csac.training.checkpoint import SCHEMA_VERSION, Checkpoint, Checkpoints, Damaged
 from csac.training.learner import Learner
+from csac.training.seed_files import SeedFiles
 from csac.types import Spec
 
 SPEC = Spec(3, 1)
@@ -50,8 +51,10 @@ def test_a_checkpoint_names_its_arrays_by_where_they_are_in_the_state(tmp_path):
 def test_a_checkpoint_of_the_schema_before_is_refused_in_one_line(tmp_path):
     Checkpoints(tmp_path, 2).commit(5, {}, {})
     path = tmp_path / "step_5.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "schema_version": 1}))
-    with pytest.raises(Damaged, match=r"step_5\.json is of schema 1, and this csac reads 2"):
+    path.write_text(json.dumps({**json.loads(path.read_text()), "schema_version": SCHEMA_VERSION - 1}))
+    with pytest.raises(
+        Damaged, match=rf"^{path} is of schema {SCHEMA_VERSION - 1} and this csac reads {SCHEMA_VERSION}: go on with"
+    ):
         Checkpoint.open(tmp_path, 5)
 
 
