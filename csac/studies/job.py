@@ -96,7 +96,9 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
         write_history(job.path, spent())
         raise Stopped(interruption.signal_number) from None
     except Exception as error:
-        return _failed(job, spent(), f"{type(error).__name__}: {error}", traceback.format_exc())
+        return _failed(
+            job, spent(), ": ".join(filter(None, (type(error).__name__, str(error)))), traceback.format_exc()
+        )
     write_history(job.path, spent())
     if run.manifest["state"] != "finished":
         return Ended(key, "failed", "; ".join(map(str, run.manifest["failures"].values())))

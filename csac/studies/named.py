@@ -77,9 +77,10 @@ PANDA = Study(
     analyses=("curves", "returns", "success"),
 )
 
-REFERENCE = Study(
-    "reference",
-    "CSAC's reference policies and estimators against SAC",
+REFERENCE = replace(
+    MUJOCO,
+    name="reference",
+    title="CSAC's reference policies and estimators against SAC",
     tasks=("HalfCheetah-v4", "Walker2d-v4", "Hopper-v4"),
     methods=(
         SAC,
