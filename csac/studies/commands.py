@@ -6,6 +6,7 @@ import shlex
 import signal
 import sys
 from collections import Counter
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,18 +17,22 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from csac.console.tables import make_console, program, short
+from csac.console.tables import duration, make_console, program, short
 from csac.processes import usable_cores
+from csac.studies.calibration import Calibration, Prediction, predict
 from csac.studies.cells import HOME, Cell, Store
 from csac.studies.engines import run_here, run_in_processes
-from csac.studies.job import Job, Stopped
+from csac.studies.job import Ended, Job, Message, Stopped, is_over
 from csac.studies.named import NAMED, find
 from csac.studies.progress import StudyProgress
+from csac.studies.results import collect
 from csac.studies.study import Study, cells_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+
+    from rich.console import Console
 
     from csac.studies.cells import Status
     from csac.studies.engines import Engine
@@ -46,7 +51,7 @@ The paper's experiments, and your own, as studies: tasks x methods x seeds, one 
 NAME may also be a TOML file of your own (docs/studies.md).
 To begin: csac study run smoke
 """
-STATE_STYLES = {"running": "cyan", "complete": "green", "failed": "red", "partial": "yellow", "waiting": "dim"}
+STATE_STYLES = {"complete": "green", "running": "cyan", "partial": "yellow", "waiting": "dim", "failed": "red"}
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,13 @@ class List:
 
 @dataclass(frozen=True)
 class Show(Chosen):
-    """Show the cells of a study and how far they are."""
+    """Show the cells of a study, how far they are, and what the rest will take on this machine.
+
+    A kind of cell that this machine has not run yet is measured first, for some seconds each, and remembered.
+    """
+
+    measure: FlagCreatePairsOff[bool] = True
+    """Measure how fast this machine is; without it, only what was measured before is told."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +110,8 @@ class Run(Chosen):
     """Run the cell of this number alone, as csac study show counts them: one job of an array."""
     device: Literal["cpu", "gpu"] = "cpu"
     """Where the networks learn."""
+    results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
+    """Copy the evaluations and a small manifest of each cell that is over there: what a report needs."""
     keep_checkpoints: FlagCreatePairsOff[bool] = False
     """Keep the checkpoints of finished cells too: they hold the replay, and take most of the room."""
 
@@ -145,23 +158,73 @@ def show(options: Show) -> int:
     """Print the cells of a study, one row for each."""
     studies, store, console = options.studies(), Store(options.directory), make_console()
     cells, labels = cells_of(studies), labels_of(studies)
-    table = _table("cell", "what", "steps", "state", "directory")
-    table.columns[4].overflow = "fold"
-    states = Counter[str]()
+    statuses = {cell.key: store.status(cell) for cell in cells}
+    rest = [cell for cell in cells if not store.is_final(cell)]
+    predictions = _predictions(rest, statuses, options.measure, console)
+    table = _table("cell", "what", "steps", "state", "time", "directory")
+    table.columns[5].overflow = "fold"
     for index, cell in enumerate(cells):
-        status = store.status(cell)
-        states[status.state] += 1
+        status = statuses[cell.key]
         text = Text(status.state + (f": {status.reason}" if status.reason else ""), STATE_STYLES[status.state])
-        done = f"{short(status.steps)} / {short(cell.steps)}"
-        table.add_row(str(index), labels[cell.key], done, text, str(store.path(cell).relative_to(store.root)))
+        prediction = predictions.get(cell.key)
+        table.add_row(
+            str(index),
+            labels[cell.key],
+            f"{short(status.steps)} / {short(cell.steps)}",
+            text,
+            f"about {duration(prediction.seconds)}"
+            if prediction
+            else duration(status.seconds)
+            if status.seconds
+            else "",
+            str(store.path(cell).relative_to(store.root)),
+        )
     console.print(table)
-    console.print(f"{len(cells)} cells below {store.root}: {_counted(states)}", soft_wrap=True)
+    console.print(f"{len(cells)} cells below {store.root}: {_counted(statuses.values())}", soft_wrap=True)
+    if rest:
+        console.print(_told(rest, predictions), soft_wrap=True)
     return 0
+
+
+def _predictions(
+    cells: Sequence[Cell], statuses: Mapping[str, Status], measure: bool, console: Console
+) -> dict[str, Prediction]:
+    """Return what each cell will take, of those whose kind was measured or can be."""
+    calibration, predictions, refused = Calibration(), {}, set()
+    for cell in cells:
+        cost, kind = calibration.cost(cell), f"{cell.algorithm} on {cell.task}"
+        if cost is None and measure and kind not in refused:
+            try:
+                with console.status(f"measuring {kind}") if console.is_interactive else nullcontext():
+                    cost = calibration.measure(cell)
+            except RuntimeError as error:
+                refused.add(kind)
+                _say(console, f"{kind} cannot be measured: {error}", "red")
+        if cost:
+            predictions[cell.key] = predict(cell, cost, statuses[cell.key].steps)
+    if calibration.is_busy:
+        _say(console, "other processes keep this machine busy: what was measured now is too slow, and not remembered")
+    return predictions
+
+
+def _told(rest: Sequence[Cell], predictions: Mapping[str, Prediction]) -> str:
+    """Return what the cells that are not over will take together."""
+    if len(predictions) < len(rest):
+        return f"{len(rest)} to run, {len(rest) - len(predictions)} of them not measured"
+    workers = min(len(usable_cores()), len(rest))
+    seconds = sum(one.seconds for one in predictions.values())
+    memory = sum(sorted((one.memory for one in predictions.values()), reverse=True)[:workers])
+    disk = sum(sorted((one.disk for one in predictions.values()), reverse=True)[:workers])
+    at_once = f", {duration(seconds / workers)} with {workers} at once" if workers > 1 else ""
+    return (
+        f"{len(rest)} to run: at most {duration(seconds)} of one core{at_once}; "
+        f"{memory / 2**30:.2g} GiB of memory, {disk / 2**30:.2g} GiB of disk for checkpoints"
+    )
 
 
 def run(options: Run) -> int:
     """Run what is not complete and return the exit code."""
-    studies, store = options.studies(), Store(options.directory)
+    studies, store, console = options.studies(), Store(options.directory), make_console()
     cells, labels = cells_of(studies), labels_of(studies)
     engine = _engine(options)
     if options.cell is not None:
@@ -169,26 +232,28 @@ def run(options: Run) -> int:
             raise InputError(f"--cell counts from 0 to {len(cells) - 1}, not {options.cell}")
         cells = [cells[options.cell]]
     statuses = {cell.key: store.status(cell) for cell in cells}
-    jobs = [
-        Job(cell, store.path(cell), options.device, keep_checkpoints=options.keep_checkpoints, command=command_line())
-        for cell in cells
-        if not store.is_final(cell)
-    ]
-    console = make_console()
-    console.print(Text(_intention(studies, cells, statuses), "bold"), soft_wrap=True)
-    progress = StudyProgress(
-        [job.cell for job in jobs], labels, {key: status.steps for key, status in statuses.items()}, console
-    )
+    _say(console, _intention(studies, cells, statuses.values()), "bold")
+    jobs = [job for job in _jobs(studies, cells, store, options) if not is_over(job)]
+    by_key = {cell.key: cell for cell in cells}
+    if options.results:
+        for cell in cells:
+            collect(store, cell, options.results)
+    done = {key: status.steps for key, status in statuses.items()}
+    progress = StudyProgress([job.cell for job in jobs], labels, done, console)
+
+    def tell(message: Message) -> None:
+        progress.tell(message)
+        if options.results and isinstance(message, Ended):
+            collect(store, by_key[message.key], options.results)
+
     try:
         if jobs:
-            engine(jobs, progress.tell)
+            engine(jobs, tell)
     except Stopped as stopped:
         progress.close()
-        print(
-            f"csac: stopped by {signal.Signals(stopped.signal_number).name}; to go on, type the same line again: "
-            f"{command_line()}",
-            file=sys.stderr,
-        )
+        name = signal.Signals(stopped.signal_number).name
+        line = f"csac: stopped by {name}; every cell is saved. To go on, type the same line again: {command_line()}"
+        print(line, file=sys.stderr)
         return 128 + stopped.signal_number
     finally:
         progress.close()
@@ -223,25 +288,47 @@ def _engine(options: Run) -> Engine:
     return run_here if engine == "local" else partial(run_in_processes, workers=options.workers)
 
 
-def _intention(studies: Sequence[Study], cells: Sequence[Cell], statuses: Mapping[str, Status]) -> str:
-    states = Counter(status.state for status in statuses.values())
+def _jobs(studies: Sequence[Study], cells: Sequence[Cell], store: Store, options: Run) -> list[Job]:
+    """Return the jobs of these cells: a policy is tested as often as the most demanding of their studies asks for."""
+    rollouts = Counter[str]()
+    for study in studies:
+        for entry in study.entries():
+            rollouts[entry.cell.key] = max(rollouts[entry.cell.key], study.rollouts_each)
+    return [
+        Job(
+            cell,
+            store.path(cell),
+            device=options.device,
+            keep_checkpoints=options.keep_checkpoints,
+            rollouts=rollouts[cell.key],
+            command=command_line(),
+        )
+        for cell in cells
+    ]
+
+
+def _intention(studies: Sequence[Study], cells: Sequence[Cell], statuses: Iterable[Status]) -> str:
     scale = f", at {studies[0].scale:g} of the steps" if studies[0].scale < 1 else ""
-    names = ", ".join(study.name for study in studies)
-    return f"{names}{scale}: {len(cells)} cells, {_counted(states)}"
+    return f"{', '.join(study.name for study in studies)}{scale}: {len(cells)} cells, {_counted(statuses)}"
 
 
-def _conclude(cells: Sequence[Cell], labels: Mapping[str, str], store: Store, console: Any) -> int:
+def _conclude(cells: Sequence[Cell], labels: Mapping[str, str], store: Store, console: Console) -> int:
     """Print what became of the cells, and return the exit code."""
     statuses = {cell.key: store.status(cell) for cell in cells}
-    for key, status in statuses.items():
-        if status.state == "failed":
-            console.print(Text(f"failed: {labels[key]}: {status.reason}", "red"), soft_wrap=True)
-    console.print(f"{len(cells)} cells: {_counted(Counter(status.state for status in statuses.values()))}")
-    return 3 if any(status.state == "failed" for status in statuses.values()) else 0
+    failed = {key: status.reason for key, status in statuses.items() if status.state == "failed"}
+    for key, reason in failed.items():
+        _say(console, f"failed: {labels[key]}: {reason}", "red")
+    _say(console, f"{len(cells)} cells: {_counted(statuses.values())}")
+    return 3 if failed else 0
 
 
-def _counted(states: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {state}" for state, count in states.items())
+def _counted(statuses: Iterable[Status]) -> str:
+    states = Counter(status.state for status in statuses)
+    return ", ".join(f"{states[state]} {state}" for state in STATE_STYLES if states[state])
+
+
+def _say(console: Console, text: str, style: str = "") -> None:
+    console.print(Text(text, style), soft_wrap=True)
 
 
 def _table(*headings: str) -> Table:

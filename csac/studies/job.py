@@ -10,13 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from csac.record.run import RunDirectory, is_run
+from csac.record.tables import COLUMNS, write_rows
 from csac.studies.cells import Cell, is_in_use, read_history, write_history
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from csac.record.run import RunDirectory
+
+ROLLOUTS = "rollouts.csv"
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,8 @@ class Job:
     checkpoint_interval: int = 50_000
     keep_checkpoints: bool = False
     tensorboard: bool = True
+    rollouts: int = 0
+    """Fresh episodes that the finished policy is tested on: `rollouts.csv` in its run."""
     command: str | None = None
 
 
@@ -69,6 +74,17 @@ class Stopped(Exception):
         self.signal_number = signal_number
 
 
+def is_over(job: Job) -> bool:
+    """Whether there is nothing left to do: the run is complete, and so are its rollouts, or what it learns has failed.
+
+    What failed for another reason, such as a package that is missing or a machine that died, is tried again.
+    """
+    with suppress(InputError):
+        state = RunDirectory.open(job.path).manifest["state"] if is_run(job.path) else "waiting"
+        return state == "failed" or (state == "finished" and (not job.rollouts or (job.path / ROLLOUTS).exists()))
+    return False
+
+
 def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
     """Train a cell from where it is to its end, and say how it went; only a signal is raised.
 
@@ -90,6 +106,8 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
 
     try:
         run = _train(job, tell)
+        if run.manifest["state"] == "finished" and job.rollouts:
+            _roll_out(job)
     except InputError as error:
         return Ended(key, "elsewhere") if is_in_use(job.path) else _failed(job, spent(), str(error))
     except Interrupted as interruption:
@@ -134,6 +152,17 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
         # A finished cell needs them no more, and they take most of its room: the replay is in them.
         shutil.rmtree(job.path / "checkpoint", ignore_errors=True)
     return run
+
+
+def _roll_out(job: Job) -> None:
+    """Test the last policy on episodes that neither training nor its evaluations have seen, and keep a row of each."""
+    from csac.evaluation.play import evaluate_run
+
+    if (job.path / ROLLOUTS).exists():
+        return
+    ((seed, episodes),) = evaluate_run(job.path, episodes=job.rollouts, processes=1)
+    rows = [episode.row(seed, job.cell.steps) for episode in episodes]
+    write_rows(job.path / ROLLOUTS, COLUMNS["evaluations"], rows)
 
 
 def _failed(job: Job, history: dict[str, Any], reason: str, trace: str = "") -> Ended:

@@ -104,10 +104,7 @@ NAMED: Mapping[str, tuple[Study, ...]] = MappingProxyType(
     {
         **{study.name: (study,) for study in WHOLE},
         "smoke": tuple(
-            replace(study, evaluation_episodes=1, rollouts=min(study.rollouts, 5))
-            .narrowed(seeds=1)
-            .shortened(SMOKE_SCALE)
-            for study in WHOLE
+            replace(study, evaluation_episodes=1).narrowed(seeds=1).shortened(SMOKE_SCALE) for study in WHOLE
         ),
     }
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -109,6 +110,11 @@ class Study:
         """Return the steps between two evaluations: as planned, or less where there would be too few of them."""
         interval = self.evaluation_interval
         return interval if self.scale == 1 else max(1, min(interval, self.steps_for(task) // FEWEST_POINTS))
+
+    @property
+    def rollouts_each(self) -> int:
+        """Fresh episodes for each policy, fewer where the runs are shorter."""
+        return math.ceil(self.rollouts * self.scale)
 
     def conditions_for(self) -> tuple[tuple[str, ...], ...]:
         """Return the conditions, at steps that are shortened as the runs are."""
