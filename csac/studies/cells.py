@@ -28,6 +28,7 @@ except ImportError:  # Windows: there is no lock to ask for
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from csac.record.manifest import Manifest
     from csac.types import Algorithm
 
 HOME = Path("runs/studies/cells")
@@ -80,27 +81,25 @@ class Cell:
         )
 
     @classmethod
-    def of_run(cls, manifest: Mapping[str, Any]) -> Cell:
+    def of_run(cls, manifest: Manifest) -> Cell:
         """Return the cell whose run has this manifest. Raises InputError where it is no cell's.
 
         A hyperparameter that an older run has not got is the default: that is what it did.
         """
-        try:
-            (seed,) = manifest["seeds"]
-            return cls.make(
-                manifest["task"],
-                manifest["algorithm"],
-                manifest["hyperparameters"],
-                perturbations=manifest["perturbations"],
-                environment_arguments=manifest["environment_arguments"],
-                events=manifest["events"],
-                steps=manifest["steps"],
-                seed=seed,
-                evaluation_interval=manifest["evaluation"]["interval"],
-                evaluation_episodes=manifest["evaluation"]["episodes"],
-            )
-        except (KeyError, ValueError, TypeError) as error:
-            raise InputError(f"this is not the run of a cell: {error}") from None
+        if len(manifest.seeds) != 1:
+            raise InputError("it has several seeds, and a cell has one")
+        return cls.make(
+            manifest.task,
+            manifest.algorithm,
+            manifest.hyperparameters,
+            perturbations=manifest.perturbations,
+            environment_arguments=manifest.environment_arguments,
+            events=manifest.events,
+            steps=manifest.steps,
+            seed=manifest.seeds[0],
+            evaluation_interval=manifest.evaluation.interval,
+            evaluation_episodes=manifest.evaluation.episodes,
+        )
 
     @functools.cached_property
     def key(self) -> str:
@@ -172,24 +171,24 @@ class Store:
             manifest = RunDirectory.open(path).manifest
         except InputError as error:
             return Status("failed", 0, str(error), seconds)
-        steps = manifest["steps_done"]
-        if manifest["state"] == "finished":
+        steps = manifest.steps_done
+        if manifest.state == "finished" and not reason:
             return Status("complete", steps, "", seconds)
         if is_in_use(path):
             return Status("running", steps, "", seconds)
-        if manifest["state"] == "failed":
-            return Status("failed", steps, "; ".join(map(str, manifest["failures"].values())), seconds)
+        if manifest.state == "failed":
+            return Status("failed", steps, "; ".join(map(str, manifest.failures.values())), seconds)
         return Status("failed" if reason else "partial", steps, reason, seconds)
 
-    def is_final(self, cell: Cell) -> bool:
-        """Whether there is nothing left to do: the cell is complete, or what it learns has failed.
 
-        What failed for another reason, such as a package that is missing or a machine that died, is tried again.
-        """
-        path = self.path(cell)
-        with suppress(InputError):
-            return is_run(path) and RunDirectory.open(path).manifest["state"] in ("finished", "failed")
-        return False
+def is_final(path: Path) -> bool:
+    """Whether a run has been trained to its end, or to where what it learns failed.
+
+    What failed for another reason, such as a package that is missing or a machine that died, is tried again.
+    """
+    with suppress(InputError):
+        return is_run(path) and RunDirectory.open(path).manifest.state in ("finished", "failed")
+    return False
 
 
 def complete(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:

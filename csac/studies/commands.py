@@ -20,7 +20,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from csac.console.tables import duration, make_console, program, short
 from csac.processes import usable_cores
 from csac.studies.calibration import Calibration, Prediction, predict
-from csac.studies.cells import HOME, Cell, Store
+from csac.studies.cells import HOME, Cell, Store, is_final
 from csac.studies.engines import run_here, run_in_processes
 from csac.studies.job import Ended, Job, Message, Stopped, is_over
 from csac.studies.named import NAMED, find
@@ -159,7 +159,7 @@ def show(options: Show) -> int:
     studies, store, console = options.studies(), Store(options.directory), make_console()
     cells, labels = cells_of(studies), labels_of(studies)
     statuses = {cell.key: store.status(cell) for cell in cells}
-    rest = [cell for cell in cells if not store.is_final(cell)]
+    rest = [cell for cell in cells if not is_final(store.path(cell))]
     predictions = _predictions(rest, statuses, options.measure, console)
     table = _table("cell", "what", "steps", "state", "time", "directory")
     table.columns[5].overflow = "fold"

@@ -5,14 +5,15 @@ from __future__ import annotations
 import shutil
 import time
 import traceback
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from csac.record.run import RunDirectory, is_run
+from csac.record.run import RunDirectory
 from csac.record.tables import COLUMNS, write_rows
-from csac.studies.cells import Cell, is_in_use, read_history, write_history
+from csac.studies.cells import Cell, is_final, is_in_use, read_history, write_history
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ class Job:
 
     cell: Cell
     path: Path
-    device: str = "cpu"
+    device: Literal["cpu", "gpu"] = "cpu"
     checkpoint_interval: int = 50_000
     keep_checkpoints: bool = False
     tensorboard: bool = True
@@ -75,14 +76,11 @@ class Stopped(Exception):
 
 
 def is_over(job: Job) -> bool:
-    """Whether there is nothing left to do: the run is complete, and so are its rollouts, or what it learns has failed.
-
-    What failed for another reason, such as a package that is missing or a machine that died, is tried again.
-    """
-    with suppress(InputError):
-        state = RunDirectory.open(job.path).manifest["state"] if is_run(job.path) else "waiting"
-        return state == "failed" or (state == "finished" and (not job.rollouts or (job.path / ROLLOUTS).exists()))
-    return False
+    """Whether there is nothing left to do: the run is final and, where it did not fail, so are its rollouts."""
+    if not is_final(job.path):
+        return False
+    failed = RunDirectory.open(job.path).manifest.state == "failed"
+    return failed or not job.rollouts or (job.path / ROLLOUTS).exists()
 
 
 def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
@@ -105,8 +103,9 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
     from csac.training.train import Interrupted  # JAX, which a worker imports once it has its cores
 
     try:
-        run = _train(job, tell)
-        if run.manifest["state"] == "finished" and job.rollouts:
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a seed that failed is told of below
+            run = _train(job, tell)
+        if run.manifest.state == "finished" and job.rollouts:
             _roll_out(job)
     except InputError as error:
         return Ended(key, "elsewhere") if is_in_use(job.path) else _failed(job, spent(), str(error))
@@ -114,12 +113,11 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
         write_history(job.path, spent())
         raise Stopped(interruption.signal_number) from None
     except Exception as error:
-        return _failed(
-            job, spent(), ": ".join(filter(None, (type(error).__name__, str(error)))), traceback.format_exc()
-        )
+        reason = ": ".join(filter(None, (type(error).__name__, str(error))))
+        return _failed(job, spent(), reason, traceback.format_exc())
     write_history(job.path, spent())
-    if run.manifest["state"] != "finished":
-        return Ended(key, "failed", "; ".join(map(str, run.manifest["failures"].values())))
+    if run.manifest.state != "finished":
+        return Ended(key, "failed", "; ".join(map(str, run.manifest.failures.values())))
     return Ended(key, "complete")
 
 
@@ -148,9 +146,9 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
         command=job.command,
         on_evaluation=lambda step, returns: tell(Advanced(cell.key, step, returns.get(cell.seed, float("nan")))),
     )
-    if run.manifest["state"] == "finished" and not job.keep_checkpoints:
+    if run.manifest.state == "finished" and not job.keep_checkpoints:
         # A finished cell needs them no more, and they take most of its room: the replay is in them.
-        shutil.rmtree(job.path / "checkpoint", ignore_errors=True)
+        shutil.rmtree(run.checkpoints, ignore_errors=True)
     return run
 
 

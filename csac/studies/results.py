@@ -2,40 +2,37 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from csac.record import manifest as manifests
 from csac.record.files import write_atomically
 from csac.record.run import RunDirectory
 from csac.record.tables import read_rows
-from csac.studies.cells import Cell, Store, read_history
+from csac.studies.cells import Cell, Store, is_final, read_history
 from csac.studies.job import ROLLOUTS
 from csac.types import InputError
 
 if TYPE_CHECKING:
     import numpy as np
 
-# Of a manifest, what names the cell and what tells where its numbers come from.
-FACTS = (
-    *("task", "algorithm", "hyperparameters", "seeds", "steps", "evaluation", "perturbations"),
-    *("environment_arguments", "events", "state", "steps_done", "failures", "created", "device", "versions", "commit"),
-    "command",
-)
+    from csac.record.manifest import Manifest
 
 
 class Record(NamedTuple):
-    """What one cell has given. `facts` are those of its manifest, its processor and the seconds that it took."""
+    """What one cell has given: its manifest, the seconds that it took as far as they are known, and its tables."""
 
-    cell: Cell
-    facts: dict[str, Any]
+    manifest: Manifest
+    seconds: float
     evaluations: np.ndarray
     rollouts: np.ndarray | None
 
     @property
     def failure(self) -> str:
         """Why it failed, or nothing."""
-        return "; ".join(map(str, self.facts["failures"].values())) if self.facts["state"] == "failed" else ""
+        return "; ".join(self.manifest.failures.values()) if self.manifest.state == "failed" else ""
 
 
 class Source(Protocol):
@@ -54,14 +51,11 @@ class Runs:
 
     def record(self, cell: Cell) -> Record | None:
         """Return what a cell has given, or None where it is not over. Raises InputError for a damaged table."""
-        if not self.store.is_final(cell):
-            return None
         path = self.store.path(cell)
-        run, history = RunDirectory.open(path), read_history(path)
-        facts = {name: run.manifest.get(name) for name in FACTS}
-        facts["processor"] = run.manifest.get("machine", {}).get("processor")
-        facts["seconds"] = history.get("seconds")
-        return Record(cell, facts, run.evaluations, _rows(path / ROLLOUTS))
+        if not is_final(path):
+            return None
+        run, seconds = RunDirectory.open(path), read_history(path).get("seconds", 0.0)
+        return Record(run.manifest, seconds, run.evaluations, _rows(path / ROLLOUTS))
 
 
 class Results:
@@ -72,8 +66,8 @@ class Results:
         self._files: dict[str, Path] = {}
         for path in sorted(self.directory.glob("cells/*/*/seed-*.json")):
             try:
-                self._files[Cell.of_run(json.loads(path.read_bytes())).key] = path
-            except (ValueError, OSError) as error:
+                self._files[Cell.of_run(manifests.read(path.read_bytes())).key] = path
+            except (InputError, OSError) as error:
                 raise InputError(f"{path} is not a cell's: {error}") from None
         if not self._files:
             raise InputError(
@@ -85,8 +79,9 @@ class Results:
         path = self._files.get(cell.key)
         if path is None:
             return None
-        facts = json.loads(path.read_bytes())
-        return Record(cell, facts, read_rows(path.with_suffix(".csv")), _rows(_rollouts(path)))
+        content = path.read_bytes()
+        tables = read_rows(path.with_suffix(".csv")), _rows(_rollouts(path))
+        return Record(manifests.read(content), json.loads(content).get("seconds", 0.0), *tables)
 
 
 def collect(store: Store, cell: Cell, directory: str | Path) -> None:
@@ -99,7 +94,9 @@ def collect(store: Store, cell: Cell, directory: str | Path) -> None:
     write_atomically(path.with_suffix(".csv"), (source / "evaluations.csv").read_bytes())
     if (source / ROLLOUTS).exists():
         write_atomically(_rollouts(path), (source / ROLLOUTS).read_bytes())
-    write_atomically(path, (json.dumps(record.facts, indent=1) + "\n").encode())
+    manifest = dataclasses.replace(record.manifest, machine=dataclasses.replace(record.manifest.machine, host=""))
+    fields = json.loads(manifests.written(dataclasses.replace(manifest, process=None, history=())))
+    write_atomically(path, (json.dumps({**fields, "seconds": record.seconds}, indent=1) + "\n").encode())
 
 
 def _rollouts(path: Path) -> Path:

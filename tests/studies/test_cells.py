@@ -1,11 +1,11 @@
 import dataclasses
-import json
 
 import pytest
 from studying import cell
 
+from csac.record.manifest import EvaluationPlan, Manifest
 from csac.record.run import RunDirectory
-from csac.studies.cells import Cell, Store, complete, write_history
+from csac.studies.cells import Cell, Store, complete, is_final, write_history
 from csac.types import InputError
 
 OTHERS = {
@@ -26,18 +26,18 @@ def make_run(store, one, **manifest):
     """A run as `train` would leave it."""
     return RunDirectory.create(
         store.path(one),
-        {
-            "task": one.task,
-            "algorithm": one.algorithm,
-            "hyperparameters": one.hyperparameters,
-            "seeds": [one.seed],
-            "steps": one.steps,
-            "evaluation": {"interval": one.evaluation_interval, "episodes": one.evaluation_episodes},
-            "perturbations": list(one.perturbations),
-            "environment_arguments": one.environment_arguments,
-            "events": list(one.events),
+        Manifest(
+            task=one.task,
+            algorithm=one.algorithm,
+            hyperparameters=one.hyperparameters,
+            seeds=(one.seed,),
+            steps=one.steps,
+            evaluation=EvaluationPlan(one.evaluation_interval, one.evaluation_episodes),
+            perturbations=one.perturbations,
+            environment_arguments=one.environment_arguments,
+            events=one.events,
             **manifest,
-        },
+        ),
     )
 
 
@@ -94,7 +94,7 @@ def test_what_a_manifest_says_is_the_cell_again(tmp_path):
     store = Store(tmp_path)
     one = cell(perturbations=("friction=2@100",), hyperparameters={"entropy_weight": 0.1, "temperature": "fixed"})
     run = make_run(store, one)
-    assert Cell.of_run(json.loads((run.path / "manifest.json").read_text())) == one
+    assert Cell.of_run(run.manifest) == one
 
 
 def test_a_run_of_before_there_was_a_hyperparameter_is_found(tmp_path):
@@ -115,7 +115,7 @@ def test_states(tmp_path):
     waiting, partial, done, diverged, crashed, busy = (cell(seed) for seed in range(6))
     make_run(store, partial, steps_done=120)
     make_run(store, done, steps_done=300, state="finished")
-    make_run(store, diverged, steps_done=200, state="failed", failures={"3": "step 200: critic is not finite"})
+    make_run(store, diverged, steps_done=200, state="failed", failures={3: "step 200: critic is not finite"})
     make_run(store, crashed, steps_done=100)
     write_history(store.path(crashed), {"seconds": 12.5, "failure": "its process was killed by SIGKILL"})
     states = {one.seed: store.status(one) for one in (waiting, partial, done, diverged, crashed)}
@@ -123,9 +123,9 @@ def test_states(tmp_path):
     assert [status.steps for status in states.values()] == [0, 120, 300, 200, 100]
     assert states[3].reason == "step 200: critic is not finite"
     assert (states[4].reason, states[4].seconds) == ("its process was killed by SIGKILL", 12.5)
-    assert [store.is_final(one) for one in (waiting, partial, done, diverged, crashed)] == [False] * 2 + [True] * 2 + [
-        False
-    ]
+    assert [is_final(store.path(one)) for one in (waiting, partial, done, diverged, crashed)] == [False] * 2 + [
+        True
+    ] * 2 + [False]
     with make_run(store, busy, steps_done=100).locked():
         assert store.status(busy).state == "running"
     assert store.status(busy).state == "partial"

@@ -55,7 +55,8 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
     collected, made = Results("out").record(one), Runs(store).record(one)
     assert collected is not None
     assert made is not None
-    assert collected.facts == made.facts
+    assert (collected.seconds, collected.manifest.versions) == (made.seconds, made.manifest.versions)
+    assert collected.manifest.machine.host == ""
     assert collected.evaluations.tobytes() == made.evaluations.tobytes()
     assert Results("out").record(other) is None
     monkeypatch.setattr(commands, "run_here", lambda jobs, tell: pytest.fail("complete cells are skipped"))

@@ -6,7 +6,7 @@ from resuming import Crash, contents
 from studying import cell, jobs
 
 from csac.record.run import RunDirectory
-from csac.studies.cells import Store
+from csac.studies.cells import Store, is_final
 from csac.studies.engines import run_here, run_in_processes, split_cores
 from csac.studies.job import Advanced, Ended, Started, Stopped
 from csac.tasks.seeds import training_seed
@@ -34,7 +34,7 @@ def test_cells_are_run_to_their_end_and_told(tmp_path):
     store = Store(tmp_path)
     assert [store.status(job.cell).state for job in two] == ["complete", "complete"]
     assert not (two[0].path / "checkpoint").exists()
-    assert RunDirectory.open(two[1].path).manifest["seeds"] == [1]
+    assert RunDirectory.open(two[1].path).manifest.seeds == (1,)
 
 
 def test_a_cell_that_crashed_goes_on_and_leaves_the_same_files(tmp_path, uninterrupted):
@@ -50,8 +50,8 @@ def test_a_cell_that_crashed_goes_on_and_leaves_the_same_files(tmp_path, uninter
     assert Store(tmp_path).status(job.cell).reason == "Crash"
     run_here([job], lambda _: None)
     assert contents(job.path) == uninterrupted
-    (entry,) = RunDirectory.open(job.path).manifest["history"]
-    assert entry["step"] == 120
+    (entry,) = RunDirectory.open(job.path).manifest.history
+    assert entry.step == 120
     assert Store(tmp_path).status(job.cell)._replace(seconds=0) == ("complete", 300, "", 0)
 
 
@@ -64,8 +64,8 @@ def test_a_cell_that_fails_does_not_stop_the_others(tmp_path):
     reasons = [store.status(job.cell).reason for job in wrong]
     assert "no task is called Hoppper-v4" in reasons[0]
     assert reasons[1].startswith("step ")
-    assert not store.is_final(wrong[0].cell)
-    assert store.is_final(wrong[1].cell)
+    assert not is_final(wrong[0].path)
+    assert is_final(wrong[1].path)
 
 
 def test_a_cell_that_another_process_has_is_left_to_it(tmp_path):
