@@ -61,7 +61,7 @@ gpu: $(SETUP) $(if $(shell command -v nvidia-smi),$(CUDA))  ## Measure training 
 	.venv/bin/python -m benchmarks gpu --write $(ARGS)
 
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml
-	$(UV) pip compile pyproject.toml --extra robots --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
+	$(UV) pip compile pyproject.toml --extra robots --extra cluster --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
 		--no-emit-index-url --no-annotate --no-header --quiet --output-file requirements.lock
 
 clean:  ## Remove .venv, .tools and caches; runs stay

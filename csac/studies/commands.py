@@ -101,13 +101,23 @@ class Run(Chosen):
     """
 
     engine: Annotated[
-        Literal["local", "processes"] | None, arg(help_behavior_hint="(default: processes, where there are cores)")
+        Literal["local", "processes", "ray"] | None,
+        arg(help_behavior_hint="(default: processes, where there are cores)"),
     ] = None
-    """local: one cell after another, in this process. processes: as many at once as there are workers."""
+    """local: one cell after another, in this process. processes: as many at once as there are workers. ray: as many as
+    a Ray cluster has room for (docs/cluster.md)."""
     workers: Annotated[int | None, arg(help_behavior_hint="(default: one for each core)")] = None
     """Processes that run a cell each, on their own share of the cores."""
     cell: Annotated[int | None, arg(help_behavior_hint="(default: all)")] = None
     """Run the cell of this number alone, as csac study show counts them: one job of an array."""
+    address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: a new one, here)")] = None
+    """The Ray cluster, with --engine ray; auto is the one that this machine belongs to."""
+    cell_cores: int = 1
+    """Cores that each cell asks Ray for."""
+    cell_gpus: float = 0.0
+    """GPUs, or a share of one, that each cell asks Ray for."""
+    cell_memory: float = 0.0
+    """GiB of memory that each cell asks Ray for; 0 asks for none in particular."""
     device: Literal["cpu", "gpu"] = "cpu"
     """Where the networks learn."""
     results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
@@ -281,6 +291,15 @@ def command_line() -> str:
 def _engine(options: Run) -> Engine:
     if options.workers is not None and options.workers < 1:
         raise InputError(f"--workers must be at least 1, not {options.workers}")
+    if options.engine == "ray":
+        from csac.studies.cluster import Request, run_on_ray  # an optional dependency
+
+        if options.cell_cores < 1 or options.cell_gpus < 0 or options.cell_memory < 0:
+            raise InputError("--cell-cores is at least 1, --cell-gpus and --cell-memory are not below 0")
+        request = Request(options.cell_cores, options.cell_gpus, options.cell_memory)
+        return partial(run_on_ray, address=options.address, request=request)
+    if options.address:
+        raise InputError("--address is a Ray cluster's: add --engine ray")
     several = len(usable_cores()) > 1 and options.cell is None and options.device == "cpu"
     engine = options.engine or ("processes" if several or options.workers else "local")
     if engine == "local" and options.workers:

@@ -120,6 +120,8 @@ def test_a_signal_is_an_exit_code_and_the_line_to_type(monkeypatch, capsys):
         ("study run tiny.toml --cell 2", "--cell counts from 0 to 1, not 2"),
         ("study run tiny.toml --workers 0", "--workers must be at least 1, not 0"),
         ("study run tiny.toml --engine local --workers 2", "leave out --workers"),
+        ("study run tiny.toml --address 10.0.0.1:6379", "add --engine ray"),
+        ("study run tiny.toml --engine ray --cell-cores 0", "--cell-cores is at least 1"),
         ("study run tiny.toml --scale 2", "scale is a share of the steps"),
         ("study run tiny.toml --tasks Ant-v4", "tiny has no task 'Ant-v4': there is Hopper-v4"),
         ("study run smoke --tasks Swimmer-v4", "has no task 'Swimmer-v4'"),

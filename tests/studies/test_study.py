@@ -1,7 +1,10 @@
+from collections import Counter
+from pathlib import Path
+
 import pytest
 from studying import TINY, write
 
-from csac.studies.named import NAMED, find
+from csac.studies.named import NAMED, WHOLE, find
 from csac.studies.study import Method, Study, cells_of, read_study
 from csac.types import InputError
 
@@ -80,6 +83,16 @@ def test_studies_share_what_they_have_in_common():
     assert len(keys["reference"] & keys["mujoco"]) == 3 * 3 * 5  # SAC, algorithm 1 and the default
     assert len(keys["mujoco"]) == 4 * 6 * 5
     assert len(keys["robustness"]) == 3 * 3 * 5
+
+
+def test_the_page_on_clusters_says_how_many_steps_there_are():
+    steps, cells = Counter[str](), cells_of(WHOLE)
+    for one in cells:
+        steps[one.algorithm] += one.steps // 10**6
+    page = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text()
+    assert f"| CSAC | {steps['csac']} |\n| SAC | {steps['sac']} |" in page
+    assert {steps[name] for name in ("ppo", "td3", "sd3")} == {35}
+    assert f"| together | {sum(steps.values())}, in {len(cells)} cells |" in page
 
 
 def test_smoke_has_something_of_every_study():
