@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from csac.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
+from csac.processes import Child, die_with_parent, move_to, usable_cores
 from csac.record.files import write_atomically
 
 if TYPE_CHECKING:
@@ -92,8 +92,7 @@ class Calibration:
         try:
             outcome = child.connection.recv()
         except EOFError:
-            child.process.join()
-            outcome = cause_of_death(child.process.exitcode)
+            outcome = child.cause_of_death()
         finally:
             child.kill()
         if isinstance(outcome, str):

@@ -25,7 +25,7 @@ from csac.studies.engines import run_here, run_in_processes
 from csac.studies.job import Ended, Job, Message, Stopped, is_over
 from csac.studies.named import NAMED, find
 from csac.studies.progress import StudyProgress
-from csac.studies.results import collect
+from csac.studies.results import Results, Runs, collect
 from csac.studies.study import Study, cells_of
 from csac.types import InputError
 
@@ -45,6 +45,7 @@ The paper's experiments, and your own, as studies: tasks x methods x seeds, one 
   csac study list           the studies that there are
   csac study show NAME      the cells of one, how far they are, and what the rest will take
   csac study run NAME       run what is not complete yet; Ctrl-C at any time, and run it again
+  csac study report NAME    claims, tables and figures of what is complete
 
   csac study COMMAND --help  explain a command and its options
 
@@ -75,6 +76,14 @@ class Chosen:
         """Return the studies that are meant."""
         tasks, algorithms = (None if text is None else text.split(",") for text in (self.tasks, self.algorithms))
         return narrowed([study.shortened(self.scale) for study in find(self.name)], tasks, algorithms, self.seeds)
+
+    def words(self) -> list[str]:
+        """Return what to type for the same choice, wherever the runs are."""
+        words = [self.name]
+        words += ["--scale", f"{self.scale:g}"] * (self.scale != 1)
+        for name, value in (("--tasks", self.tasks), ("--algorithms", self.algorithms), ("--seeds", self.seeds)):
+            words += [] if value is None else [name, str(value)]
+        return words
 
 
 @dataclass(frozen=True)
@@ -124,6 +133,16 @@ class Run(Chosen):
     """Copy the evaluations and a small manifest of each cell that is over there: what a report needs."""
     keep_checkpoints: FlagCreatePairsOff[bool] = False
     """Keep the checkpoints of finished cells too: they hold the replay, and take most of the room."""
+
+
+@dataclass(frozen=True)
+class Report(Chosen):
+    """Write a report of a study: the paper's claims, its numbers beside those measured, figures, commands."""
+
+    results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the runs themselves)")] = None
+    """Make it from the files that csac study run --results has collected, and from nothing else."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: below runs/studies/reports)")] = None
+    """Where report.md and its figures go; with --results beside them by default."""
 
 
 def narrowed(
@@ -270,7 +289,32 @@ def run(options: Run) -> int:
     return _conclude(cells, labels, store, console)
 
 
-COMMANDS: Mapping[str, tuple[type, Any]] = {"list": (List, list_studies), "show": (Show, show), "run": (Run, run)}
+def report(options: Report) -> int:
+    """Write the report and print where it is."""
+    from csac.studies.report import write_report  # matplotlib is slow to import
+
+    studies, store, console = options.studies(), Store(options.directory), make_console()
+    source = Results(options.results) if options.results else Runs(store)
+    scale = f"-scale-{studies[0].scale:g}" if options.scale < 1 else ""
+    folder = options.out or options.results or Path("runs/studies/reports", f"{Path(options.name).stem}{scale}")
+    chosen = options.words()
+    results = [] if options.results is None else ["--results", str(options.results)]
+    path = write_report(
+        studies,
+        source,
+        folder,
+        [shlex.join(["csac", "study", command, *chosen, *results]) for command in ("run", "report")],
+    )
+    _say(console, str(path))
+    return 0
+
+
+COMMANDS: Mapping[str, tuple[type, Any]] = {
+    "list": (List, list_studies),
+    "show": (Show, show),
+    "run": (Run, run),
+    "report": (Report, report),
+}
 
 
 def labels_of(studies: Iterable[Study]) -> dict[str, str]:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING, Any, Protocol
 
-from csac.processes import Child, cause_of_death, usable_cores
+from csac.processes import Child, usable_cores
 from csac.studies.cells import read_history, write_history
 from csac.studies.job import Ended, Job, Message, Started, Stopped, execute
 from csac.studies.worker import work
@@ -106,10 +106,9 @@ class _Worker:
         try:
             return self.child.connection.recv()
         except (EOFError, OSError):
-            self.child.process.join()
+            reason = self.child.cause_of_death()
         if self._is_stopping:
             return Ended(self.job.cell.key, "stopped")
-        reason = cause_of_death(self.child.process.exitcode)
         with suppress(OSError):
             write_history(self.job.path, {**read_history(self.job.path), "failure": reason})
         return Ended(self.job.cell.key, "failed", reason)
