@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+# A process whose pipe is closed is about to end: its exit code says why.
+SECONDS_TO_END = 10.0
+
 _PR_SET_PDEATHSIG = 1
 
 
@@ -61,6 +64,13 @@ class Child:
         with suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send(message)
 
+    def cause_of_death(self) -> str:
+        """Wait until a process that speaks no more is gone; return how it ended, as the end of a sentence."""
+        self.process.join(SECONDS_TO_END)
+        code = self.process.exitcode
+        self.kill()
+        return "its process spoke no more and was killed" if code is None else cause_of_death(code)
+
     def kill(self) -> None:
         """End the process at once, and wait until it is gone."""
         if self.process.is_alive():
@@ -88,10 +98,17 @@ def worker_surroundings() -> Iterator[None]:
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
-def cause_of_death(exit_code: int | None) -> str:
-    """Return how a process ended, as the end of a sentence."""
-    if exit_code is not None and exit_code < 0:
-        name = signal.Signals(-exit_code).name
-        hint = " (out of memory?)" if name == "SIGKILL" else ""
-        return f"its process was killed by {name}{hint}"
-    return f"its process ended with exit code {exit_code}"
+def cause_of_death(exit_code: int) -> str:
+    """Return how a process ended that nobody asked to end, as the end of a sentence."""
+    if exit_code >= 0:
+        return f"its process ended by itself with exit code {exit_code} (does the task call os._exit?)"
+    name = _signal_name(-exit_code)
+    hints = {"SIGKILL": " (out of memory?)", "SIGSEGV": " (a fault in native code, such as the task's simulator)"}
+    return f"its process was killed by {name}{hints.get(name, '')}"
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # a real-time signal
+        return f"signal {number}"

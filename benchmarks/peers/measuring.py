@@ -15,7 +15,7 @@ STEPS = 1_000_000  # what training is asked for, and never reached: the window e
 
 
 def argument_parser(description, algorithms):
-    """Return a parser of what `speed.py` gives; a script that is run by hand has defaults for most of it."""
+    """Return a parser of what `python -m benchmarks peers` gives; by hand, most of it has defaults."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--algorithm", choices=algorithms, default=algorithms[0])
     parser.add_argument("--task", default="HalfCheetah-v4")

@@ -1,4 +1,4 @@
-"""One measurement of SB3 or SBX, in a process of its own; `benchmarks/speed.py` runs it with the peers' Python.
+"""One measurement of SB3 or SBX, in a process of its own; `python -m benchmarks peers` runs it with the peers' Python.
 
 It prints one line of JSON.
 """

@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from csac.evaluation.evaluator import EvaluationEpisode, EvaluationFailure, Evaluator
-from csac.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
+from csac.processes import Child, die_with_parent, move_to, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -91,7 +91,9 @@ class EvaluationPool:
         self.info_names |= running.info_names
         return episodes
 
-    def begin(self, policies: Sequence[Policy], deterministic: bool = True, stop_at_failure: bool = False) -> Running:
+    def begin(
+        self, policies: Sequence[Policy], deterministic: bool = True, stop_at_failure: bool = False
+    ) -> PendingEvaluation:
         """Begin to evaluate policies and return. The run before must be over.
 
         With `stop_at_failure` a failing batch leaves out all that no process has begun, else those of its own policy.
@@ -102,7 +104,7 @@ class EvaluationPool:
             (index, first): (policies[index], first, deterministic, self._evaluator.perturbed)
             for index, first in batches
         }
-        return Running(list(self._workers), tasks, len(policies) * self._evaluator.episodes, stop_at_failure)
+        return PendingEvaluation(list(self._workers), tasks, len(policies) * self._evaluator.episodes, stop_at_failure)
 
     def close(self) -> None:
         """End the processes; another run starts new ones."""
@@ -118,7 +120,7 @@ class EvaluationPool:
             self._workers.append(_Worker(self._evaluator, self._cores))
 
 
-class Running:
+class PendingEvaluation:
     """A run of an `EvaluationPool` that is on its way.
 
     The processes have a batch each, in order, and are given the next whenever somebody waits here or asks whether it is
@@ -207,8 +209,7 @@ class _Worker(Child):
         try:
             return self.connection.recv()
         except (EOFError, OSError):
-            self.kill()
-            return ProcessDied(f"the evaluation was broken off: {cause_of_death(self.process.exitcode)}")
+            return ProcessDied(f"the evaluation was broken off: {self.cause_of_death()}")
 
 
 def _work(connection: Connection, evaluator: Evaluator, cores: Sequence[int] | None) -> None:

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 Table = Literal["episodes", "metrics", "evaluations"]
 Which = Literal["last", "best"]
 
-GROWING_FILES = ("evaluations.csv", "episodes.csv", "metrics.csv", "log.txt")
 LOCK = ".lock"
 MANIFEST = "manifest.json"
 
@@ -128,31 +127,10 @@ class RunDirectory:
         return self.rows("evaluations")
 
     def log(self, line: str) -> None:
-        """Add one line to log.txt."""
+        """Add a line to log.txt, after the time of now."""
+        moment = datetime.now().astimezone().isoformat(timespec="seconds")
         with open(self.path / "log.txt", "a", encoding="utf-8") as file:
-            file.write(line.rstrip("\n") + "\n")
-
-    def sync(self) -> dict[str, int]:
-        """Push what was appended so far to the disk and return the size of each growing file in bytes."""
-        sizes = {}
-        for name in GROWING_FILES:
-            with suppress(FileNotFoundError), open(self.path / name, "rb") as file:
-                os.fsync(file.fileno())
-                sizes[name] = file.seek(0, os.SEEK_END)
-        return sizes
-
-    def cut_back(self, sizes: Mapping[str, int]) -> None:
-        """Undo what was appended after `sync` returned these sizes.
-
-        Raises InputError, and changes nothing, where a file is shorter than it was.
-        """
-        for name, size in sizes.items():
-            path = self.path / name
-            if not path.exists() or path.stat().st_size < size:
-                raise InputError(f"{path} has lost rows since the checkpoint: restore it from a copy")
-        for name in GROWING_FILES:
-            with suppress(FileNotFoundError):
-                os.truncate(self.path / name, sizes[name]) if name in sizes else (self.path / name).unlink()
+            file.write(f"{moment} {line.rstrip()}\n")
 
     @contextmanager
     def locked(self) -> Iterator[None]:

@@ -102,7 +102,7 @@ def read_rows(path: str | Path) -> np.ndarray:
             raise InputError(f"{path}, line {number}: {len(cells)} cells instead of {len(header)}; remove that line")
     try:
         return structured(header, body)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise InputError(f"{path} is damaged ({error}); remove the line that holds it") from None
 
 

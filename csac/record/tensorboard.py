@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboardX.proto.event_pb2 import Event as TensorBoardEvent  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboardX.proto.event_pb2 import SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
-from csac.record.statistics import is_case, mean_told
+from csac.record.statistics import is_case, mean_over_episodes
 from csac.record.tables import COLUMNS
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class TensorBoardLog:
         self, path: Path, seeds: Sequence[int], begin: int = 0, clock: Callable[[], float] = time.monotonic
     ) -> None:
         purge = begin + 1 if begin else None  # what a run wrote after the step that it goes on from
-        self._files = {seed: _EventFile(path / f"seed_{seed}", purge) for seed in seeds}
+        self._files = {seed: _SeedFile(path / f"seed_{seed}", purge) for seed in seeds}
         self._begin = begin
         self._recent: dict[int, deque[tuple[float, int]]] = {seed: deque(maxlen=EPISODES_AVERAGED) for seed in seeds}
         self._cases: set[str] = set()  # events that happen or do not: where nobody speaks of one, it did not
@@ -76,7 +77,7 @@ class TensorBoardLog:
                     self._cases.add(name)
                 elif not np.isnan(told).all():
                     self._cases.discard(name)
-                mean = mean_told(told, name in self._cases)
+                mean = mean_over_episodes(told, name in self._cases)
                 if not np.isnan(mean):
                     values["eval/success_rate" if name == "success" else f"eval/{name}"] = mean
             self._write(seed, step, values)
@@ -88,10 +89,10 @@ class TensorBoardLog:
 
     def _write(self, seed: int, step: int, values: Mapping[str, Any]) -> None:
         for tag, value in values.items():
-            self._files[seed].add(Event(step=step, summary=Summary(value=[_value(tag, value)])))
+            self._files[seed].add(TensorBoardEvent(step=step, summary=Summary(value=[_value(tag, value)])))
 
 
-class _EventFile:
+class _SeedFile:
     """One seed's file.
 
     Not tensorboardX's own writer: its thread dies of a full disk, and whoever adds to its queue then waits for ever.
@@ -99,25 +100,25 @@ class _EventFile:
 
     def __init__(self, folder: Path, purge_step: int | None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._events: EventsWriter | None = EventsWriter(str(folder / "events"))
+        self._writer: EventsWriter | None = EventsWriter(str(folder / "events"))
         self._flushed = time.monotonic()
         if purge_step is not None:
-            self.add(Event(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
+            self.add(TensorBoardEvent(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
 
-    def add(self, event: Event) -> None:
-        assert self._events
-        event.wall_time = time.time()
-        self._events.write_event(event)
+    def add(self, record: TensorBoardEvent) -> None:
+        assert self._writer
+        record.wall_time = time.time()
+        self._writer.write_event(record)
         if time.monotonic() - self._flushed >= FLUSH_SECONDS:
-            self._events.flush()
+            self._writer.flush()
             self._flushed = time.monotonic()
 
     def close(self) -> None:
         """Close the file; what cannot be written is left out, since nothing depends on it."""
-        events, self._events = self._events, None
-        if events:
+        writer, self._writer = self._writer, None
+        if writer:
             with suppress(OSError):
-                events.close()
+                writer.close()
 
 
 def _value(tag: str, value: float) -> Summary.Value:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import math
+import multiprocessing
 from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import Any
@@ -16,6 +19,7 @@ from csac.tasks.physics import NOISES, PHYSICS, Noise, Physics
 from csac.tasks.silence import quietly
 from csac.tasks.snapshots import restore, snapshot
 from csac.tasks.spaces import (
+    RAISED,
     ContractParts,
     EnvironmentFailure,
     action_parts,
@@ -28,6 +32,9 @@ from csac.tasks.spaces import (
     size,
 )
 from csac.types import InputError, Snapshot, Spec
+
+_log = logging.getLogger(__name__)
+_said: set[str] = set()
 
 
 class Environment:
@@ -50,6 +57,8 @@ class Environment:
             arguments["render_mode"] = render_mode
         self.raw = make(task, arguments)
         self.task_name = task_name(task, self.raw)
+        if multiprocessing.parent_process() is None:  # which has made one too, or will
+            _say_once(self.task_name, known.wrapper_notes(self.raw))
         self._quietly = quietly if known.is_pybullet(self.raw) else nullcontext
         self.has_memory = known.has_memory(task, self.raw)
         try:
@@ -95,7 +104,7 @@ class Environment:
         try:
             with self._quietly():
                 observation, _ = self.raw.reset(seed=seed)
-        except Exception as error:
+        except RAISED as error:
             raise EnvironmentFailure(f"reset raised {one_line(error)}") from error
         try:
             return self._flatten(observation)
@@ -125,13 +134,22 @@ class Environment:
         try:
             observation, reward, terminated, truncated, info = self.raw.step(action)
             terminated, truncated, info = bool(terminated), bool(truncated), dict(info)
-        except Exception as error:
+        except RAISED as error:
             raise EnvironmentFailure(f"step raised {one_line(error)}") from error
         return self._flatten(observation), scalar(reward), terminated, truncated, info
 
     def snapshot(self) -> Snapshot | None:
-        """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell."""
-        saved = snapshot(self.raw)
+        """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell.
+
+        Raises:
+            EnvironmentFailure: its `get_snapshot` raised, or gave what cannot be saved.
+        """
+        try:
+            saved = snapshot(self.raw)
+        except RAISED as error:
+            raise EnvironmentFailure(f"get_snapshot raised {one_line(error)}") from error
+        if saved:
+            _check_savable(saved)
         if saved and self._noise:
             saved.values["noise"] = self._noise.state()
         return saved
@@ -147,13 +165,16 @@ class Environment:
             restore(self.raw, saved)
             if self._noise:
                 self._noise.take_back(saved.values.get("noise", {}))
-        except Exception as error:
+        except RAISED as error:
             raise EnvironmentFailure(f"the environment does not take its snapshot back: {one_line(error)}") from error
 
     def close(self) -> None:
-        """Close the Gymnasium environment."""
-        with self._quietly():
-            self.raw.close()
+        """Close the Gymnasium environment. What that raises is logged: it takes nothing back of what was done."""
+        try:
+            with self._quietly():
+                self.raw.close()
+        except RAISED as error:
+            _log.warning("%s: close raised %s", getattr(self, "task_name", "the task"), one_line(error))
 
     def _flatten(self, observation: Any) -> np.ndarray:
         """Copy the observation, since environments may reuse their array."""
@@ -174,3 +195,22 @@ class Environment:
         raw = {key: part.reshape(shape) for (key, shape), part in zip(self._parts, np.split(noisy, ends), strict=True)}
         self.raw_observation = raw.get(None, raw)
         return noisy
+
+
+def _say_once(task_name: str, notes: list[str]) -> None:
+    """Log what the user should know of a task, once in this process."""
+    for note in notes:
+        if note not in _said:
+            _log.warning("note: %s: %s", task_name, note)
+    _said.update(notes)
+
+
+def _check_savable(saved: Snapshot) -> None:
+    """Raise EnvironmentFailure where an environment gave what a file of arrays and JSON cannot hold."""
+    for name, array in saved.arrays.items():
+        if array.dtype.kind not in "biuf":
+            raise EnvironmentFailure(f"get_snapshot gave {name.removeprefix('own.')!r}, which is no array of numbers")
+    try:
+        json.dumps(saved.values)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise EnvironmentFailure(f"get_snapshot gave values that JSON cannot hold: {one_line(error)}") from error

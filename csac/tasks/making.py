@@ -15,7 +15,7 @@ import gymnasium
 
 from csac.tasks import known
 from csac.tasks.silence import quietly
-from csac.tasks.spaces import message, one_line
+from csac.tasks.spaces import RAISED, message, one_line
 from csac.types import InputError
 
 Task = str | Callable[..., gymnasium.Env]
@@ -25,6 +25,7 @@ _log = logging.getLogger(__name__)
 
 def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
     """Return a new environment. Raises InputError where there is no such task or it refuses its arguments."""
+    _check_task(task)
     name = task if isinstance(task, str) else _name_of(task) or "the task"
     adapter = known.adapter_of(task)
     _silence_mujoco()
@@ -40,12 +41,22 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
             if adapter:
                 raise InputError(known.missing(name, error)) from error
             raise InputError(f"{name} needs a package that is not installed: {message(error)}") from error
-        except Exception as error:
+        except RAISED as error:
             given = f" with the arguments {arguments}" if arguments else ""
             raise InputError(f"{name} could not be made{given}: {one_line(error)}") from error
     if not isinstance(environment, gymnasium.Env):
         raise InputError(f"{name} gave a {type(environment).__name__}: a task's callable returns a gymnasium.Env")
     return environment
+
+
+def _check_task(task: object) -> None:
+    if isinstance(task, gymnasium.Env):
+        raise InputError(
+            f"the task is an environment already made ({type(task).__name__}), and csac makes several: "
+            "give its id, or a function that makes one, such as lambda: gymnasium.make(...)"
+        )
+    if not isinstance(task, str) and not callable(task):
+        raise InputError(f"a task is a Gymnasium id or a function that makes an environment, not {task!r}")
 
 
 def _registered(task: str) -> str:
@@ -54,7 +65,7 @@ def _registered(task: str) -> str:
     if module:
         try:
             importlib.import_module(module)
-        except Exception as error:
+        except RAISED as error:
             raise InputError(f"{task}: the module {module} cannot be imported: {one_line(error)}") from error
     known.register(name)
     if name in gymnasium.registry and not _is_gone(gymnasium.registry[name]):

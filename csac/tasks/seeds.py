@@ -125,8 +125,15 @@ class SeedEnvironments:
         self._rest(index)
 
     def save(self, index: int) -> Snapshot:
-        """Return what the seed at this place needs to go on; without "exact", from the start of its episode."""
-        inner = self.environments[index].snapshot() if self.alive[index] else None
+        """Return what the seed at this place needs to go on; without "exact", from the start of its episode.
+
+        "problem" says what is wrong with an environment that offers to be saved and cannot.
+        """
+        inner, problem = None, ""
+        try:
+            inner = self.environments[index].snapshot() if self.alive[index] else None
+        except EnvironmentFailure as error:
+            problem = str(error)
         arrays = {"observation": self._observation[index].copy(), **(inner.arrays if inner else {})}
         values = {
             "alive": bool(self.alive[index]),
@@ -135,6 +142,7 @@ class SeedEnvironments:
             "episode_return": self._returns[index],
             "episode_length": self._lengths[index],
             "exact": inner is not None,
+            "problem": problem,
             "environment": inner.values if inner else {},
         }
         return Snapshot(arrays, values)

@@ -15,6 +15,10 @@ Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
+# What an environment may raise that is its own failure; a script that ends with `sys.exit` is one too.
+RAISED = (Exception, SystemExit)
+
+
 class EnvironmentFailure(RuntimeError):
     """An environment raised, or gave what is not a finite number of the right shape. The message is one line."""
 
@@ -56,7 +60,10 @@ def action_parts(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray, np.n
     if not low.size:
         raise InputError("the action space is empty: there is nothing to learn")
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise InputError("the action space has no bounds: wrap the environment in gymnasium.wrappers.RescaleAction")
+        raise InputError(
+            "the action space has no bounds: give it some, as gymnasium.wrappers.TransformAction(environment, "
+            f"lambda action: action, gymnasium.spaces.Box(-1.0, 1.0, {space.shape})) does"
+        )
     return space.low.shape, low, high
 
 
@@ -120,11 +127,11 @@ def scalar(reward: Any) -> float:
     return reward
 
 
-def message(error: Exception) -> str:
+def message(error: BaseException) -> str:
     """Return what an error says, in one line."""
     return " ".join(str(error).split())
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """Return an error's type and what it says, in one line."""
     return f"{type(error).__name__}: {message(error)}" if str(error) else type(error).__name__

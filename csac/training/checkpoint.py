@@ -3,38 +3,46 @@
     checkpoint/step_<n>.json                      the checkpoint itself: which files it is made of, with their checksums
     checkpoint/step_<n>.seed_<k>.safetensors      what seed k has learnt, its environment and its counters
     checkpoint/step_<n>.seed_<k>.best.safetensors its best policy so far
+    checkpoint/step_<n>.<table>.csv               the tables of the run by then
     checkpoint/replay/seed_<k>.<a>-<b>.safetensors  the transitions a to b - 1 of seed k
+    checkpoint/replay/seed_<k>.<a>-<b>.parity       what mends that file where it is damaged in one place
 
 Transitions never change once they are made, so each checkpoint only adds those that are new: its cost does not grow
-with the replay. The JSON file is written last, so a checkpoint that was cut off does not exist.
+with the replay. All checkpoints share them, which is why they alone have a parity; what each checkpoint has for itself
+is there twice, since two are kept. The JSON file is written last, so a checkpoint that was cut off does not exist.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 import re
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import safetensors.numpy
 
 from csac.record.files import write_atomically
+from csac.record.parity import mended, parity_of
 from csac.types import InputError, Ring, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 FOLDER = "checkpoint"
+BEST = ".best.safetensors"
 
 _NUMBER = r"[0-9]{1,15}"
 _FILE_NAME = re.compile(
-    rf"(step_{_NUMBER}\.seed_{_NUMBER}(\.best)?|replay/seed_{_NUMBER}\.{_NUMBER}-{_NUMBER})\.safetensors"
+    rf"step_{_NUMBER}\.(seed_{_NUMBER}(\.best)?\.safetensors|(evaluations|episodes|metrics)\.csv)"
+    rf"|replay/seed_{_NUMBER}\.{_NUMBER}-{_NUMBER}\.(safetensors|parity)"
 )
+_BLOCK = 4096  # bytes that are read at a time where the disk cannot read all
 
 Files = dict[str, dict[str, Any]]  # name below the folder -> {"bytes": size, "sha256": checksum}
 
@@ -54,7 +62,8 @@ class SeedFiles:
 
     def __init__(self, folder: Path, seed: int, known: Mapping[str, dict[str, Any]]) -> None:
         self.folder, self.seed = folder, seed
-        self._shards = {name: known[name] for _, _, name in _shards(known, seed)}
+        shards = [name for _, _, name in _shards(known, seed)]
+        self._shards = {name: known[name] for name in [*shards, *map(_parity_name, shards)] if name in known}
 
     def write(self, step: int, saved: Snapshot, memory: Ring) -> Files:
         """Write what is new at this step; return every file that the seed needs now.
@@ -64,32 +73,39 @@ class SeedFiles:
         """
         for folder in (self.folder, self.folder / "replay"):  # not their parents: a run that was deleted stays so
             folder.mkdir(exist_ok=True)
-        self._write_new_rows(memory)
+        oldest = max(memory.count - len(memory.rows), 0)
+        self._write_new_rows(memory, oldest)
         name = f"step_{step}.seed_{self.seed}.safetensors"
         content = safetensors.numpy.save(
             {key: np.asarray(array, order="C") for key, array in saved.arrays.items()},
-            metadata={"values": json.dumps(saved.values)},
+            metadata={"values": json.dumps(saved.values), "transitions": json.dumps([oldest, memory.count])},
         )
-        return {name: _write(self.folder, name, content), **self._shards}
+        return {name: write_file(self.folder, name, content), **self._shards}
 
-    def _write_new_rows(self, memory: Ring) -> None:
-        capacity, oldest = len(memory.rows), memory.count - len(memory.rows)
+    def _write_new_rows(self, memory: Ring, oldest: int) -> None:
         last = max((last for _, last, _ in _shards(self._shards, self.seed)), default=0)
         first = max(last, oldest)
         if first < memory.count:
-            rows = memory.rows[np.arange(first, memory.count) % capacity]
+            rows = memory.rows[np.arange(first, memory.count) % len(memory.rows)]
+            content = safetensors.numpy.save({"rows": rows})
             name = f"replay/seed_{self.seed}.{first}-{memory.count}.safetensors"
-            self._shards[name] = _write(self.folder, name, safetensors.numpy.save({"rows": rows}))
+            self._shards[name] = write_file(self.folder, name, content)
+            self._shards[_parity_name(name)] = write_file(self.folder, _parity_name(name), parity_of(content))
         for _, last, name in _shards(self._shards, self.seed):
             if last <= oldest:
                 del self._shards[name]
+                self._shards.pop(_parity_name(name), None)
 
 
 class Checkpoint:
-    """One checkpoint on disk. `values` is what the run as a whole noted down with it."""
+    """One checkpoint on disk. `values` is what the run as a whole noted down with it.
+
+    `mended` are the files of transitions that were read, found damaged and mended; on disk they still are as they were.
+    """
 
     def __init__(self, folder: Path, step: int, files: Files, values: dict[str, Any]) -> None:
         self.folder, self.step, self.files, self.values = folder, step, files, values
+        self.mended: set[str] = set()
 
     @classmethod
     def open(cls, folder: Path, step: int) -> Checkpoint:
@@ -103,7 +119,10 @@ class Checkpoint:
             fields = json.loads(path.read_bytes())
             checksum = fields.pop("sha256")
             if fields["schema_version"] != SCHEMA_VERSION:
-                raise Damaged(f"{path} is of schema {fields['schema_version']!r}, and this csac reads {SCHEMA_VERSION}")
+                raise Damaged(
+                    f"{path} is of schema {fields['schema_version']!r} and this csac reads {SCHEMA_VERSION}: "
+                    "go on with the csac that wrote it"
+                )
             if checksum != _sha256(_encoded(fields)) or fields["step"] != step:
                 raise Damaged(f"{path} has changed since it was written")
             return cls(folder, step, _checked_files(fields["files"]), _checked_values(fields["values"]))
@@ -113,37 +132,91 @@ class Checkpoint:
             raise Damaged(f"{path} is not a checkpoint ({type(error).__name__}: {error})") from error
 
     def verify(self) -> None:
-        """Read every file once.
+        """Read every file once that learning goes on from, and the tables.
 
         Raises:
-            Damaged: one is missing, cut off or changed.
+            Damaged: one is missing, cut off or changed, and cannot be mended. Best policies are not looked at.
         """
-        for name, facts in self.files.items():
-            _read(self.folder, name, facts)
+        for name in self.files:
+            if not name.endswith((BEST, ".parity")):
+                self.read(name)
+
+    def read(self, name: str) -> bytes:
+        """Return the content of one of the files. Raises Damaged.
+
+        Where it is damaged, transitions are mended, and of a table or a best policy the run itself may have the same.
+        """
+        path, facts = self.folder / name, self.files[name]
+        try:
+            content = _content(path)
+        except OSError as error:
+            if (right := self._original(name)) is not None:
+                return right
+            raise Damaged(f"{path} cannot be read: {error.strerror}") from error
+        if _is(content, facts):
+            return content
+        if (right := self._mended(name, content)) is not None:
+            self.mended.add(name)
+            return right
+        if (right := self._original(name)) is not None:
+            return right
+        if len(content) != facts["bytes"]:
+            raise Damaged(f"{path} has {len(content)} bytes instead of {facts['bytes']}")
+        raise Damaged(f"{path} has changed since it was written: its checksum is another")
 
     def seed(self, seed: int) -> Snapshot:
         """Return what was saved of a seed. Raises Damaged."""
-        name = f"step_{self.step}.seed_{seed}.safetensors"
-        if name not in self.files:
-            raise Damaged(f"{self.folder} has nothing of seed {seed} at step {self.step}")
-        content = _read(self.folder, name, self.files[name])
-        try:
-            # The header: eight bytes of length, then JSON. The library gives the metadata of files alone.
-            header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-            return Snapshot(safetensors.numpy.load(content), json.loads(header["__metadata__"]["values"]))
-        except (safetensors.SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
-            raise Damaged(f"{self.folder / name} is not what csac writes ({error})") from error
+        return self._read_seed(seed)[0]
 
     def memory(self, seed: int, rows: np.ndarray) -> None:
         """Put a seed's transitions into a ring [capacity, width]. Raises Damaged."""
+        _, (reached, count) = self._read_seed(seed)
         for first, last, name in sorted(_shards(self.files, seed)):
+            if last <= reached:
+                continue
+            if first > reached:
+                raise Damaged(f"{self.folder} lacks the transitions {reached} to {first - 1} of seed {seed}")
             try:
-                shard = safetensors.numpy.load(_read(self.folder, name, self.files[name]))["rows"]
+                shard = safetensors.numpy.load(self.read(name))["rows"]
                 if shard.shape != (last - first, rows.shape[1]) or shard.dtype != rows.dtype:
                     raise ValueError(f"{shard.dtype} {shard.shape} where the memory has {rows.dtype} {rows.shape}")
                 rows[np.arange(first, last) % len(rows)] = shard
             except (safetensors.SafetensorError, ValueError, KeyError) as error:
                 raise Damaged(f"{self.folder / name} does not fit: {error}") from error
+            reached = last
+        if reached != count:
+            raise Damaged(f"{self.folder} has {reached} transitions of seed {seed} at step {self.step}, not {count}")
+
+    def _read_seed(self, seed: int) -> tuple[Snapshot, tuple[int, int]]:
+        """Return what was saved of a seed, and the transitions [first, last + 1] that its memory held."""
+        name = f"step_{self.step}.seed_{seed}.safetensors"
+        if name not in self.files:
+            raise Damaged(f"{self.folder} has nothing of seed {seed} at step {self.step}")
+        content = self.read(name)
+        try:
+            # The header: eight bytes of length, then JSON. The library gives the metadata of files alone.
+            metadata = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
+            first, last = json.loads(metadata["transitions"])
+            return Snapshot(safetensors.numpy.load(content), json.loads(metadata["values"])), (int(first), int(last))
+        except (safetensors.SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+            raise Damaged(f"{self.folder / name} is not what csac writes ({error})") from error
+
+    def _mended(self, name: str, content: bytes) -> bytes | None:
+        """Return the content of a damaged file of transitions as it was, if its parity can tell."""
+        parity, facts = _parity_name(name), self.files[name]
+        if not name.startswith("replay/") or parity not in self.files:
+            return None
+        with suppress(OSError):
+            return mended(content, facts["bytes"], (self.folder / parity).read_bytes(), lambda guess: _is(guess, facts))
+        return None
+
+    def _original(self, name: str) -> bytes | None:
+        """Return what the file of the run that a file is a copy of holds, if that is still the same."""
+        path = original_of(self.folder.parent, name)
+        with suppress(OSError):
+            if path and _is(content := path.read_bytes()[: self.files[name]["bytes"]], self.files[name]):
+                return content
+        return None
 
 
 class Checkpoints:
@@ -253,38 +326,46 @@ def sound_at(folder: Path, step: int) -> Checkpoint:
         raise InputError(f"{error}: choose another of the steps {', '.join(map(str, steps_in(folder)))}") from None
 
 
-def link(source: Path, target: Path) -> None:
-    """Give a file that is only ever replaced whole a second name; a copy where the file system has no links."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.unlink(missing_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:
-        write_atomically(target, source.read_bytes())
+def original_of(run: Path, name: str) -> Path | None:
+    """Return the file of a run that a file of its checkpoint is a copy of, a table or a best policy."""
+    own = name.partition(".")[2]
+    if name.endswith(".csv"):
+        return run / own
+    return run / "policy" / own if name.endswith(BEST) else None
 
 
-def facts_of(path: Path) -> dict[str, Any]:
-    """Return the size and checksum of a file."""
-    content = path.read_bytes()
-    return {"bytes": len(content), "sha256": _sha256(content)}
-
-
-def _write(folder: Path, name: str, content: bytes) -> dict[str, Any]:
+def write_file(folder: Path, name: str, content: bytes) -> dict[str, Any]:
+    """Write a file of a checkpoint; return its size and checksum for `Checkpoints.commit`."""
     write_atomically(folder / name, content)
     return {"bytes": len(content), "sha256": _sha256(content)}
 
 
-def _read(folder: Path, name: str, facts: dict[str, Any]) -> bytes:
-    path = folder / name
+def _content(path: Path) -> bytes:
+    """Return the bytes of a file, with zeros for the blocks that the disk cannot read."""
     try:
-        content = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
-        raise Damaged(f"{path} cannot be read: {error.strerror}") from error
-    if len(content) != facts["bytes"]:
-        raise Damaged(f"{path} has {len(content)} bytes instead of {facts['bytes']}")
-    if _sha256(content) != facts["sha256"]:
-        raise Damaged(f"{path} has changed since it was written: its checksum is another")
-    return content
+        if error.errno != errno.EIO:
+            raise
+    with open(path, "rb", buffering=0) as file:
+        size = os.fstat(file.fileno()).st_size
+        return b"".join(_block(file.fileno(), place, min(_BLOCK, size - place)) for place in range(0, size, _BLOCK))
+
+
+def _block(descriptor: int, place: int, size: int) -> bytes:
+    try:
+        return os.pread(descriptor, size, place).ljust(size, b"\0")
+    except OSError:
+        return bytes(size)
+
+
+def _is(content: bytes, facts: dict[str, Any]) -> bool:
+    return len(content) == facts["bytes"] and _sha256(content) == facts["sha256"]
+
+
+def _parity_name(name: str) -> str:
+    """Return the name of the file that mends a file of transitions."""
+    return name.removesuffix(".safetensors") + ".parity"
 
 
 def _shards(files: Mapping[str, Any], seed: int) -> list[tuple[int, int, str]]:
@@ -303,12 +384,11 @@ def _checked_files(files: Any) -> Files:
 
 
 def _checked_values(values: Any) -> dict[str, Any]:
-    values = {"sizes": {}, "failures": {}, "pinned": [], **values}
-    for name, kind in (("sizes", int), ("failures", str)):
-        if not all(type(value) is kind for value in values[name].values()):
-            raise TypeError(f"{name} are not of type {kind.__name__}")
-    if not all(type(step) is int for step in values["pinned"]) or not all(map(str.isdigit, values["failures"])):
-        raise TypeError("pinned steps or failed seeds are not numbers")
+    values = {"log_bytes": 0, "failures": {}, "pinned": [], **values}
+    if type(values["log_bytes"]) is not int or not all(type(step) is int for step in values["pinned"]):
+        raise TypeError("the log's size or pinned steps are not numbers")
+    if not all(re.fullmatch(_NUMBER, seed) and isinstance(text, str) for seed, text in values["failures"].items()):
+        raise TypeError("failures are not texts by the numbers of seeds")
     return values
 
 

@@ -17,14 +17,25 @@ from csac.tasks.perturbations import values_at
 from csac.tasks.seeds import SeedEnvironments
 from csac.training.checkpoint import Checkpoint, SeedFiles, taken_back
 from csac.training.learner import Learner
-from csac.training.messages import Boundary, Ended, Evaluated, Event, Failed, Noted, Progress, Rows, Saved, Settings
+from csac.training.messages import (
+    Boundary,
+    Ended,
+    Evaluated,
+    Failed,
+    GroupMessage,
+    Noted,
+    Progress,
+    Rows,
+    Saved,
+    Settings,
+)
 from csac.types import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
 
     from csac.evaluation.evaluator import EvaluationEpisode
-    from csac.evaluation.pool import Running
+    from csac.evaluation.pool import PendingEvaluation
     from csac.types import PolicyNetwork
 
 METRICS_INTERVAL = 1_000
@@ -36,7 +47,7 @@ class Evaluation(NamedTuple):
 
     step: int
     policies: dict[int, Policy]
-    running: Running | None
+    running: PendingEvaluation | None
 
     @property
     def is_over(self) -> bool:
@@ -44,7 +55,7 @@ class Evaluation(NamedTuple):
         return self.running is None or self.running.is_over
 
 
-def train_group(settings: Settings, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[Event]:
+def train_group(settings: Settings, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[GroupMessage]:
     """Train `seeds` side by side and yield what happens, in order; the caller writes it down."""
     with closing(Group(settings, seeds)) as group:
         yield from group.run(should_stop)
@@ -56,7 +67,7 @@ class Group:
     Strict order: each action comes from the policy after the update that followed the step before it.
 
     Evaluations may be made by processes beside this one while training goes on. What happens meanwhile is told after
-    what they give, so that the order of events and all that they say is the same as with evaluations in line.
+    what they give, so that the order of messages and all that they say is the same as with evaluations in line.
 
     Args:
         settings: what is trained and how.
@@ -77,7 +88,7 @@ class Group:
         processes = settings.evaluation_processes
         self._pool = EvaluationPool(self.evaluator, processes, cores) if processes else None
         self._evaluation: Evaluation | None = None  # the one on its way
-        self._held: list[Event] = []  # what has happened after it
+        self._held: list[GroupMessage] = []  # what has happened after it
         self._info_names: set[str] = set()
         self.learner = Learner(settings.algorithm, self.environments.spec, seeds, settings.steps)
         self._contract = Contract(
@@ -101,32 +112,32 @@ class Group:
         if settings.checkpoints and not self._files:
             self._files = [SeedFiles(settings.checkpoints, seed, {}) for seed in seeds]
 
-    def run(self, should_stop: Callable[[], bool]) -> Iterator[Event]:
+    def run(self, should_stop: Callable[[], bool]) -> Iterator[GroupMessage]:
         """Train to the last step and yield what happens; the caller writes it down."""
         if self._pool:
             self._pool.start()
-        for event in self._train(should_stop):
-            if self._evaluation and not isinstance(event, Boundary):
-                self._held.append(event)
+        for message in self._train(should_stop):
+            if self._evaluation and not isinstance(message, Boundary):
+                self._held.append(message)
             else:
-                yield event
+                yield message
 
-    def settle(self) -> Iterator[Event]:
+    def settle(self) -> Iterator[GroupMessage]:
         """Wait for the evaluation that is on its way, if there is one; yield what it gives, then what waited for it."""
         if not self._evaluation:
             return
         evaluation, held = self._evaluation, self._held
         self._evaluation, self._held = None, []
         failed: set[int] = set()
-        for event in self._outcome(evaluation):
-            if isinstance(event, Failed):
-                failed.add(event.seed)
-            yield event
-        for event in held:
-            if (rest := _without(event, failed)) is not None:
+        for message in self._outcome(evaluation):
+            if isinstance(message, Failed):
+                failed.add(message.seed)
+            yield message
+        for message in held:
+            if (rest := _without(message, failed)) is not None:
                 yield rest
 
-    def _train(self, should_stop: Callable[[], bool]) -> Iterator[Event]:
+    def _train(self, should_stop: Callable[[], bool]) -> Iterator[GroupMessage]:
         settings, environments = self.settings, self.environments
         while self.step < settings.steps and environments.is_any_alive and not should_stop():
             yield from self._advance()
@@ -144,8 +155,9 @@ class Group:
                 self._evaluation = self._begin_evaluation()
             if self._evaluation and (due or boundary) and self._evaluation.is_over:
                 yield from self.settle()
-            if boundary:
+            if boundary or (due and not self._evaluation):  # so that who watches hears of an evaluation at once
                 yield Progress(self.step)
+            if boundary:
                 yield Boundary(self.step)
         yield from self.settle()
         yield Ended(self.step, self.policies())
@@ -165,7 +177,7 @@ class Group:
         Raises:
             OSError: it cannot be written.
         """
-        files, inexact = {}, []
+        files, inexact = {}, {}
         for index, (seed, seed_files) in enumerate(zip(self.seeds, self._files, strict=True)):
             learnt, environment = self.learner.save(index), self.environments.save(index)
             arrays = {
@@ -177,7 +189,7 @@ class Group:
             memory = self.learner.memory(index, self.step)
             files |= seed_files.write(self.step, Snapshot(arrays, values), memory)
             if self.environments.alive[index] and not environment.values["exact"]:
-                inexact.append(seed)
+                inexact[seed] = environment.values["problem"]
         return Saved(self.step, files, inexact)
 
     def close(self) -> None:
@@ -187,7 +199,7 @@ class Group:
         self.environments.close()
         self.evaluator.close()
 
-    def _advance(self) -> Iterator[Event]:
+    def _advance(self) -> Iterator[GroupMessage]:
         """Make one environment step, and learn from it."""
         if self.step in self._changes:
             self._perturb(self.step)
@@ -218,7 +230,7 @@ class Group:
         running = self._pool.begin(list(policies.values())) if self._pool else None
         return Evaluation(self.step, policies, running)
 
-    def _outcome(self, evaluation: Evaluation) -> Iterator[Event]:
+    def _outcome(self, evaluation: Evaluation) -> Iterator[GroupMessage]:
         """Yield what an evaluation gives; stop the seeds that fail in it."""
         rows, policies, step = [], dict(evaluation.policies), evaluation.step
         for index, seed in enumerate(evaluation.policies):
@@ -236,7 +248,7 @@ class Group:
         self._info_names |= self.evaluator.info_names | (evaluation.running.info_names if evaluation.running else set())
         yield Evaluated(step, rows, policies, frozenset(self._info_names))
 
-    def _episodes(self, evaluation: Evaluation, index: int) -> Generator[Event, None, list[EvaluationEpisode]]:
+    def _episodes(self, evaluation: Evaluation, index: int) -> Generator[GroupMessage, None, list[EvaluationEpisode]]:
         """Return the episodes of one of the policies; those that a dying process took along are made here."""
         policy = list(evaluation.policies.values())[index]
         if not evaluation.running:
@@ -250,7 +262,7 @@ class Group:
         finally:
             self.evaluator.close()  # no process is sent open environments
 
-    def _stop_diverged(self) -> Iterator[Event]:
+    def _stop_diverged(self) -> Iterator[GroupMessage]:
         """Stop each seed whose parameters, or what they led to, are not finite. Its last checkpoint stays sound."""
         for index in np.flatnonzero(self.environments.alive).tolist():
             bad = self.learner.first_bad(index)
@@ -284,12 +296,12 @@ def is_boundary(settings: Settings, step: int) -> bool:
     return step % PROGRESS_INTERVAL == 0 or step == settings.steps or bool(interval and step % interval == 0)
 
 
-def _without(event: Event, seeds: set[int]) -> Event | None:
-    """Return the event without what these seeds did, or None where nothing is left of it."""
-    if isinstance(event, Rows):
-        rows = [row for row in event.rows if row["seed"] not in seeds]
-        return Rows(event.table, rows) if rows else None
-    return None if isinstance(event, Failed) and event.seed in seeds else event
+def _without(message: GroupMessage, seeds: set[int]) -> GroupMessage | None:
+    """Return the message without what these seeds did, or None where nothing is left of it."""
+    if isinstance(message, Rows):
+        rows = [row for row in message.rows if row["seed"] not in seeds]
+        return Rows(message.table, rows) if rows else None
+    return None if isinstance(message, Failed) and message.seed in seeds else message
 
 
 def _episode_row(seed: int, step: int, episode: Any) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 
 from csac.algorithms.memory import pack, row_width
 from csac.training.compilation import keep_programs
-from csac.training.packing import Packing
+from csac.training.packing import Packing, SeedAxis, by_name
 from csac.types import InputError, PolicyNetwork, Ring, Snapshot, Transition
 
 if TYPE_CHECKING:
@@ -23,40 +23,50 @@ if TYPE_CHECKING:
 # every use.
 SMALL = 2**15
 
+KEY_DATA = jax.ShapeDtypeStruct((2,), "uint32")
+
+
+class Carry(NamedTuple):
+    """What goes from one dispatch to the next."""
+
+    state: Any  # of the algorithm; packed, the buffers that hold it
+    memory: Any  # a Replay or a Rollout
+    sums: jax.Array  # [metric] over the updates since metrics were last forgotten
+    key: jax.Array  # [2] of the run, as data: each step's own keys are folded from it
+
 
 class Learner:
     """The compiled programs of one group. Seeds are the leading axis of everything that enters and leaves.
 
     What is learnt is kept packed into few buffers, donated at every update: with one for each of CSAC's 74 arrays an
-    update takes 2-6 % longer. A seed that is alone has no seed axis in there: for an axis of size one XLA transposes
-    the weight gradients, which costs 4-8 % of an update.
+    update takes 2-6 % longer.
     """
 
     def __init__(self, algorithm: Algorithm, spec: Spec, seeds: Sequence[int], steps: int) -> None:
         self.algorithm, self.spec, self._steps = algorithm, spec, steps
         self._cadence = algorithm.cadence
-        self._is_alone = len(seeds) == 1
-        self._metrics: list[str] = []
+        self._axis = SeedAxis(len(seeds))
         self._updates_summed = 0
         self._waiting = np.zeros((len(seeds), self._cadence.update_interval, row_width(spec)), np.float32)
         keep_programs()
-        keys = np.stack([np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds])
-        # Asked for its metrics' names and then to learn: traced once.
-        self._update = jax.jit(lambda *arguments: algorithm.update(*arguments), inline=True)
+        self._one = OneSeed(algorithm, spec, steps)
+        self.network = algorithm.policy(self._one.state)  # for all but its parameters
         # It runs once, and less optimised it is compiled in three quarters of the time.
-        begin = jax.jit(lambda key: self._begin(key, steps), compiler_options={"xla_backend_optimization_level": 1})
-        self._buffers = begin(keys[0]) if self._is_alone else jax.vmap(begin)(keys)
-        self._explore = self._compiled(self._remember_and_explore)
-        self._learn = self._compiled(self._remember_and_learn)
-        self._act_alone = self._compiled_to_act(self._act)
-        self._explore_alone = self._compiled_to_act(self._uniform)
-        state = jax.eval_shape(lambda: self._packing.unpack(self._buffers[0]))
-        self.network = algorithm.policy(state)  # for all but its parameters
+        begin = jax.jit(self._axis.map(self._one.begin), compiler_options={"xla_backend_optimization_level": 1})
+        keys = [np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds]
+        self._carry: Carry = begin(self._axis.stack(keys))
+        self._explore, self._learn = (
+            jax.jit(self._axis.map(program, (0, 0, 0, None)), donate_argnums=0)
+            for program in (self._one.remember_and_explore, self._one.remember_and_learn)
+        )
+        self._explore_alone, self._act_alone = (
+            jax.jit(self._axis.map(program, (0, 0, None))) for program in (self._one.explore, self._one.act)
+        )
 
     def next_actions(self, observations: np.ndarray, step: int) -> np.ndarray:
         """Return the actions [seed, action] for observations [seed, observation], after `step` steps."""
         program = self._explore_alone if step < self._cadence.warmup_steps else self._act_alone
-        return np.array(program(self._buffers, observations, np.int32(step)))
+        return self._axis.restore(np.array(program(self._carry, self._axis.strip(observations), np.int32(step))))
 
     def step(self, observations: np.ndarray, actions: np.ndarray, outcome: Steps, step: int) -> np.ndarray:
         """Remember environment step number `step`, learn where it is time to, and return the next actions.
@@ -76,8 +86,10 @@ class Learner:
         if step >= self._cadence.warmup_steps:
             program = self._learn
             self._updates_summed += self._cadence.updates_per_interval
-        next_actions, self._buffers = program(self._buffers, self._waiting, outcome.observation, np.int32(step))
-        return np.asarray(next_actions)
+        given = (self._axis.strip(self._waiting), self._axis.strip(outcome.observation), np.int32(step))
+        next_actions, self._carry = program(self._carry, *given)
+        self._waiting = np.zeros_like(self._waiting)  # JAX reads an argument where it lies, as long as the program runs
+        return self._axis.restore(np.asarray(next_actions))
 
     def networks(self) -> list[PolicyNetwork]:
         """Return each seed's policy as NumPy layers."""
@@ -85,36 +97,40 @@ class Learner:
         def parameters_of(state: Any) -> PolicyParameters:
             return self.algorithm.policy(state).parameters
 
-        states = self._carry[0]
-        parameters = jax.tree.map(
-            np.array, parameters_of(states) if self._is_alone else jax.vmap(parameters_of)(states)
-        )
-        return [self.network._replace(parameters=seed) for seed in self._by_seed(parameters)]
+        parameters = jax.tree.map(np.array, self._axis.map(parameters_of)(self._states()))
+        return [self.network._replace(parameters=self._axis.of(parameters, i)) for i in range(self._axis.seeds)]
 
     def metrics(self) -> list[dict[str, float]]:
         """Return each seed's metrics, averaged over the updates since `forget_metrics`; none if there were none."""
         if not self._updates_summed:
             return []
-        means = np.asarray(self._carry[2]) / self._updates_summed
-        return [dict(zip(self._metrics, seed.tolist(), strict=True)) for seed in self._by_seed(means)]
+        means = np.asarray(self._carry.sums) / self._updates_summed
+        of_seeds = [self._axis.of(means, i).tolist() for i in range(self._axis.seeds)]
+        return [dict(zip(self._one.metrics, of_seed, strict=True)) for of_seed in of_seeds]
 
     def forget_metrics(self) -> None:
         """Begin to average anew."""
-        packed, memory, sums, key_data = self._buffers
-        self._buffers = packed, memory, jnp.zeros_like(sums), key_data
+        self._carry = self._carry._replace(sums=jnp.zeros_like(self._carry.sums))
         self._updates_summed = 0
+
+    def carry(self, index: int) -> Carry:
+        """Return what the seed at this place carries, its state unpacked; views of NumPy, to read only."""
+        own = self._axis.of(jax.tree.map(np.asarray, self._carry), index)
+        return own._replace(state=self._one.packing.unpack(own.state))
+
+    def waiting(self, index: int) -> np.ndarray:
+        """Return the transitions [step, width] of the seed at this place that wait for an update, as a view."""
+        return self._waiting[index]
 
     def save(self, index: int) -> Snapshot:
         """Return what the seed at this place needs to go on, but for its memory."""
-        state, _, sums, key_data = self._carry
-        own = {"state": state, "sums": sums, "key": key_data}
-        arrays = {name: np.array(self._of_seed(leaf, index)) for name, leaf in _named(own).items()}
+        arrays = {name: np.array(leaf) for name, leaf in by_name(_lasting(self.carry(index))).items()}
         return Snapshot({**arrays, "waiting": self._waiting[index].copy()}, {"updates_summed": self._updates_summed})
 
     def memory(self, index: int, step: int) -> Ring:
         """Return the memory of the seed at this place, to read only; `step` environment steps were made."""
-        rows = np.asarray(self._carry[1].rows)
-        return Ring(self._of_seed(rows, index), step - step % self._cadence.update_interval)
+        interval = self._cadence.update_interval
+        return Ring(self._axis.of(np.asarray(self._carry.memory.rows), index), step // interval * interval)
 
     def take_back(self, saved: Sequence[Snapshot], memories: Sequence[Callable[[np.ndarray], None]]) -> None:
         """Go on from what `save` returned for each seed; `memories` fill each seed's rows [capacity, width].
@@ -125,134 +141,115 @@ class Learner:
         for seed in saved:
             if problem := misfit(self.algorithm, self.spec, self._steps, seed):
                 raise InputError(f"the checkpoint does not fit: {problem}")
-        state, memory, sums, key_data = self._carry
-        fresh = {"state": state, "sums": sums, "key": key_data}
-        leaves = [self._stacked([seed.arrays[name] for seed in saved]) for name in _named(fresh)]
-        fresh = jax.tree.unflatten(jax.tree.structure(fresh), leaves)
-        rows = np.zeros(memory.rows.shape, memory.rows.dtype)
+        rows = np.zeros(self._carry.memory.rows.shape, self._carry.memory.rows.dtype)
         for index, fill in enumerate(memories):
-            fill(self._of_seed(rows, index))
-        memory = type(memory)(jnp.array(rows))
-        pack = self._packing.pack if self._is_alone else jax.vmap(self._packing.pack)
-        self._buffers = jax.jit(pack)(fresh["state"]), memory, fresh["sums"], fresh["key"]
+            fill(self._axis.of(rows, index))
+        memory = self._carry.memory._replace(rows=jnp.array(rows))
+        lasting = _lasting(self._carry._replace(state=self._one.state))
+        leaves = [jnp.array(self._axis.stack([seed.arrays[name] for seed in saved])) for name in by_name(lasting)]
+        taken = Carry(memory=memory, **jax.tree.unflatten(jax.tree.structure(lasting), leaves))
+        self._carry = taken._replace(state=jax.jit(self._axis.map(self._one.packing.pack))(taken.state))
         self._waiting = np.stack([seed.arrays["waiting"] for seed in saved])
         self._updates_summed = int(saved[0].values["updates_summed"])
 
     def first_bad(self, index: int) -> str | None:
         """Return the name of the first of a seed's arrays that is not finite, or None."""
-        for name, leaf in _named(self._carry[0]).items():
-            array = np.asarray(self._of_seed(leaf, index))
+        for name, array in by_name(self._axis.of(self._states(), index)).items():
             if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-                return name.removeprefix(".")
+                return name
         return None
 
-    def _of_seed(self, leaf: Any, index: int) -> Any:
-        return leaf if self._is_alone else leaf[index]
+    def _states(self) -> Any:
+        """Return what the seeds have learnt as views of NumPy, to read only."""
+        return self._one.packing.unpack([np.asarray(buffer) for buffer in self._carry.state])
 
-    def _stacked(self, arrays: Sequence[np.ndarray]) -> jax.Array:
-        return jnp.array(arrays[0] if self._is_alone else np.stack(arrays))
 
-    @property
-    def _carry(self) -> tuple:
-        """What all seeds carry from update to update; their state as views of NumPy, to read only."""
-        packed, memory, sums, key_data = self._buffers
-        return self._packing.unpack([np.asarray(buffer) for buffer in packed]), memory, sums, key_data
+class OneSeed:
+    """What one seed does in a dispatch: pure functions of its packed `Carry`. `step` counts environment steps.
 
-    def _by_seed(self, tree: Any) -> list[Any]:
-        """Return one tree of NumPy arrays per seed."""
-        if self._is_alone:
-            return [tree]
-        seeds = len(jax.tree.leaves(tree)[0])
-        return [jax.tree.map(lambda leaf: leaf[i], tree) for i in range(seeds)]  # noqa: B023
+    Attributes:
+        state: the shapes of what the algorithm learns.
+        metrics: the names of what an update tells of itself, in the order of the carry's sums.
+        packing: how the state is packed.
+    """
 
-    def _compiled(self, program: Callable) -> Callable:
-        """Return a program of one seed as one dispatch for all: (buffers, rows, observations, step)."""
-
-        def one(buffers: tuple, rows: jax.Array, observation: jax.Array, step: jax.Array) -> tuple[jax.Array, tuple]:
-            packed, *others = buffers
-            action, (state, *others) = program((self._packing.unpack(packed), *others), rows, observation, step)
-            return action, (self._packing.pack(state), *others)
-
-        def alone(buffers: tuple, rows: jax.Array, observations: jax.Array, step: jax.Array):
-            action, buffers = one(buffers, rows[0], observations[0], step)
-            return action[None], buffers
-
-        return jax.jit(alone if self._is_alone else jax.vmap(one, in_axes=(0, 0, 0, None)), donate_argnums=0)
-
-    def _compiled_to_act(self, act: Callable) -> Callable:
-        """Return what gives one seed's action as one dispatch for all: (buffers, observations, step)."""
-
-        def one(buffers: tuple, observation: jax.Array, step: jax.Array) -> jax.Array:
-            packed, *others = buffers
-            return act((self._packing.unpack(packed), *others), observation, step)
-
-        def alone(buffers: tuple, observations: jax.Array, step: jax.Array) -> jax.Array:
-            return one(buffers, observations[0], step)[None]
-
-        return jax.jit(alone if self._is_alone else jax.vmap(one, in_axes=(0, 0, None)))
-
-    # What follows speaks of one seed; a carry is (state, memory, sums of metrics, key data).
-
-    def _begin(self, key_data: jax.Array, steps: int) -> tuple[list[jax.Array], Any, jax.Array, jax.Array]:
-        init_key, run_key = jax.random.split(jax.random.wrap_key_data(key_data))
-        state, memory = self.algorithm.init(init_key, self.spec, steps), self.algorithm.memory(self.spec, steps)
-        batch = jax.eval_shape(lambda: self._draw(memory, run_key, jnp.int32(1)))
-        metrics = jax.eval_shape(self._update, state, batch, run_key, jnp.int32(0))[1]
-        self._metrics = list(metrics)
+    def __init__(self, algorithm: Algorithm, spec: Spec, steps: int) -> None:
+        self.algorithm, self.spec = algorithm, spec
+        # Both are asked for shapes and then to run: traced once.
+        self._first = jax.jit(
+            lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), inline=True
+        )
+        self._update = jax.jit(lambda *arguments: algorithm.update(*arguments), inline=True)
+        self.state, memory = jax.eval_shape(lambda data: self._first(jax.random.wrap_key_data(data)), KEY_DATA)
+        self.metrics = tuple(jax.eval_shape(self._first_metrics, self.state, memory, KEY_DATA))
         # What acts more often than it learns would take its policy out of the row again and again.
-        self._packing = Packing(state, SMALL if self._cadence.update_interval == 1 else 0)
-        return self._packing.pack(state), memory, jnp.zeros(len(metrics)), jax.random.key_data(run_key)
+        self.packing = Packing(self.state, SMALL if algorithm.cadence.update_interval == 1 else 0)
 
-    def _remember_and_explore(self, carry: tuple, rows: jax.Array, observation: jax.Array, step: jax.Array):
-        state, memory, sums, key_data = carry
-        carry = (state, memory.add(rows, step - len(rows)), sums, key_data)
-        return self._uniform(carry, observation, step), carry
+    def begin(self, key_data: jax.Array) -> Carry:
+        """Return what a seed begins with."""
+        init_key, run_key = jax.random.split(jax.random.wrap_key_data(key_data))
+        state, memory = self._first(init_key)
+        return Carry(self.packing.pack(state), memory, jnp.zeros(len(self.metrics)), jax.random.key_data(run_key))
 
-    def _remember_and_learn(self, carry: tuple, rows: jax.Array, observation: jax.Array, step: jax.Array):
-        state, memory, sums, key_data = carry
-        memory = memory.add(rows, step - len(rows))
-        draw_key, update_key, _ = self._keys(key_data, step)
+    def explore(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
+        """Return a uniformly random action."""
+        shape = (self.spec.action_size,)
+        return jax.random.uniform(_keys(carry.key, step)[2], shape, minval=-1.0, maxval=1.0)
+
+    def act(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
+        """Return the policy's action, to explore."""
+        return self._act(self.packing.unpack(carry.state), carry.key, observation, step)
+
+    def remember_and_explore(
+        self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
+    ) -> tuple[jax.Array, Carry]:
+        """Add packed transitions [n, width]; return a uniformly random action."""
+        carry = carry._replace(memory=carry.memory.add(rows, step - len(rows)))
+        return self.explore(carry, observation, step), carry
+
+    def remember_and_learn(
+        self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
+    ) -> tuple[jax.Array, Carry]:
+        """Add packed transitions [n, width], make all updates that are due; return the new policy's action."""
+        memory = carry.memory.add(rows, step - len(rows))
+        draw_key, update_key, _ = _keys(carry.key, step)
         first = self._updates_before(step)
 
-        def update(i: jax.Array, learnt: tuple) -> tuple:
+        def update(i: jax.Array, learnt: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
             state, sums = learnt
             batch = self._draw(memory, jax.random.fold_in(draw_key, i), step)
             state, metrics = self._update(state, batch, jax.random.fold_in(update_key, i), first + i)
-            return state, sums + jnp.stack([metrics[name] for name in self._metrics])
+            return state, sums + jnp.stack([metrics[name] for name in self.metrics])
 
-        if self._cadence.updates_per_interval == 1:
-            state, sums = update(jnp.int32(0), (state, sums))
+        learnt = self.packing.unpack(carry.state), carry.sums
+        if self.algorithm.cadence.updates_per_interval == 1:
+            state, sums = update(jnp.int32(0), learnt)
         else:
-            state, sums = jax.lax.fori_loop(0, self._cadence.updates_per_interval, update, (state, sums))
-        carry = (state, memory, sums, key_data)
-        return self._act(carry, observation, step), carry
+            state, sums = jax.lax.fori_loop(0, self.algorithm.cadence.updates_per_interval, update, learnt)
+        action = self._act(state, carry.key, observation, step)
+        return action, Carry(self.packing.pack(state), memory, sums, carry.key)
+
+    def _first_metrics(self, state: Any, memory: Any, key_data: jax.Array) -> dict[str, jax.Array]:
+        key = jax.random.wrap_key_data(key_data)
+        return self._update(state, self._draw(memory, key, jnp.int32(1)), key, jnp.int32(0))[1]
 
     def _draw(self, memory: Any, key: jax.Array, count: jax.Array) -> Transition:
-        return memory.draw(key, count, self._cadence.transitions_per_update, self.spec)
+        return memory.draw(key, count, self.algorithm.cadence.transitions_per_update, self.spec)
 
     def _updates_before(self, step: jax.Array) -> jax.Array:
         """Return how many updates came before those that follow environment step `step`."""
-        interval = self._cadence.update_interval
-        first_step = -(-max(self._cadence.warmup_steps, 1) // interval) * interval
-        return (step - first_step) // interval * self._cadence.updates_per_interval
+        interval = self.algorithm.cadence.update_interval
+        first_step = -(-max(self.algorithm.cadence.warmup_steps, 1) // interval) * interval
+        return (step - first_step) // interval * self.algorithm.cadence.updates_per_interval
 
-    def _act(self, carry: tuple, observation: jax.Array, step: jax.Array) -> jax.Array:
-        return self.algorithm.act(carry[0], observation, self._keys(carry[3], step)[2], True)
-
-    def _uniform(self, carry: tuple, observation: jax.Array, step: jax.Array) -> jax.Array:
-        shape = (self.spec.action_size,)
-        return jax.random.uniform(self._keys(carry[3], step)[2], shape, minval=-1.0, maxval=1.0)
-
-    @staticmethod
-    def _keys(key_data: jax.Array, step: jax.Array) -> jax.Array:
-        """Return the keys of one environment step: to draw batches, to update, to act."""
-        return jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key_data), step), 3)
+    def _act(self, state: Any, key_data: jax.Array, observation: jax.Array, step: jax.Array) -> jax.Array:
+        return self.algorithm.act(state, observation, _keys(key_data, step)[2], True)
 
 
 def misfit(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str | None:
     """Say what keeps an algorithm from going on from what `Learner.save` returned, or return None."""
-    state = jax.eval_shape(lambda key: algorithm.init(key, spec, steps), jax.ShapeDtypeStruct((2,), "uint32"))
-    for name, leaf in _named({"state": state}).items():
+    state = jax.eval_shape(lambda key: algorithm.init(key, spec, steps), KEY_DATA)
+    for name, leaf in by_name({"state": state}).items():
         given = saved.arrays.get(name)
         if given is None or given.shape != leaf.shape or given.dtype != leaf.dtype:
             found = "no such array" if given is None else f"{given.dtype} {given.shape}"
@@ -263,6 +260,11 @@ def misfit(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str
     return None
 
 
-def _named(tree: Any) -> dict[str, Any]:
-    """Return the leaves of a tree by where they are in it."""
-    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+def _lasting(carry: Carry) -> dict[str, Any]:
+    """Return what a checkpoint has of a carry; memories are saved apart."""
+    return {"state": carry.state, "sums": carry.sums, "key": carry.key}
+
+
+def _keys(key_data: jax.Array, step: jax.Array) -> jax.Array:
+    """Return the keys of one environment step: to draw batches, to update, to act."""
+    return jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key_data), step), 3)

@@ -88,12 +88,13 @@ class Noted(NamedTuple):
 class Saved(NamedTuple):
     """What a checkpoint at this step needs of the group is on disk, in these files.
 
-    `inexact` are the seeds whose environment cannot be saved in the middle of an episode.
+    `inexact` are the seeds whose environment cannot be saved in the middle of an episode, and what went wrong: nothing
+    ("") where it does not offer to be.
     """
 
     step: int
     files: Files
-    inexact: list[int]
+    inexact: dict[int, str]
 
 
 class Ended(NamedTuple):
@@ -103,7 +104,7 @@ class Ended(NamedTuple):
     policies: dict[int, Policy]
 
 
-Event = Rows | Evaluated | Failed | Progress | Boundary | Noted | Saved | Ended
+GroupMessage = Rows | Evaluated | Failed | Progress | Boundary | Noted | Saved | Ended
 
 Order = Literal["save", "stop"] | list[int]  # to a worker: what to do, or the cores to take its next turn on
 
@@ -128,4 +129,4 @@ class NotSaved(NamedTuple):
     error: OSError
 
 
-Message = Event | GroupCrashed | GroupRestarted | NotSaved
+Message = GroupMessage | GroupCrashed | GroupRestarted | NotSaved

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from csac.record.run import Table
-from csac.training.checkpoint import facts_of, link
+from csac.record.statistics import best_returns, mean_returns
 from csac.training.messages import (
     Boundary,
     Ended,
@@ -23,10 +23,10 @@ from csac.training.messages import (
     Rows,
     Saved,
 )
+from csac.training.restore import LOG, keep_best_policies, keep_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Mapping, Sequence
 
     from csac.console.progress import Reporter
     from csac.deploy.policy import Policy
@@ -76,7 +76,8 @@ class Recorder:
         self._made = dict(self._steps)  # steps of which some may not have been told of yet
         self._pending: dict[Table, list[dict[str, Any]]] = defaultdict(list)
         self._saved: dict[int, dict[int, Files]] = defaultdict(dict)  # step -> group -> its files
-        self._best = _best_means(run.evaluations)
+        # One that was lost is followed by the best of later evaluations.
+        self._best = {k: v for k, v in best_returns(run.evaluations).items() if self.run.policy(k, "best").exists()}
         # Told once, after the first evaluation of the run.
         self._unheard = set() if len(run.evaluations) else set(run.manifest.events)
         self._info_names: set[str] = set()
@@ -132,26 +133,24 @@ class Recorder:
         self._received[group][table] = rows[0]["step"]
         self._pending[table] += rows
 
-    def _evaluated(self, group: int, event: Evaluated) -> None:
-        self._take(group, "evaluations", event.rows)
-        self._info_names |= event.info_names
-        self._save(event.policies)
-        for seed, value in _mean_returns(event.rows).items():
+    def _evaluated(self, group: int, message: Evaluated) -> None:
+        self._take(group, "evaluations", message.rows)
+        self._info_names |= message.info_names
+        self._save(message.policies)
+        for seed, value in mean_returns(message.rows).items():
             if value > self._best.get(seed, -np.inf):
                 self._best[seed] = value
-                event.policies[seed].save(self._policy_file(seed, ".best"))
+                message.policies[seed].save(self.run.policy(seed, "best"))
 
-    def _commit_when_whole(self, group: int, event: Saved) -> None:
+    def _commit_when_whole(self, group: int, message: Saved) -> None:
         """Keep a group's best policies with its files; with the last living group's files there is a checkpoint."""
         assert self.checkpoints
-        files = dict(event.files)
-        for seed in self.groups[group]:
-            if self._policy_file(seed, ".best").exists():
-                name = f"step_{event.step}.seed_{seed}.best.safetensors"
-                link(self._policy_file(seed, ".best"), self.checkpoints.folder / name)
-                files[name] = facts_of(self.checkpoints.folder / name)
-        self.inexact.update(event.inexact)
-        self._saved[event.step][group] = files
+        best = keep_best_policies(self.run.path, self.groups[group], message.step)
+        for seed, problem in message.inexact.items():
+            if problem and seed not in self.inexact:
+                self._note(f"seed {seed}: {problem}; after a stop its episode begins anew")
+        self.inexact.update(message.inexact)
+        self._saved[message.step][group] = {**message.files, **best}
         self._commit_whole()
 
     def _commit_whole(self) -> None:
@@ -172,7 +171,10 @@ class Recorder:
         parts = [part for _, part in sorted(self._saved[step].items())]
         files = {name: facts for part in parts for name, facts in part.items()}
         failures = {seed: text for seed, text in self.failures.items() if self._failed_at[seed] <= step}
-        values = {"sizes": self.run.sync(), "failures": failures, "groups": self.groups}
+        files |= keep_tables(self.run.path, step)
+        log = self.run.path / LOG
+        log_bytes = log.stat().st_size if log.exists() else 0
+        values = {"log_bytes": log_bytes, "failures": failures, "groups": self.groups}
         # Said before, so that no checkpoint is ever taken for exact that is not.
         self.run.update_manifest(steps_done=step, inexact_seeds=sorted(self.inexact))
         self.checkpoints.commit(step, files, values)
@@ -191,16 +193,16 @@ class Recorder:
         for part in self._saved.values():
             part.pop(group, None)
 
-    def _failed(self, event: Failed) -> None:
-        if event.seed in self.failures:
+    def _failed(self, message: Failed) -> None:
+        if message.seed in self.failures:
             return  # a restarted group meets the same failure again
-        if event.policy is not None:
-            self._save({event.seed: event.policy})
-        self._note_failure(event.seed, event.step, event.reason, event.details)
+        if message.policy is not None:
+            self._save({message.seed: message.policy})
+        self._note_failure(message.seed, message.step, message.reason, message.details)
 
-    def _crashed(self, group: int, event: GroupCrashed) -> None:
+    def _crashed(self, group: int, message: GroupCrashed) -> None:
         for seed in self.groups[group]:
-            self._note_failure(seed, self._steps[seed], event.reason, event.details)
+            self._note_failure(seed, self._steps[seed], message.reason, message.details)
         self._passed[group] = OVER
         self._commit_whole()
         self._flush()
@@ -235,14 +237,10 @@ class Recorder:
 
     def _save(self, policies: dict[int, Policy]) -> None:
         for seed, policy in policies.items():
-            contract = self.run.path / "policy" / "contract.json"
-            if not contract.exists():
-                contract.parent.mkdir(exist_ok=True)
-                policy.contract.save(contract)
-            policy.save(self._policy_file(seed))
-
-    def _policy_file(self, seed: int, kind: str = "") -> Path:
-        return self.run.path / "policy" / f"seed_{seed}{kind}.safetensors"
+            if not self.run.contract.exists():
+                self.run.contract.parent.mkdir(exist_ok=True)
+                policy.contract.save(self.run.contract)
+            policy.save(self.run.policy(seed))
 
     def _flush(self, until: int = OVER) -> None:
         """Write the rows that no group can precede any more, as far as step `until`."""
@@ -266,7 +264,7 @@ class Recorder:
         """Tell whoever watches of each evaluation that every group has passed."""
         for step in sorted({row["step"] for row in rows}):
             self._tell_perturbations(step)
-            returns = _mean_returns([row for row in rows if row["step"] == step])
+            returns = mean_returns([row for row in rows if row["step"] == step])
             self.evaluated.append((step, returns))
             self.run.log(f"step {step}: " + ", ".join(f"seed {seed} {value:.1f}" for seed, value in returns.items()))
             self.run.update_manifest(steps_done=step)
@@ -289,21 +287,5 @@ class Recorder:
             self._note(f"perturbed from step {begin + 1:,} on: {text}")
 
 
-def _best_means(evaluations: np.ndarray) -> dict[int, float]:
-    """Return each seed's best mean return so far."""
-    best: dict[int, float] = {}
-    for step in np.unique(evaluations["step"]):
-        for seed, value in _mean_returns(evaluations[evaluations["step"] == step]).items():
-            best[seed] = max(value, best.get(seed, -np.inf))
-    return best
-
-
 def _seeds(seeds: Sequence[int]) -> str:
     return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
-
-
-def _mean_returns(rows: Iterable[Any]) -> dict[int, float]:
-    returns: dict[int, list[float]] = defaultdict(list)
-    for row in rows:
-        returns[int(row["seed"])].append(float(row["return"]))
-    return {seed: float(np.mean(values)) for seed, values in returns.items()}

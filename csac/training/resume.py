@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 from csac.record.manifest import Continuation, Origin, differences
-from csac.record.run import GROWING_FILES, RunDirectory, Table, now
+from csac.record.run import RunDirectory, Table, now
 from csac.tasks.perturbations import continued, perturbations_of
-from csac.training.checkpoint import Checkpoint, Checkpoints, link, newest_sound, sound_at, taken_back
+from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, sound_at, taken_back
+from csac.training.restore import copy, restore
 from csac.types import InputError, Snapshot
 
 if TYPE_CHECKING:
@@ -36,12 +37,12 @@ class Restart(NamedTuple):
 
     step: int
     failures: dict[int, str]
-    complaints: list[str]  # what was wrong with newer checkpoints
+    complaints: list[str]  # what was wrong with newer checkpoints, and what was mended
     pinned: list[int]  # steps of checkpoints to keep for good
 
     def notes(self, before: Manifest, now: Manifest) -> list[str]:
         """Return what the user should know of this continuation, a line each."""
-        lines = [f"warning: {complaint}; an earlier checkpoint is used" for complaint in self.complaints]
+        lines = [f"warning: {complaint}" for complaint in self.complaints]
         lines.append(f"going on from step {self.step:,}" if self.step else "no checkpoint yet: it begins anew")
         if changes := _machine_changes(before, now):
             lines.append(f"note: not the same to the last bit from here on, because {' and '.join(changes)}")
@@ -127,17 +128,16 @@ def roll_back(run: RunDirectory) -> Restart:
         raise InputError(
             f"{run.path} has results and no checkpoint to go on from, and would begin anew: train in another directory"
         )
-    run.cut_back(checkpoint.values["sizes"] if checkpoint else {})
+    complaints = [f"{complaint}; an earlier checkpoint is used" for complaint in complaints]
+    complaints += restore(run.path, checkpoint)
     for unfinished in [*run.path.glob(".*.*"), *run.path.glob("policy/*.tmp")]:
         unfinished.unlink()
-    _restore_best_policies(run, checkpoint)
     if checkpoint is None:
         return BEGINNING
-    Checkpoints(run.checkpoints, run.manifest.checkpoints.keep, checkpoint.values["pinned"]).discard_after(
-        checkpoint.step
-    )
+    step, pinned = checkpoint.step, checkpoint.values["pinned"]
+    Checkpoints(run.checkpoints, run.manifest.checkpoints.keep, pinned).discard_after(step)
     failures = {int(seed): reason for seed, reason in checkpoint.values["failures"].items()}
-    return Restart(checkpoint.step, failures, complaints, checkpoint.values["pinned"])
+    return Restart(step, failures, complaints, pinned)
 
 
 class Source(NamedTuple):
@@ -198,27 +198,11 @@ class Source(NamedTuple):
 
     def copy_to(self, run: RunDirectory, keep: int) -> None:
         """Give a new run the tables up to the checkpoint, and the checkpoint."""
-        sizes = {name: size for name, size in self.checkpoint.values["sizes"].items() if name in GROWING_FILES}
-        for name, size in sizes.items():
-            with open(self.run.path / name, "rb") as source, open(run.path / name, "wb") as target:
-                target.write(source.read(size))
-        for name in self.checkpoint.files:
-            link(self.checkpoint.folder / name, run.checkpoints / name)
+        files = copy(self.checkpoint, run.path)
         if self.run.contract.exists():
             run.contract.parent.mkdir()
             shutil.copyfile(self.run.contract, run.contract)
-        values = {**self.checkpoint.values, "sizes": sizes}
-        Checkpoints(run.checkpoints, keep).commit(self.checkpoint.step, self.checkpoint.files, values)
-
-
-def _restore_best_policies(run: RunDirectory, checkpoint: Checkpoint | None) -> None:
-    """Undo what later evaluations found best."""
-    for path in run.path.glob("policy/seed_*.best.safetensors"):
-        path.unlink()
-    for name in checkpoint.files if checkpoint else ():
-        if name.endswith(".best.safetensors"):
-            assert checkpoint
-            link(checkpoint.folder / name, run.path / "policy" / name.partition(".")[2])
+        Checkpoints(run.checkpoints, keep).commit(self.checkpoint.step, files, self.checkpoint.values)
 
 
 def _would_lose_results(run: RunDirectory) -> bool:

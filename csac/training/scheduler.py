@@ -9,15 +9,15 @@ from itertools import count
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
-from csac.evaluation.evaluator import ROWS
-from csac.processes import Child, cause_of_death, die_with_parent, move_to, usable_cores
+from csac.evaluation.evaluator import EPISODES_AT_ONCE
+from csac.processes import Child, die_with_parent, move_to, usable_cores
 from csac.training.checkpoint import remove_unfinished
 from csac.training.group import Group, is_boundary
 from csac.training.messages import (
     Boundary,
     Ended,
-    Event,
     GroupCrashed,
+    GroupMessage,
     GroupRestarted,
     Message,
     NotSaved,
@@ -66,7 +66,7 @@ def choose_evaluation_processes(groups: Sequence[Sequence[int]], episodes: int) 
     Several groups may share the cores that are to spare, since they evaluate for a small part of the time only.
     """
     spare = len(usable_cores()) - len(groups)
-    batches = max(map(len, groups)) * -(-episodes // ROWS)
+    batches = max(map(len, groups)) * -(-episodes // EPISODES_AT_ONCE)
     return min(batches, max(1, spare // len(groups))) if spare > 0 else 0
 
 
@@ -81,7 +81,7 @@ def run_groups(
     All groups are saved at the same steps. Whoever takes the messages commits to `checkpoints`; here it is only read.
     """
     if len(groups) == 1:
-        yield from ((0, event) for event in _run_here(settings, groups[0], should_stop))
+        yield from ((0, message) for message in _run_here(settings, groups[0], should_stop))
         return
     scheduler = _Scheduler(settings, groups, should_stop, checkpoints)
     try:
@@ -103,22 +103,22 @@ class _Timer:
         return time.monotonic() - self._began >= SECONDS_BETWEEN_CHECKPOINTS
 
 
-def _run_here(settings: Settings, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[Event]:
+def _run_here(settings: Settings, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[GroupMessage]:
     timer, saved = _Timer(), settings.begin
     with closing(Group(settings, seeds)) as group:
-        for event in group.run(should_stop):
-            due = isinstance(event, Ended)
-            if isinstance(event, Boundary):
-                yield event
-                due = is_regular(settings, event.step) or timer.is_due()
+        for message in group.run(should_stop):
+            due = isinstance(message, Ended)
+            if isinstance(message, Boundary):
+                yield message
+                due = is_regular(settings, message.step) or timer.is_due()
             if settings.checkpoints and due and group.step > saved:
                 yield from group.settle()
                 if group.environments.alive.any():
                     saved = group.step
                     timer.reset()
                     yield group.save()
-            if not isinstance(event, Boundary):
-                yield event
+            if not isinstance(message, Boundary):
+                yield message
 
 
 def is_regular(settings: Settings, step: int) -> bool:
@@ -210,11 +210,10 @@ class _Scheduler:
 
     def _died(self, index: int, worker: _Worker) -> Message:
         """Let another process go on from the newest checkpoint, once."""
-        worker.kill()
+        reason = worker.cause_of_death()
         self._take_cores(worker)
         if self.settings.checkpoints:
             remove_unfinished(self.settings.checkpoints, worker.process.pid)
-        reason = cause_of_death(worker.process.exitcode)
         if self.stopping and self.checkpoints and index not in self.restarted:
             worker.over = True  # and no failure: the run goes on from the last step at which all were saved
             return Ended(worker.step, {})
@@ -282,9 +281,9 @@ def _work(connection: Connection, settings: Settings, seeds: list[int]) -> None:
             connection.send(Ended(settings.begin, {}))
             return
         with closing(Group(settings, seeds, cores)) as group:
-            for event in group.run(lambda: turns.stopped):
-                connection.send(event)
-                if isinstance(event, Boundary):
+            for message in group.run(lambda: turns.stopped):
+                connection.send(message)
+                if isinstance(message, Boundary):
                     turns.take(group)
     except (BrokenPipeError, EOFError, ConnectionResetError):
         return  # the parent is gone, and with it whoever would write this down
@@ -314,8 +313,8 @@ class _Turns:
 
     def _save(self, group: Group) -> None:
         """Say what the group's files are, or stop where an evaluation has left no seed to save."""
-        for event in group.settle():
-            self.connection.send(event)
+        for message in group.settle():
+            self.connection.send(message)
         if not group.environments.alive.any():
             self.stopped = True
             return

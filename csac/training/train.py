@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 import warnings
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
-
 from csac.record.run import RunDirectory, default_directory, is_run
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import by_step, perturbations_of, refuse_late
+from csac.tasks.trust import refuse_untrusted, remember
 from csac.training.checkpoint import Checkpoints
 from csac.training.compilation import tidy_programs
+from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
 from csac.training.interruptions import Interrupted, caught_signals, storage_failures_told
 from csac.training.learner import misfit
@@ -132,6 +131,7 @@ def resume(
     *,
     steps: int | None = None,
     evaluation_processes: int | None = 0,
+    trust_task: bool = False,
     reporter: Reporter | None = None,
     command: str | None = None,
     on_evaluation: OnEvaluation | None = None,
@@ -139,7 +139,8 @@ def resume(
 ) -> RunDirectory:
     """Go on with a run from its newest checkpoint; everything but a larger number of `steps` comes from its manifest.
 
-    `evaluation_processes` and what follows are as in `train`.
+    `trust_task` lets the task import its module though nobody has named it here (`csac.tasks.trust`);
+    `evaluation_processes`, `reporter` and what follows it are as in `train`.
 
     Raises:
         InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
@@ -149,6 +150,7 @@ def resume(
     """
     run = RunDirectory.open(directory)
     task, options = options_of(run)
+    refuse_untrusted(task, run.path, trust_task)
     options["evaluation_processes"], options["groups"] = evaluation_processes, None
     if steps is not None:
         options["steps"] = steps
@@ -207,6 +209,7 @@ def make_plan(
     continued = before.run.manifest if before.run else None
     with closing(Environment(task, arguments)) as environment:
         spec, task_name = environment.spec, environment.task_name
+        remember(task)
         changes = planned_perturbations(asked, before.existing, before.source)
         if not before.existing:  # whose number of steps has its own refusal
             refuse_late(changes, options.steps, planned=before.source is not None and asked is None)
@@ -362,23 +365,6 @@ def _draw(run: RunDirectory) -> None:
         from csac.record.plots import learning_curve  # matplotlib is slow to import
 
         learning_curve([(run.manifest.algorithm.upper(), rows)], run.curve, title=run.manifest.task, marks=marks)
-
-
-def choose_device(device: str) -> None:
-    """Have JAX compute there, in this process and its workers. Raises InputError where there is no such device."""
-    if device not in ("cpu", "gpu"):
-        raise InputError(f"device must be cpu or gpu, not {device!r}")
-    before, platform_name = os.environ.get("JAX_PLATFORMS"), "cpu" if device == "cpu" else "cuda"
-    jax.config.update("jax_platforms", platform_name)
-    if device == "gpu":
-        try:
-            jax.devices()
-        except Exception as error:  # which one depends on what is missing, and on JAX's version
-            jax.config.update("jax_platforms", before)
-            raise InputError("no GPU that JAX can use: install csac[cuda], or choose the cpu") from error
-    # Every dispatch is waited for at once: handing it to another thread would only cost the hand-over.
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
-    os.environ |= {"JAX_PLATFORMS": platform_name, "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0"}  # for the workers
 
 
 def _defaults(algorithm: Algorithm) -> dict[str, Any]:

@@ -2,6 +2,7 @@ import json
 import os
 import tempfile
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -320,6 +321,7 @@ def test_a_line_cut_by_a_crash_is_left_out_and_then_overwritten(run, kept):
         ("seed,step\n1,x\n", "damaged .*'x'"),
         ("seed,step,loss\n1,1,low\n", "damaged .*'low'"),
         ("seed,step\n,1\n", "damaged"),
+        (f"seed,step\n1,{10**30}\n", "damaged"),
     ],
 )
 def test_a_damaged_table_is_refused(tmp_path, content, error):
@@ -339,4 +341,8 @@ def test_what_is_no_table_at_all_is_refused(tmp_path):
 def test_log_lines_follow_each_other(run):
     run.log("first")
     run.log("second\n")
-    assert (run.path / "log.txt").read_text() == "first\nsecond\n"
+    lines = (run.path / "log.txt").read_text().splitlines()
+    assert [line.split(" ", 1)[1] for line in lines] == ["first", "second"]
+    moments = [datetime.fromisoformat(line.split(" ")[0]) for line in lines]
+    assert moments[0] >= datetime.fromisoformat(run.manifest.created)
+    assert moments[1] >= moments[0]

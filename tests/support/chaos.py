@@ -3,8 +3,9 @@
     python tests/support/chaos.py --kills 100 --seed 0 --out results/reliability
 
 A run is two seeds in two processes beside their parent: 2,000 steps of Hopper with tiny networks, a checkpoint every
-300. Each is killed several times. What is killed and when comes from a seeded generator; what the processes are doing
-at that moment does not, since it depends on the machine.
+300. Each is killed several times. One in three has friction that changes and noise that begins on its way, and one in
+three is forked with them from a run that had none. What is killed and when comes from a seeded generator; what the
+processes are doing at that moment does not, since it depends on the machine.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ import argparse
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import count
@@ -27,6 +29,7 @@ from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 import psutil
+from logs import without_times
 
 from csac.training.checkpoint import FOLDER, Checkpoint, newest_sound, steps_in
 
@@ -38,6 +41,17 @@ TRAIN = [
     *("--checkpoint-interval", "300"),
 ]
 TWO_PROCESSES = ["--seeds", "2", "--groups", "2"]
+FORKED_AT = 600
+PERTURBED = [
+    *("--perturb", "friction=1.5@700", "--perturb", "action_noise=0.05@900"),
+    *("--perturb", "observation_noise=0.01@1100"),
+]
+Case = Literal["plain", "perturbed", "forked"]
+CASES: dict[Case, list[str]] = {
+    "plain": [],
+    "perturbed": PERTURBED,
+    "forked": [*PERTURBED, "--from", f"../source/run@{FORKED_AT}"],
+}
 TABLES = ("episodes.csv", "evaluations.csv", "metrics.csv")
 KILLS_PER_RUN = 5
 MOST_MISSED = 8  # runs in a row that end before the moment of a kill has come
@@ -46,6 +60,10 @@ RESTARTED = "started again from step"
 MARKERS = ("<!-- chaos -->", "<!-- /chaos -->")
 
 Kind = Literal["parent", "worker", "write", "worker-write", "terminate", "interrupt"]
+SAID_OF_CASES: dict[Case, str] = {
+    "perturbed": "of these on a perturbed task",
+    "forked": "of these forked onto one",
+}
 KINDS: dict[Kind, str] = {
     "parent": "SIGKILL to the parent",
     "worker": "SIGKILL to a worker",
@@ -60,6 +78,7 @@ class Kill(NamedTuple):
     """One kill that was carried out. `exact` is about the run it belongs to, once that is over."""
 
     run: int
+    case: Case
     kind: Kind
     reached: int  # the last step that the run's tables told of
     exit_code: int | None  # None where a worker died and its parent did not
@@ -192,7 +211,7 @@ def _files(run: Path) -> dict[str, bytes]:
                 fields.pop(field)
             contents[name] = json.dumps(fields).encode()
         elif name == "log.txt":
-            lines = path.read_bytes().splitlines()
+            lines = without_times(path.read_bytes()).splitlines()
             contents[name] = b"\n".join(line for line in lines if RESTARTED.encode() not in line)
         elif not name.startswith(("tensorboard/", f"{FOLDER}/")) and name != ".lock":
             contents[name] = path.read_bytes()
@@ -209,8 +228,7 @@ def _checkpoint_differences(ours: Path, theirs: Path) -> list[str]:
 
 
 def _checkpoint_contents(checkpoint: Checkpoint) -> dict[str, Any]:
-    sizes = {name: size for name, size in checkpoint.values["sizes"].items() if name != "log.txt"}
-    contents: dict[str, Any] = {"values": {**checkpoint.values, "sizes": sizes}}
+    contents: dict[str, Any] = {"values": {**checkpoint.values, "log_bytes": None}}
     for seed in [seed for group in checkpoint.values["groups"] for seed in group]:
         saved = checkpoint.seed(seed)
         rows = np.zeros((700, saved.arrays["learner.waiting"].shape[-1]), np.float32)
@@ -219,7 +237,7 @@ def _checkpoint_contents(checkpoint: Checkpoint) -> dict[str, Any]:
         contents[f"transitions of seed {seed}"] = rows.tobytes()
         contents |= {f"seed {seed}: {name}": (str(a.dtype), a.shape, a.tobytes()) for name, a in saved.arrays.items()}
     for name in checkpoint.files:
-        if name.endswith(".best.safetensors"):
+        if name.endswith((".best.safetensors", ".csv")):
             contents[name] = (checkpoint.folder / name).read_bytes()
     return contents
 
@@ -232,12 +250,12 @@ class Chaos:
 
     Args:
         folder: where the runs go.
-        whole: an uninterrupted run.
+        wholes: an uninterrupted run of each case.
         cache: the folder of compiled programs.
     """
 
-    def __init__(self, folder: Path, whole: Path, cache: Path) -> None:
-        self.folder, self.whole, self.cache = folder, whole, cache
+    def __init__(self, folder: Path, wholes: Mapping[Case, Path], cache: Path) -> None:
+        self.folder, self.wholes, self.cache = folder, wholes, cache
         self.kills: list[Kill] = []
         self.complaints: list[str] = []
 
@@ -258,7 +276,8 @@ class Chaos:
     def _one_run(self, folder: Path, plans: Sequence[Plan], number: int) -> int:
         """Kill one run as planned until it finishes, and return how many plans it took."""
         kills: list[Kill] = []
-        arguments = [*TRAIN, *TWO_PROCESSES]
+        case = case_of(number)
+        arguments = command = [*TRAIN, *TWO_PROCESSES, *CASES[case]]
         while True:
             with open(folder.with_suffix(".txt"), "a+") as output:
                 at = output.seek(0, os.SEEK_END)
@@ -268,13 +287,13 @@ class Chaos:
                 kills += _with_restarts(life, output.read())
             if process.returncode == 0 or not life or life[-1].exit_code is None:
                 break
-            arguments = ["resume", "run"] if kills[-1].by == "resume" else [*TRAIN, *TWO_PROCESSES]
+            arguments = ["resume", "run"] if kills[-1].by == "resume" else command
         found = [f"ended with {process.returncode} by itself"]
         if process.returncode == 0:
-            found = differences(folder / "run", self.whole)
+            found = differences(folder / "run", self.wholes[case])
         self.complaints += [f"run {folder.name}: {line}" for line in found]
         self.kills += [kill._replace(exact=not found) for kill in kills]
-        print(f"run {folder.name}: {len(kills)} kills, {'; '.join(found) or 'the same files'}", flush=True)
+        print(f"run {folder.name}, {case}: {len(kills)} kills, {'; '.join(found) or 'the same files'}", flush=True)
         return len(kills)
 
     def _one_life(self, process: subprocess.Popen[str], run: Path, plans: Sequence[Plan], number: int) -> list[Kill]:
@@ -301,7 +320,7 @@ class Chaos:
                 struck.append(self._after_death(plan, process, run, number, children))
                 return struck
             begin = reached(run)
-            struck.append(Kill(number, plan.kind, begin, None, begin, "itself", 0, 0, 0))
+            struck.append(Kill(number, case_of(number), plan.kind, begin, None, begin, "itself", 0, 0, 0))
         process.wait(PATIENCE)
         return struck
 
@@ -312,9 +331,12 @@ class Chaos:
         orphans = len(psutil.wait_procs(children, timeout=20)[1])
         checkpoint, complaints = newest_sound(run / FOLDER)
         step = checkpoint.step if checkpoint else 0
-        lost = lost_rows(run, self.whole)
+        case, last = case_of(number), reached(run)
+        lost = lost_rows(run, self.wholes[case])
+        if case == "forked" and not step:
+            shutil.rmtree(run, ignore_errors=True)  # as csac asks for, where a fork dies before it has its checkpoint
         by = plan.by if (run / "manifest.json").exists() else "train"  # it may have died before there was a run
-        return Kill(number, plan.kind, reached(run), process.returncode, step, by, len(complaints), lost, orphans)
+        return Kill(number, case, plan.kind, last, process.returncode, step, by, len(complaints), lost, orphans)
 
 
 def _wait_for_moment(plan: Plan, process: subprocess.Popen[str], run: Path, target: float) -> bool:
@@ -334,6 +356,11 @@ def _with_restarts(life: Sequence[Kill], output: str) -> list[Kill]:
     """Fill in where workers began anew, as the output tells in order."""
     steps = [int(line.split(RESTARTED)[1].replace(",", "")) for line in output.splitlines() if RESTARTED in line]
     return [kill._replace(resumed_from=steps.pop(0)) if kill.exit_code is None and steps else kill for kill in life]
+
+
+def case_of(number: int) -> Case:
+    """Return the case of a run: they take turns."""
+    return list(CASES)[number % len(CASES)]
 
 
 def make_plans(kills: int, seed: int) -> list[Plan]:
@@ -380,7 +407,8 @@ def summary(kills: Sequence[Kill]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     kinds: list[tuple[str, list[Kill]]] = [(text, [k for k in kills if k.kind == kind]) for kind, text in KINDS.items()]
-    for text, part in [*kinds, ("all", list(kills))]:
+    parts = [(text, [kill for kill in kills if kill.case == case]) for case, text in SAID_OF_CASES.items()]
+    for text, part in [*kinds, ("all", list(kills)), *parts]:
         if part:
             lost = [kill.steps_lost for kill in part]
             cells = [text, len(part), sum(k.exact for k in part), sum(k.damaged for k in part)]
@@ -404,6 +432,15 @@ def write_results(kills: Sequence[Kill], out: Path) -> None:
         readme.write_text(f"{before}{MARKERS[0]}\n{summary(kills)}\n{MARKERS[1]}{after}")
 
 
+def make_wholes(folder: Path, cache: Path) -> dict[Case, Path]:
+    """Make the run that is forked, and an uninterrupted run of each case."""
+    commands = {case: [*TRAIN, *TWO_PROCESSES, *arguments] for case, arguments in CASES.items()}
+    with open(os.devnull, "w") as nowhere:
+        for name, command in {"source": [*commands["plain"], "--keep-checkpoints", "0"], **commands}.items():
+            start(folder / name, command, cache, nowhere).wait(PATIENCE)
+    return {case: folder / case / "run" for case in CASES}
+
+
 def main() -> int:
     """Return 0 where every run ended with the files of the uninterrupted one."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -415,10 +452,8 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = (options.folder or Path(temporary)).absolute()
-        cache, whole = folder / "programs", folder / "whole"
-        with open(os.devnull, "w") as nowhere:
-            start(whole, [*TRAIN, *TWO_PROCESSES], cache, nowhere).wait(PATIENCE)
-        chaos = Chaos(folder, whole / "run", cache)
+        cache = folder / "programs"
+        chaos = Chaos(folder, make_wholes(folder, cache), cache)
         plans = make_plans(options.kills, options.seed)
         parts = [plans[i : i + KILLS_PER_RUN] for i in range(0, len(plans), KILLS_PER_RUN)]
         with ThreadPoolExecutor(options.jobs) as pool:

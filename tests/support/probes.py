@@ -98,15 +98,22 @@ class Endless(Probe):
 
 
 class Failing(Endless):
-    """Raises in the `at`-th `step` or `reset` of its life, in episodes reset with one of `seeds` (None: any)."""
+    """Raises in the `at`-th `step`, `reset` or `close` of its life, in episodes reset with one of `seeds` (None: any).
+
+    With `exits` it does as a script does that is over: it calls `sys.exit(7)`.
+    """
 
     def __init__(
-        self, where: Literal["step", "reset"] = "step", at: int = 1, seeds: Collection[int] | None = None
+        self,
+        where: Literal["step", "reset", "close"] = "step",
+        at: int = 1,
+        seeds: Collection[int] | None = None,
+        exits: bool = False,
     ) -> None:
         super().__init__(length=3)
-        self.where, self.at, self.seeds = where, at, seeds
-        self.count = {"step": 0, "reset": 0}
-        self.is_chosen = False
+        self.where, self.at, self.seeds, self.exits = where, at, seeds, exits
+        self.count = {"step": 0, "reset": 0, "close": 0}
+        self.is_chosen = seeds is None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         self.is_chosen = self.seeds is None or seed in self.seeds
@@ -117,9 +124,14 @@ class Failing(Endless):
         self.maybe_fail("step")
         return super().step(action)
 
+    def close(self) -> None:
+        self.maybe_fail("close")
+
     def maybe_fail(self, where: str) -> None:
         self.count[where] += 1
         if self.is_chosen and where == self.where and self.count[where] >= self.at:
+            if self.exits:
+                sys.exit(7)
             raise RuntimeError("the simulator\nbroke")
 
 
@@ -148,6 +160,22 @@ class NonFinite(Endless):
         if self.where == "reward":
             return observation, self.value, terminated, truncated, info
         return np.array([self.value], np.float32), reward, terminated, truncated, info
+
+
+class Unsavable(Endless):
+    """Ends after 40 steps, and has a `get_snapshot` that raises, exits or gives what no file can hold."""
+
+    def __init__(self, gives: Literal["error", "exit", "nothing", "objects", "values"] = "error") -> None:
+        super().__init__(length=40)
+        self.gives = gives
+
+    def get_snapshot(self) -> Any:
+        if self.gives == "error":
+            raise KeyError("position")
+        if self.gives == "exit":
+            sys.exit(7)
+        arrays = {"bodies": np.array([object()])} if self.gives == "objects" else {}
+        return None if self.gives == "nothing" else (arrays, {"process": os} if self.gives == "values" else {})
 
 
 class Cases(Endless):
@@ -243,6 +271,7 @@ for name in (
     "Endless",
     "Failing",
     "NonFinite",
+    "Unsavable",
     "Cases",
     "Picky",
     "Deadly",

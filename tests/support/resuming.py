@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from logs import without_times
+
 from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
 from csac.training.train import train
 
@@ -36,7 +38,8 @@ def run(directory: Path, algorithm=LEARNERS[0], steps: int = 500, task: Any = "H
 def contents(directory: Path) -> dict[str, bytes]:
     """The files that an uninterrupted run would have too."""
     files = [*FILES, *(path.relative_to(directory).as_posix() for path in directory.glob("policy/*"))]
-    return {name: (directory / name).read_bytes() for name in files if (directory / name).exists()}
+    found = {name: (directory / name).read_bytes() for name in files if (directory / name).exists()}
+    return {name: without_times(content) if name == "log.txt" else content for name, content in found.items()}
 
 
 class Crash(Exception):

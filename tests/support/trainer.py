@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from unittest.mock import patch
 
 import jax
-import numpy as np
 
 from csac.training import group, messages
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from csac.types import Algorithm
 
 # XLA would take most of the time of these tests: compile each program once for all of them.
@@ -22,11 +23,11 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 class Outcome(NamedTuple):
-    """`states` and `memories` hold one entry per seed; `events` is everything that the loop yielded."""
+    """`states` and `memories` hold one entry per seed; `messages` is everything that the loop yielded."""
 
     states: list[Any]
     memories: list[np.ndarray]  # [steps, width] packed transitions, in the order of the steps
-    events: list[messages.Event]
+    messages: list[messages.GroupMessage]
 
 
 def run(
@@ -42,6 +43,6 @@ def run(
 
     settings = messages.Settings(algorithm, task, arguments, steps, steps, episodes)
     with patch.object(group, "Learner", Kept):
-        events = list(group.train_group(settings, seeds, lambda: False))
-    carries = learners[0]._by_seed(jax.tree.map(np.asarray, learners[0]._carry))
-    return Outcome([carry[0] for carry in carries], [carry[1].rows for carry in carries], events)
+        told = list(group.train_group(settings, seeds, lambda: False))
+    carries = [learners[0].carry(index) for index in range(len(seeds))]
+    return Outcome([carry.state for carry in carries], [carry.memory.rows for carry in carries], told)

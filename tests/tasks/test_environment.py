@@ -68,6 +68,11 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
         ("probes:ConstantRewards-v0", "did you mean ConstantReward-v0"),
         ("CartPole-v1", r"CartPole-v1: the action space is Discrete\(2\)"),
         (lambda: 3, "gave a int: a task's callable returns a gymnasium.Env"),
+        (probes.Endless(), r"already made \(Endless\).*a function that makes one"),
+        (gymnasium.wrappers.TimeLimit(probes.Endless(), 3), r"already made \(TimeLimit\)"),
+        (5, "a Gymnasium id or a function that makes an environment, not 5"),
+        (None, "a Gymnasium id or a function"),
+        (gymnasium.wrappers.TimeLimit, "TimeLimit could not be made: TypeError"),
     ],
 )
 def test_a_task_that_cannot_be_learnt_is_refused(task, message):
@@ -99,6 +104,19 @@ def test_a_task_that_cannot_be_learnt_is_refused(task, message):
 def test_a_space_that_cannot_be_learnt_is_refused(name, space, message):
     with pytest.raises(InputError, match=message):
         scripted(**{name: space})
+
+
+def test_the_advice_for_actions_without_bounds_works():
+    def task() -> gymnasium.Env:
+        return Scripted(action_space=spaces.Box(-np.inf, np.inf, (2,)))
+
+    with pytest.raises(InputError) as refusal:
+        Environment(task)
+    advice = str(refusal.value).rpartition("give it some, as ")[2].removesuffix(" does")
+    bounded = Environment(lambda: eval(advice, {"gymnasium": gymnasium, "environment": task()}))
+    bounded.reset(0)
+    bounded.step(np.array([0.5, -2.0], np.float32))
+    np.testing.assert_array_equal(bounded.raw.unwrapped.actions, [[0.5, -1.0]])  # pyright: ignore
 
 
 @pytest.mark.parametrize(
@@ -439,6 +457,21 @@ def test_a_stopped_seed_steps_no_more():
     assert [failure.index for failure in second.failures] == [1]
 
 
+@pytest.mark.parametrize("wrapper", ["NormalizeObservation", "NormalizeReward"])
+def test_a_wrapper_that_learns_by_itself_is_told_once(wrapper, caplog, monkeypatch):
+    monkeypatch.setattr("csac.tasks.environment._said", set())
+
+    def wrapped() -> gymnasium.Env:
+        environment = getattr(gymnasium.wrappers, wrapper)(probes.Endless())
+        return gymnasium.wrappers.TimeLimit(environment, 9)
+
+    for _ in range(3):
+        Environment(wrapped).close()
+    Environment(lambda: gymnasium.wrappers.RecordEpisodeStatistics(probes.Endless()))
+    (message,) = caplog.messages
+    assert message.startswith(f"note: wrapped: {wrapper} keeps statistics of its own")
+
+
 # What is printed
 
 RUN = """
@@ -497,3 +530,47 @@ def test_warnings_of_the_users_own_environment_are_shown():
     with pytest.warns(UserWarning, match="the user's own") as shown:
         Environment(task)
     assert len(shown) == 1
+
+
+# What an environment does to the process that it is in.
+
+
+@pytest.mark.parametrize("where", ["step", "reset"])
+def test_an_environment_that_exits_has_failed_like_one_that_raises(where):
+    environments = SeedEnvironments(probes.Failing, {"where": where, "exits": True, "at": 2}, [0, 1])
+    environments.reset()
+    steps = [environments.step(np.zeros((2, 1), np.float32)) for _ in range(4)]
+    failures = [failure.reason for step in steps for failure in step.failures]
+    assert failures == [f"{where} raised SystemExit: 7"] * 2
+    assert not environments.is_any_alive
+
+
+def test_a_task_that_exits_while_it_is_made_is_refused():
+    with pytest.raises(InputError, match="could not be made: SystemExit: 7"):
+        Environment(lambda: sys.exit(7))
+
+
+@pytest.mark.parametrize(("exits", "error"), [(False, "RuntimeError: the simulator broke"), (True, "SystemExit: 7")])
+def test_an_error_while_closing_is_logged_and_keeps_nobody(caplog, exits, error):
+    Environment("probes:Failing-v0", {"where": "close", "exits": exits}).close()
+    assert caplog.messages == [f"probes:Failing-v0: close raised {error}"]
+
+
+@pytest.mark.parametrize(
+    ("gives", "problem"),
+    [
+        ("error", "get_snapshot raised KeyError: 'position'"),
+        ("exit", "get_snapshot raised SystemExit: 7"),
+        ("nothing", "get_snapshot raised TypeError"),
+        ("objects", "get_snapshot gave 'bodies', which is no array of numbers"),
+        ("values", "get_snapshot gave values that JSON cannot hold: TypeError"),
+    ],
+)
+def test_an_episode_that_cannot_be_saved_says_why_and_begins_anew(gives, problem):
+    first, second = (SeedEnvironments(probes.Unsavable, {"gives": gives}, [3]) for _ in range(2))
+    first.reset()
+    first.step(np.zeros((1, 1), np.float32))
+    saved = first.save(0)
+    assert saved.values["problem"].startswith(problem)
+    assert second.take_back(0, saved) is False
+    np.testing.assert_array_equal(second.observations, SeedEnvironments(probes.Unsavable, {}, [3]).reset())

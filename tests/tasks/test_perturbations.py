@@ -16,16 +16,26 @@ import probes
 import pytest
 from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
+from logs import log_lines
 from resuming import LEARNERS, Crash, contents, crash_at, run
 from trajectories import steps_of
 
+from csac.deploy.choosing import load
 from csac.deploy.contract import Contract
-from csac.deploy.policy import Policy, load
+from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import Evaluator, evaluate
 from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
-from csac.tasks.perturbations import Perturbation, by_step, continued, lasting, perturbations_of, refuse_late, values_at
+from csac.tasks.perturbations import (
+    Perturbation,
+    by_step,
+    constant_perturbations,
+    continued,
+    perturbations_of,
+    refuse_late,
+    values_at,
+)
 from csac.tasks.seeds import EVALUATION_SEED, SeedEnvironments
 from csac.tasks.snapshots import _mujoco_arrays
 from csac.training import messages
@@ -116,7 +126,7 @@ def test_what_changes_nothing_is_refused():
     with pytest.raises(InputError, match="friction=2@100 would change nothing: the run ends at step 100"):
         refuse_late(perturbations_of("friction=2@100"), 100)
     with pytest.raises(InputError, match=r"friction=2@1: nothing is learnt here.*leave out @1"):
-        lasting("friction=2@1")
+        constant_perturbations("friction=2@1")
 
 
 def test_a_fork_keeps_what_had_happened_and_takes_what_is_to_come():
@@ -532,7 +542,7 @@ def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-
     return Group(settings, (3,))
 
 
-def advance(group: Group, until: int) -> list[messages.Event]:
+def advance(group: Group, until: int) -> list[messages.GroupMessage]:
     return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
 
 
@@ -589,18 +599,17 @@ def test_two_groups_tell_once_and_in_order(tmp_path):
     for group_number in (0, 1):
         evaluated(group_number, 300)
         recorder.handle(group_number, Progress(300))
-    log = record.path / "log.txt"
     expected = ["perturbed from step 1 on: mass x 2", "step 300: seed 0 1.0, seed 1 1.0"]
-    assert log.read_text().splitlines() == expected
+    assert log_lines(record.path) == expected
     evaluated(0, 600)
     recorder.handle(0, Progress(600))
-    assert log.read_text().splitlines() == expected
+    assert log_lines(record.path) == expected
     evaluated(1, 600)
     recorder.handle(1, Progress(600))
     expected += ["perturbed from step 301 on: friction x 2", "step 600: seed 0 1.0, seed 1 1.0"]
-    assert log.read_text().splitlines() == expected
+    assert log_lines(record.path) == expected
     recorder.close()
-    assert log.read_text().splitlines() == expected
+    assert log_lines(record.path) == expected
 
 
 def test_what_a_run_does_not_reach_is_not_told(tmp_path):
@@ -646,7 +655,7 @@ def test_a_run_says_what_it_was_perturbed_by(perturbed):
         "action_noise=0.1@250",
         "friction=1@430",
     ]
-    log = (perturbed.path / "log.txt").read_text().splitlines()
+    log = log_lines(perturbed.path)
     told = {number: line for number, line in enumerate(log) if line.startswith("perturbed")}
     assert told == {
         4: "perturbed from step 201 on: friction x 2, observation noise 0.05",

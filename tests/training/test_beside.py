@@ -11,6 +11,7 @@ import probes
 import psutil
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
+from logs import without_times
 
 from csac.algorithms import SAC
 from csac.tasks.seeds import EVALUATION_SEED
@@ -43,7 +44,7 @@ def run(directory: Path, processes: int | None, task: Any = "Hopper-v4", steps: 
 def contents(directory: Path) -> dict[str, Any]:
     """Everything in a run directory that two equal runs have alike."""
     files: dict[str, Any] = {
-        path.relative_to(directory).as_posix(): path.read_bytes()
+        path.relative_to(directory).as_posix(): without_times(path.read_bytes())
         for path in directory.rglob("*")
         if path.is_file() and path.name not in ("manifest.json", ".lock")
     }

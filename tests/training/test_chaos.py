@@ -92,6 +92,30 @@ def test_a_run_survives_every_kind_of_end_in_turn(tmp_path, cache, whole):
     assert all(entry["exact"] and not entry["complaints"] for entry in history)
 
 
+def test_a_fork_onto_a_perturbed_task_survives_before_and_after_the_change(tmp_path, cache, whole):
+    """Friction changes and noise begins between its own checkpoint, which each kill throws it back to, and the next."""
+    fork = [*ALONE, "--from", f"{whole}@600", "--steps", "1000"]
+    fork += ["--perturb", "friction=1.5@650", "--perturb", "action_noise=0.05@750"]
+    uninterrupted = Csac(tmp_path / "whole", cache, fork)
+    assert uninterrupted.end() == 0
+
+    csac = Csac(tmp_path / "fork", cache, fork)
+    csac.until("step 800 of 1,000")  # noise is on
+    strike("parent", csac.process, None)
+    assert csac.end() == -signal.SIGKILL
+    assert steps_in(csac.run / FOLDER) == [600]
+
+    csac = Csac(tmp_path / "fork", cache, ["resume", "run"])
+    csac.until("step 800 of 1,000")
+    strike("terminate", csac.process, None)
+    assert csac.end() == 128 + signal.SIGTERM
+    assert max(steps_in(csac.run / FOLDER)) >= 800
+
+    csac = Csac(tmp_path / "fork", cache, ["resume", "run"])
+    assert csac.end() == 0
+    assert differences(csac.run, uninterrupted.run) == []
+
+
 def plant_what_a_torn_write_leaves(run: Path) -> None:
     """Files without their names yet, files that no checkpoint counts on yet, and half a row."""
     folder = run / FOLDER

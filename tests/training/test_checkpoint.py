@@ -31,6 +31,7 @@ from csac.record.run import RunDirectory
 from csac.record.tensorboard import TensorBoardLog
 from csac.tasks.seeds import SeedEnvironments
 from csac.training.checkpoint import (
+    SCHEMA_VERSION,
     Checkpoint,
     Checkpoints,
     Damaged,
@@ -183,14 +184,64 @@ def test_any_cut_is_found_and_its_file_named(data):
 
 
 def check_found(place: Path, victim: Path) -> None:
-    """The damaged checkpoint is refused, and the one before it used unless it shares the file."""
+    """The damaged checkpoint is refused and the one before it used, or what both share is mended."""
     checkpoint, complaints = newest_sound(place)
-    if checkpoint and checkpoint.step == 20:
-        assert victim.suffix == ".json"  # which may say the same in other bytes: a space of another kind
+    assert checkpoint
+    if checkpoint.step == 10:
+        assert victim.name in complaints[0]
         return
-    is_shared = victim.parent.name == "replay" and victim.name == "seed_0.0-10.safetensors"
-    assert (checkpoint and checkpoint.step) == (None if is_shared else 10)
-    assert victim.name in complaints[0]
+    if victim.suffix == ".json":  # which may say the same in other bytes: a space of another kind
+        return
+    assert checkpoint.mended == ({f"replay/{victim.name}"} if victim.suffix == ".safetensors" else set())
+    rows = np.zeros((50, WIDTH), np.float32)
+    checkpoint.memory(0, rows)
+    np.testing.assert_array_equal(rows, ring(50, 20).rows)
+
+
+def test_transitions_without_a_parity_are_refused_where_they_are_damaged(tmp_path):
+    save(tmp_path, 10)
+    save(tmp_path, 20)
+    (tmp_path / "replay" / "seed_0.0-10.parity").unlink()
+    victim = tmp_path / "replay" / "seed_0.0-10.safetensors"
+    victim.write_bytes(victim.read_bytes()[:-1])
+    checkpoint, complaints = newest_sound(tmp_path)
+    assert checkpoint is None
+    assert all(victim.name in complaint for complaint in complaints)
+
+
+def test_blocks_that_the_disk_cannot_read_are_mended(tmp_path, monkeypatch):
+    """As a disk tells of a bad sector: reading it, alone or with others, is an error."""
+    save(tmp_path, 2000, capacity=2000)
+    path, read_bytes, pread = tmp_path / "replay" / "seed_0.0-2000.safetensors", Path.read_bytes, os.pread
+    content = path.read_bytes()
+
+    def read_all(self: Path) -> bytes:
+        if self == path:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return read_bytes(self)
+
+    def read_block(descriptor: int, size: int, place: int) -> bytes:
+        if place == 8192:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return pread(descriptor, size, place)
+
+    monkeypatch.setattr(Path, "read_bytes", read_all)
+    monkeypatch.setattr(os, "pread", read_block)
+    checkpoint = Checkpoint.open(tmp_path, 2000)
+    assert checkpoint.read(f"replay/{path.name}") == content
+    assert checkpoint.mended == {f"replay/{path.name}"}
+
+
+def test_transitions_that_are_missing_are_told(tmp_path):
+    """Whoever signs a list may leave out a file; training would go on with zeros in its place."""
+    save(tmp_path, 10)
+    save(tmp_path, 20)
+    checkpoint = Checkpoint.open(tmp_path, 20)
+    rows = np.zeros((50, WIDTH), np.float32)
+    for name, message in (("0-10", "lacks the transitions 0 to 9"), ("10-20", "has 10 transitions .*, not 20")):
+        files = {key: facts for key, facts in checkpoint.files.items() if name not in key}
+        with pytest.raises(Damaged, match=message):
+            Checkpoint(tmp_path, 20, files, {}).memory(0, rows)
 
 
 def test_a_missing_file_is_named():
@@ -211,8 +262,23 @@ def forge(place: Path, fields: Any) -> None:
 
 
 def forged(content: bytes, name: str) -> dict[str, Any]:
-    facts = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-    return {"schema_version": 1, "step": 5, "files": {name: facts}, "values": {}}
+    return {"schema_version": SCHEMA_VERSION, "step": 5, "files": {name: facts_of(content)}, "values": {}}
+
+
+def facts_of(content: bytes) -> dict[str, Any]:
+    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def forge_transitions(place: Path, content: bytes, first: int, last: int) -> None:
+    """Write a checkpoint of seed 0 that has this file of transitions alone."""
+    (place / "replay").mkdir()
+    name, held = f"replay/seed_0.{first}-{last}.safetensors", json.dumps([first, last])
+    (place / name).write_bytes(content)
+    learnt = safetensors.numpy.save({}, metadata={"values": "{}", "transitions": held})
+    (place / "step_5.seed_0.safetensors").write_bytes(learnt)
+    fields = forged(content, name)
+    fields["files"]["step_5.seed_0.safetensors"] = facts_of(learnt)
+    forge(place, fields)
 
 
 def use_all(place: Path, memory: np.ndarray) -> Snapshot:
@@ -270,16 +336,16 @@ def test_names_that_lead_elsewhere_are_damage(tmp_path, name):
     | st.tuples(
         st.sampled_from(["F32", "BF16", "F8_E4M3", "U16", "??"]), st.lists(st.integers(0, 2**40), max_size=3)
     ).map(lambda facts: tensor_header(*facts)),
-    st.sampled_from(
-        ["step_5.seed_0.safetensors", "replay/seed_0.0-2.safetensors", "replay/seed_0.0-999999999999999.safetensors"]
-    ),
+    st.sampled_from([None, 2, 999999999999999]),
 )
-def test_bytes_in_place_of_arrays_are_damage(content, name):
+def test_bytes_in_place_of_arrays_are_damage(content, transitions):
     """Also headers that claim more than there is: nothing is allocated for them."""
     with folder() as place:
-        (place / "replay").mkdir()
-        (place / name).write_bytes(content)
-        forge(place, forged(content, name))
+        if transitions:
+            forge_transitions(place, content, 0, transitions)
+        else:
+            (place / "step_5.seed_0.safetensors").write_bytes(content)
+            forge(place, forged(content, "step_5.seed_0.safetensors"))
         memory = np.zeros((4, WIDTH), np.float32)
         with suppress(Damaged):  # four bytes can be a scalar
             assert sum(array.nbytes for array in use_all(place, memory).arrays.values()) <= len(content)
@@ -296,11 +362,8 @@ def tensor_header(kind: str, shape: list[int]) -> bytes:
 @given(first=st.integers(0, 10**15 - 3), shape=st.tuples(st.integers(0, 3), st.integers(0, 4)))
 def test_transitions_of_another_shape_are_damage(first, shape):
     with folder() as place:
-        (place / "replay").mkdir()
-        name, rows = f"replay/seed_0.{first}-{first + 2}.safetensors", np.ones(shape, np.float32)
-        content = safetensors.numpy.save({"rows": rows})
-        (place / name).write_bytes(content)
-        forge(place, forged(content, name))
+        content = safetensors.numpy.save({"rows": np.ones(shape, np.float32)})
+        forge_transitions(place, content, first, first + 2)
         memory = np.zeros((4, WIDTH), np.float32)
         if shape == (2, WIDTH):
             Checkpoint.open(place, 5).memory(0, memory)
@@ -392,13 +455,13 @@ def saves(recorder: Recorder, group: int, step: int) -> None:
     episode = {"seed": group, "step": step - 10, "return": 1.0, "length": 5}
     recorder.handle(group, Rows("episodes", [episode]))
     place = recorder.run.path / "checkpoint"
-    recorder.handle(group, Saved(step, SeedFiles(place, group, {}).write(step, Snapshot({}, {}), ring(9, step)), []))
+    recorder.handle(group, Saved(step, SeedFiles(place, group, {}).write(step, Snapshot({}, {}), ring(9, step)), {}))
 
 
 def rows_in(recorder: Recorder, step: int) -> list[int]:
     """The steps of the episodes that a checkpoint counts on."""
-    size = Checkpoint.open(recorder.run.path / "checkpoint", step).values["sizes"]["episodes.csv"]
-    lines = (recorder.run.path / "episodes.csv").read_text()[:size].splitlines()[1:]
+    content = Checkpoint.open(recorder.run.path / "checkpoint", step).read(f"step_{step}.episodes.csv")
+    lines = content.decode().splitlines()[1:]
     return [int(line.split(",")[1]) for line in lines]
 
 
@@ -450,8 +513,8 @@ class DeadWorker:
     def recv(self) -> None:
         raise OSError("got end of file during message")
 
-    def kill(self) -> None:
-        pass
+    def cause_of_death(self) -> str:
+        return "its process was killed by SIGKILL"
 
 
 @pytest.mark.parametrize(("stopping", "before", "kind"), [(True, set(), Ended), (True, {0}, GroupCrashed)])
@@ -549,15 +612,14 @@ def test_a_file_that_may_not_grow_ends_the_run_and_it_goes_on_later(tmp_path, un
 
 
 @pytest.mark.parametrize(
-    ("full", "begin"), [("step_200.seed_0.safetensors", 100), ("episodes.csv", 100), ("step_300.json", 200)]
+    ("full", "begin"), [("step_200.seed_0.safetensors", 100), ("step_200.episodes.csv", 100), ("step_300.json", 200)]
 )
 def test_a_full_disk_ends_the_run_and_it_goes_on_later(tmp_path, uninterrupted, monkeypatch, capsys, full, begin):
-    path, seen = tmp_path / "run", []
+    path = tmp_path / "run"
 
     def fsync(descriptor: int) -> None:
         name = Path(os.readlink(f"/proc/self/fd/{descriptor}")).name
-        seen.append(name)
-        if full in name and (full != "episodes.csv" or seen.count(name) == 2):
+        if full in name:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patched:
@@ -669,7 +731,7 @@ def test_a_stranger_s_checkpoint_is_refused_in_one_line(tmp_path):
     place = first.path / "checkpoint"
     for step in steps_in(place):
         files = SeedFiles(place, 0, {}).write(step, Snapshot({"learner.x": np.zeros(2)}, {"learner": []}), ring(4, 0))
-        Checkpoints(place, 0).commit(step, files, {"sizes": first.sync()})
+        Checkpoints(place, 0).commit(step, files, {})
     with pytest.raises(InputError, match="no such array"):
         train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "fork", start_from=first.path, **LONGER)
     with pytest.raises(InputError, match=r"step_400\.json is not what csac writes"):

@@ -36,11 +36,11 @@ def learn() -> None:
     ends = np.zeros(1, bool)
     donated = []
     for step in range(1, 11):
-        before = learner._buffers
+        before = learner._carry
         outcome = Steps(observation * step, np.ones(1, np.float32), ends, ends, observation * step, [], [])
         action = learner.step(observation * (step - 1), action, outcome, step)
         donated.append(all(buffer.is_deleted() for buffer in jax.tree.leaves(before)))
-    bits = b"".join(np.asarray(buffer).tobytes() for buffer in jax.tree.leaves(learner._buffers))
+    bits = b"".join(np.asarray(buffer).tobytes() for buffer in jax.tree.leaves(learner._carry))
     loaded = events.count("/jax/compilation_cache/cache_hits")
     print(json.dumps({"bits": hashlib.sha256(bits).hexdigest(), "loaded": loaded, "donated": donated}))
 

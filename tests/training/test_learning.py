@@ -32,7 +32,7 @@ class Climbing(CSAC):
 
 
 def mean_return(algorithm, steps: int = 3000, seed: int = 0) -> float:
-    events = run(algorithm, "Pendulum-v1", steps, (seed,), episodes=10).events
+    events = run(algorithm, "Pendulum-v1", steps, (seed,), episodes=10).messages
     rows = [row for event in events if isinstance(event, Evaluated) for row in event.rows]
     assert len(rows) == 10
     return float(np.mean([row["return"] for row in rows]))

@@ -5,8 +5,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from csac.training.packing import Packing
+from csac.algorithms.networks import make_mlp
+from csac.training.packing import Packing, SeedAxis, by_name
 
 
 class Tree(NamedTuple):
@@ -52,3 +54,34 @@ def test_a_tree_without_small_floats_has_an_empty_row():
     row, count = packing.pack({"count": np.int32(3)})
     assert row.shape == (0,)
     assert int(packing.unpack([row, count])["count"]) == 3
+
+
+def test_leaves_are_named_by_fields_keys_and_places():
+    given = {"state": tree(), "moments": [np.zeros(1), (np.ones(2),)]}
+    named = by_name(given)
+    assert set(named) == {
+        *("state.bias", "state.count", "state.hidden", "state.number"),
+        *("moments.0", "moments.1.0"),
+    }
+    assert named["moments.1.0"] is given["moments"][1][0]
+    assert list(named.values()) == jax.tree.leaves(given)
+
+
+def test_a_module_is_named_by_its_fields():
+    network = make_mlp(jax.random.key(0), 3, (4,), 2)
+    assert list(by_name(network)) == [f"layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
+
+
+@pytest.mark.parametrize(("seeds", "inside"), [(1, ()), (3, (3,))])
+def test_a_seed_that_is_alone_has_no_axis(seeds, inside):
+    axis, given = SeedAxis(seeds), np.arange(seeds * 2, dtype=np.float32).reshape(seeds, 2)
+    program = axis.map(lambda row, offset: 2.0 * row.reshape(2) + offset, (0, None))
+    out = program(axis.strip(given), 1.0)
+    assert out.shape == (*inside, 2)
+    np.testing.assert_array_equal(axis.restore(out), 2.0 * given + 1.0)
+    stacked = axis.stack([row.copy() for row in given])
+    assert stacked.shape == (*inside, 2)
+    for index, row in enumerate(given):
+        np.testing.assert_array_equal(axis.of({"row": stacked}, index)["row"], row)
+        axis.of(stacked, index)[:] = -1.0  # a view
+    np.testing.assert_array_equal(stacked, np.full((*inside, 2), -1.0))

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from csac.record.run import RunDirectory
 from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, steps_in
 from csac.training.group import Group
+from csac.training.resume import Source
 from csac.training.scheduler import run_groups
 from csac.training.train import resume
 from csac.types import InputError
@@ -31,14 +33,15 @@ def group(folder: Path, algorithm, seeds, steps: int, begin: int = 0, task: Any 
     return Group(messages.Settings(algorithm, task, {}, steps, 1000, 1, folder, 0, begin), seeds)
 
 
-def advance(group: Group, until: int) -> list[messages.Event]:
+def advance(group: Group, until: int) -> list[messages.GroupMessage]:
     return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
 
 
 def everything(group: Group) -> list[np.ndarray]:
     """What a group has learnt, remembers and does next."""
-    leaves = jax.tree.leaves(group.learner._carry)
-    return [np.asarray(leaf) for leaf in leaves] + [group._actions, group._observations, group.learner._waiting]
+    learner, seeds = group.learner, range(len(group.seeds))
+    leaves = jax.tree.leaves([(learner.carry(index), learner.waiting(index)) for index in seeds])
+    return [*leaves, group._actions, group._observations]
 
 
 @pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda learner: f"{learner.name}-{learner.cadence.update_interval}")
@@ -86,8 +89,8 @@ def test_seeds_may_be_grouped_otherwise(tmp_path):
     alone = group(tmp_path, LEARNERS[0], (4,), 300, begin=150)
     advance(together, 170)
     advance(alone, 170)
-    ours = jax.tree.leaves(alone.learner._carry[0])
-    theirs = [leaf[1] for leaf in jax.tree.leaves(together.learner._carry[0])]
+    ours = jax.tree.leaves(alone.learner.carry(0).state)
+    theirs = jax.tree.leaves(together.learner.carry(1).state)
     for our, their in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(our, their, rtol=1e-3, atol=1e-5)
 
@@ -275,10 +278,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(tmp_path, unin
         run(tmp_path / "run", on_evaluation=crash_at(400))
     folder = tmp_path / "run" / "checkpoint"
     assert steps_in(folder) == [240, 360]
-    victim = folder / "step_360.seed_0.safetensors"
-    content = bytearray(victim.read_bytes())
-    content[len(content) // 2] ^= 1
-    victim.write_bytes(content)
+    flip(folder / "step_360.seed_0.safetensors")
     entry = resume(tmp_path / "run").manifest.history[0]
     assert entry.step == 240
     assert "step_360.seed_0.safetensors has changed" in entry.complaints[0]
@@ -294,10 +294,104 @@ def test_a_run_without_a_sound_checkpoint_is_refused_and_kept(tmp_path, finished
     assert contents(tmp_path / "run") == before
 
 
-def test_rows_that_someone_removed_are_missed(tmp_path, finished):
-    (tmp_path / "run" / "episodes.csv").write_text("seed,step,return,length\n")
-    with pytest.raises(InputError, match=r"episodes\.csv has lost rows"):
-        resume(tmp_path / "run", steps=260)
+SPOILT: dict[str, Callable[[bytes], bytes]] = {
+    "rows are removed": lambda content: content[: content.index(b"\n") + 1],
+    "a digit is another": lambda content: content.replace(b"0,100,1,", b"0,100,1,9"),
+    "lines come before it": lambda content: b"\n\n# mine\n" + content,
+    "a spreadsheet saved it": lambda content: content.replace(b"\n", b"\r\n"),
+    "it is no text": lambda content: b"\xff\xfe" + content,
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
+def test_a_table_that_was_changed_is_told_of_and_restored(tmp_path, finished, spoil):
+    """The checkpoint has a copy: nothing that is false becomes part of the run, and nothing is lost."""
+    path = finished / "evaluations.csv"
+    before = path.read_bytes()
+    path.write_bytes(spoil(before))
+    assert path.read_bytes() != before
+    (entry,) = resume(finished, steps=200).manifest.history
+    assert entry.complaints == (f"{path} had changed since the checkpoint; it is restored",)
+    assert entry.exact
+    assert path.read_bytes().startswith(before)
+
+
+def test_tables_that_are_gone_come_back(finished):
+    before = {path: path.read_bytes() for path in finished.glob("*.csv")}
+    for path in before:
+        path.unlink()
+    assert len(resume(finished, steps=200).manifest.history[0].complaints) == len(before) == 3
+    assert all(path.read_bytes().startswith(content) for path, content in before.items())
+
+
+def test_a_table_s_copy_that_is_damaged_is_not_needed(finished):
+    (finished / "checkpoint" / "step_130.evaluations.csv").write_bytes(b"")
+    (entry,) = resume(finished, steps=200).manifest.history
+    assert (entry.step, entry.complaints) == (130, ())
+
+
+def test_a_table_that_is_damaged_with_its_copy_costs_a_checkpoint_and_no_more(tmp_path, finished):
+    for path in (finished / "evaluations.csv", finished / "checkpoint" / "step_130.evaluations.csv"):
+        path.write_bytes(path.read_bytes()[:-2])
+    (entry,) = resume(finished, steps=200).manifest.history
+    assert entry.step == 120
+    assert "step_130.evaluations.csv has" in entry.complaints[0]
+    run(tmp_path / "whole", steps=200)
+    assert (finished / "evaluations.csv").read_bytes() == (tmp_path / "whole" / "evaluations.csv").read_bytes()
+
+
+@pytest.mark.parametrize("where", ["policy/seed_0.best.safetensors", "checkpoint/step_130.seed_0.best.safetensors"])
+def test_a_best_policy_that_is_damaged_once_comes_back(finished, where):
+    best = finished / "policy" / "seed_0.best.safetensors"
+    before = best.read_bytes()
+    flip(finished / where)
+    (entry,) = resume(finished, steps=140).manifest.history
+    assert (entry.step, entry.complaints) == (130, ())
+    assert Checkpoint.open(finished / "checkpoint", 130).read("step_130.seed_0.best.safetensors") == before
+
+
+def test_a_best_policy_that_is_lost_is_followed_by_the_best_of_later_evaluations(finished):
+    """Learning does not need it. It had two names for one file before, so that one bad byte was in all."""
+    best = finished / "policy" / "seed_0.best.safetensors"
+    for path in [best, *finished.glob("checkpoint/*.best.safetensors")]:
+        flip(path)
+    resumed = resume(finished, steps=140)
+    (entry,) = resumed.manifest.history
+    assert entry.step == 130
+    assert "seed_0.best.safetensors has changed" in entry.complaints[0]
+    assert best.read_bytes() == (finished / "policy" / "seed_0.safetensors").read_bytes()  # evaluated once since
+
+
+def test_transitions_that_are_damaged_in_one_place_are_mended(tmp_path, finished, uninterrupted):
+    """Both checkpoints share them: there would be none to go on from."""
+    shard = sorted(finished.glob("checkpoint/replay/*.safetensors"))[0]
+    before = shard.read_bytes()
+    shard.write_bytes(before[:1000] + bytes(4096) + before[5096:])
+    (entry,) = resume(finished, steps=500).manifest.history
+    assert (entry.step, entry.exact) == (130, True)
+    assert entry.complaints == (f"{shard} was damaged in one place; it is mended from its parity",)
+    assert contents(finished)["policy/seed_0.safetensors"] == uninterrupted["policy/seed_0.safetensors"]
+
+
+def test_a_fork_of_damaged_transitions_has_them_mended_and_leaves_the_others_alone(tmp_path, finished):
+    shard = sorted(finished.glob("checkpoint/replay/*.safetensors"))[0]
+    before = shard.read_bytes()
+    flip(shard)
+    spoilt = shard.read_bytes()
+    source = Source.find(finished)
+    forked = RunDirectory.create(tmp_path / "fork", source.run.manifest)
+    source.copy_to(forked, 2)
+    assert (forked.path / "checkpoint" / "replay" / shard.name).read_bytes() == before
+    assert shard.read_bytes() == spoilt
+    Checkpoint.open(forked.path / "checkpoint", 130).verify()
+    assert (forked.path / "episodes.csv").read_bytes() == (finished / "episodes.csv").read_bytes()
+
+
+def flip(path: Path) -> None:
+    """Flip a bit in the middle of a file."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
 
 
 def test_checkpoints_are_kept_as_asked(tmp_path):
@@ -376,6 +470,6 @@ def test_a_diverged_seed_names_its_first_bad_array_and_is_not_saved(tmp_path):
     settings = messages.Settings(wild, "Hopper-v4", {}, 300, 1000, 1, tmp_path / "checkpoint", 50)
     told = [message for _, message in run_groups(settings, [[0]], lambda: False)]
     (failed,) = [message for message in told if isinstance(message, messages.Failed)]
-    assert "actor.layers[0].weight is not finite" in failed.reason
+    assert "actor.layers.0.weight is not finite" in failed.reason
     assert 40 <= failed.step <= 50
     assert not [message for message in told if isinstance(message, messages.Saved) and message.step >= failed.step]

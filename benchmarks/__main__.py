@@ -1,0 +1,107 @@
+"""The entry point: `python -m benchmarks NAME` measures, prints a table and, with --write, puts it into its page."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from benchmarks.parts import Options, Part, shown
+from benchmarks.suites import checkpoint, gpu, growth, limit, peers
+from benchmarks.suites import time as times
+from csac.processes import usable_cores
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+SUITES = {
+    "peers": peers,
+    "limit": limit,
+    "growth": growth,
+    "time": times,
+    "checkpoint": checkpoint,
+    "gpu": gpu,
+}
+PARTS: list[Part] = [part for suite in SUITES.values() for part in suite.PARTS]
+
+
+def named(name: str) -> list[Part]:
+    """Return the parts that a name stands for: those of a suite, or the one part of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    parts = SUITES[name].PARTS if name in SUITES else [part for part in PARTS if part.name == name]
+    if not parts:
+        raise InputError(f"there is nothing called {name!r} to measure: choose among {', '.join(_names())}, render")
+    return list(parts)
+
+
+def measure(part: Part, options: Options, write: bool) -> bool:
+    """Measure one part, print its table and, if asked for, write it; return whether anything was measured."""
+    began = time.monotonic()
+    rows = part.run(options)
+    if not rows:
+        return False
+    notes = part.all_notes(rows, options)
+    print(f"\n{shown(part.table(rows), notes)}\n{(time.monotonic() - began) / 60:.1f} minutes", flush=True)
+    if write and (options.quick or options.only):
+        print(f"not written: only a part of {part.name} was measured, or quickly")
+    elif write:
+        part.write(rows, notes)
+        part.publish()
+    return True
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Read the command line and do what it says; return the exit code."""
+    given = _parser().parse_args(arguments)
+    options = Options(given.only, given.repetitions, given.seconds, given.quick, given.device)
+    try:
+        if given.name == "render":
+            for part in PARTS:
+                part.publish()
+            return 0
+        parts = named(given.name)
+        if not sys.platform.startswith("linux") or len(usable_cores()) < 2:
+            raise InputError("the benchmarks need Linux and two processors: run them on such a machine")
+        measured = [measure(part, options, given.write) for part in parts]
+        if not any(measured):
+            raise InputError(f"nothing in {given.name} can be measured here whose name contains {given.only!r}")
+    except InputError as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _names() -> list[str]:
+    return list(dict.fromkeys([*SUITES, *(part.name for part in PARTS)]))
+
+
+def _parser() -> argparse.ArgumentParser:
+    width = max(map(len, _names()))
+    lines = []
+    for name, suite in SUITES.items():
+        lines.append(f"  {name:{width}}  {(suite.__doc__ or '').splitlines()[0]}")
+        lines += [f"  {part.name:{width}}    {part.about}" for part in suite.PARTS if len(suite.PARTS) > 1]
+    lines.append(f"  {'render':{width}}  Put all tables into their pages again, from the rows in benchmarks/results.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description="Measure how fast csac is. NAME is one of:\n\n" + "\n".join(lines),
+        epilog="Measure on a quiet machine: other programs cost more than most differences here.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("name", metavar="NAME")
+    parser.add_argument("--only", default="", metavar="TEXT", help="measure only what has this in its name, and print")
+    parser.add_argument("--repetitions", type=int, help="of what is measured more than once, in turns")
+    parser.add_argument("--seconds", type=float, help="how long one measurement lasts, where it is a matter of time")
+    parser.add_argument("--quick", action="store_true", help="see that it runs; the numbers mean nothing")
+    parser.add_argument("--device", choices=("gpu", "cpu"), default="gpu", help="of the suite gpu")
+    parser.add_argument("--write", action="store_true", help="write the rows to benchmarks/results, and the pages")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

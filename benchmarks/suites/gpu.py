@@ -1,0 +1,88 @@
+"""Training on a GPU: seed-steps per second against seeds, and whether its numbers are those of the CPU.
+
+What runs is `csac.train` on HalfCheetah-v4 with evaluation off, at the paper's settings: all seeds in one program, the
+replay on the device, one dispatch for each environment step of all seeds, or for ten.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from benchmarks.measuring import run_one, training, worker
+from benchmarks.parts import Options, Part
+from benchmarks.tables import Row, formatted
+from csac.types import InputError
+
+PAGE = "docs/gpu.md"
+SEEDS, INTERVALS = [1, 2, 5, 10, 25, 50], [1, 10]
+AIMS = {5: "10,000", 25: "25,000"}  # seed-steps per second on an H200
+
+
+class Seeds(NamedTuple):
+    """So many seeds in one program, and so many updates in one dispatch."""
+
+    seeds: int
+    interval: int
+
+    @property
+    def name(self) -> str:
+        """What --only looks in."""
+        return f"{self.seeds} seeds, {self.interval} in one dispatch"
+
+
+def measure_agreement(_: str, options: Options) -> list[Row]:
+    """Make the same updates on GPU and CPU; nothing where the CPU is measured."""
+    return [] if options.device == "cpu" else [on_gpu(updates=200)]
+
+
+def measure_speed(case: Seeds, options: Options) -> list[Row]:
+    """Train so many seeds for a while."""
+    device = "CPU" if options.device == "cpu" else on_gpu(updates=0)["device"]
+    window = options.window(10.0)._replace(settled=260)
+    found = run_one(training("csac", window, case.seeds, case.interval, options.device), device=options.device)
+    row = {"device": device, "seeds": case.seeds, "updates_in_one_dispatch": case.interval}
+    return [{**row, **{column: found[column] for column in ("steps_per_second", "start_seconds", "peak_mib")}}]
+
+
+def on_gpu(updates: int) -> Row:
+    """Return what the GPU is, and how far it is from the CPU after so many updates.
+
+    Raises:
+        InputError: there is none that JAX can use.
+    """
+    found = run_one(worker("agreement", updates=updates), device="gpu")
+    if not found["device"]:
+        raise InputError(
+            "there is no GPU that JAX can use: install csac[cuda], or see that it runs with --device cpu --quick"
+        )
+    return found
+
+
+AGREEMENT_COLUMNS = {
+    "GPU": "{device}",
+    "updates": "{updates}",
+    "largest difference to the CPU": "{largest_difference:.1e}",
+}
+SPEED_COLUMNS = {
+    "device": "{device}",
+    "seeds": "{seeds}",
+    "updates in one dispatch": "{updates_in_one_dispatch}",
+    "seed-steps/s": "{steps_per_second:,.0f}",
+    "aim (H200)": "{aim}",
+    "start, s": "{start_seconds:.1f}",
+    "host memory, MiB": "{peak_mib:,.0f}",
+}
+
+
+def render_speed(rows: list[Row]) -> str:
+    """Return a row for each number of seeds and updates in one dispatch."""
+    return formatted([{**row, "aim": AIMS.get(row["seeds"], "")} for row in rows], SPEED_COLUMNS)
+
+
+GROUPS = [Seeds(seeds, interval) for interval in INTERVALS for seeds in SEEDS]
+PARTS = [
+    Part(
+        "gpu-agreement", PAGE, "GPU and CPU after the same updates", ["agreement"], measure_agreement, AGREEMENT_COLUMNS
+    ),
+    Part("gpu-speed", PAGE, "seed-steps per second of 1 to 50 seeds", GROUPS, measure_speed, render_speed),
+]

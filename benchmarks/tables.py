@@ -1,0 +1,79 @@
+"""From measurements to files: rows in CSV, tables in Markdown, and the places in pages where they stand.
+
+A row is a dictionary from column to number or text; all rows of a table have the same columns.
+"""
+
+from __future__ import annotations
+
+import csv
+import statistics
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+Row: TypeAlias = dict[str, Any]
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows in the order in which they were measured, numbers with six digits."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Return what `write_rows` wrote."""
+    with path.open(newline="") as file:
+        return [{key: _value(text) for key, text in line.items()} for line in csv.DictReader(file)]
+
+
+def _value(text: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def formatted(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
+    """Return a Markdown table whose columns have a heading and a format that names columns of the row."""
+    return table(list(columns), [[form.format_map(row) for form in columns.values()] for row in rows])
+
+
+def grouped(rows: Sequence[Row], *columns: str) -> dict[tuple, list[Row]]:
+    """Return the rows by what they have in these columns, in the order of their first rows."""
+    groups: dict[tuple, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[column] for column in columns), []).append(row)
+    return groups
+
+
+def with_range(values: Sequence[float], form: str, unit: str = "") -> str:
+    """Return the median, and in brackets the smallest and the largest where there are several."""
+    median = f"{statistics.median(values):{form}}{unit}"
+    return f"{median} ({min(values):{form}} to {max(values):{form}})" if len(values) > 1 else median
+
+
+def between_markers(page: str, name: str, text: str) -> str:
+    """Return the page with `text` between its markers `name`.
+
+    Raises:
+        ValueError: it lacks them.
+    """
+    start, stop = (f"<!-- {name}: {end} -->" for end in ("begin", "end"))
+    head, begin, rest = page.partition(start)
+    _, end, tail = rest.partition(stop)
+    if not (begin and end):
+        raise ValueError(f"the page lacks the lines {start} and {stop}, between which the table goes")
+    return f"{head}{start}\n{text}{stop}{tail}"

@@ -1,0 +1,37 @@
+"""Where a process computes: JAX decides it once, at its first computation."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import jax
+
+from csac.types import InputError
+
+PLATFORMS = {"cpu": "cpu", "gpu": "cuda"}  # as JAX calls them
+
+
+def choose_device(device: str) -> None:
+    """Compute on "cpu" or "gpu" in this process and in those that it starts.
+
+    A CPU's programs are dispatched asynchronously, which is JAX's default: the client looks after a program's outputs
+    while it runs already. `JAX_CPU_ENABLE_ASYNC_DISPATCH=0` changes that and no number.
+
+    Raises:
+        InputError: there is no such device, or this process has computed on another one.
+    """
+    if device not in PLATFORMS:
+        raise InputError(f"device must be cpu or gpu, not {device!r}")
+    config: Any = jax.config
+    before = config.jax_platforms
+    jax.config.update("jax_platforms", PLATFORMS[device])
+    try:
+        chosen = jax.default_backend()
+    except Exception as error:  # which one depends on what is missing, and on JAX's version
+        jax.config.update("jax_platforms", before)
+        raise InputError("no GPU that JAX can use: install csac[cuda], or choose the cpu") from error
+    if chosen != device:
+        jax.config.update("jax_platforms", before)
+        raise InputError(f"this process computes on the {chosen} already: train on the {device} in a new one")
+    os.environ["JAX_PLATFORMS"] = PLATFORMS[device]  # for the workers

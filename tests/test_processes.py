@@ -1,0 +1,47 @@
+"""Processes beside this one, and what is said of their ends."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+from multiprocessing.connection import Connection
+
+import pytest
+
+from csac.processes import Child, cause_of_death
+
+
+def end(_: Connection, how: str) -> None:
+    """What a task may do to the process that it is in."""
+    if how == "sys.exit":
+        sys.exit(7)
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+def test_a_process_that_ended_is_not_said_to_have_been_killed():
+    """Its pipe closes before it is gone: who ends it then would find the cause in himself."""
+    exits, faults = (Child(end, how, daemon=True) for how in ("sys.exit", "fault"))
+    for child, cause in (
+        (exits, "ended by itself with exit code 7"),
+        (faults, r"killed by SIGSEGV \(a fault in native"),
+    ):
+        with pytest.raises(EOFError):
+            child.connection.recv()
+        assert re.search(cause, child.cause_of_death())
+        assert not child.process.is_alive()
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "cause"),
+    [
+        (0, "its process ended by itself with exit code 0 (does the task call os._exit?)"),
+        (-9, "its process was killed by SIGKILL (out of memory?)"),
+        (-15, "its process was killed by SIGTERM"),
+        (-63, "its process was killed by signal 63"),
+    ],
+)
+def test_what_is_known_of_an_end_is_said(exit_code, cause):
+    assert cause_of_death(exit_code) == cause

@@ -1,0 +1,61 @@
+"""A process computes where it was told to, or says that it cannot."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import Any
+
+import jax
+import pytest
+
+from csac.training.devices import choose_device
+from csac.types import InputError
+
+
+@pytest.fixture(autouse=True)
+def on_the_cpu(monkeypatch):
+    """What a test chooses is forgotten."""
+    config: Any = jax.config
+    before = config.jax_platforms
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    jax.config.update("jax_platforms", "cpu")
+    assert jax.default_backend() == "cpu"
+    yield
+    jax.config.update("jax_platforms", before)
+
+
+def test_a_process_that_has_computed_on_the_cpu_refuses_the_gpu():
+    choose_device("cpu")
+    with pytest.raises(InputError, match="this process computes on the cpu already: train on the gpu in a new one"):
+        choose_device("gpu")
+    config: Any = jax.config
+    assert config.jax_platforms == os.environ["JAX_PLATFORMS"] == "cpu"
+    choose_device("cpu")
+
+
+def test_another_device_is_refused():
+    with pytest.raises(InputError, match="device must be cpu or gpu, not 'tpu'"):
+        choose_device("tpu")
+
+
+FIRST_THE_GPU = """
+import jax, os
+from csac.training.devices import choose_device
+try:
+    choose_device("gpu")
+    print("gpu", jax.default_backend(), os.environ["JAX_PLATFORMS"])
+except ValueError as error:
+    print(error)
+    choose_device("cpu")
+    print(jax.default_backend(), os.environ["JAX_PLATFORMS"])
+"""
+
+
+def test_without_a_gpu_the_cpu_can_still_be_chosen():
+    surroundings = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    command = [sys.executable, "-c", FIRST_THE_GPU]
+    said = subprocess.run(command, env=surroundings, capture_output=True, text=True, check=True).stdout.strip()
+    without = "no GPU that JAX can use: install csac[cuda], or choose the cpu\ncpu cpu"
+    assert said in (without, "gpu gpu cuda")

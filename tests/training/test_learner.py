@@ -1,0 +1,104 @@
+"""What a learner keeps and under which names."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+import trainer  # noqa: F401  (its cache of compiled programs)
+
+from csac.algorithms import CSAC, TD3
+from csac.tasks.seeds import Steps
+from csac.training.checkpoint import Checkpoint, Checkpoints, Damaged, SeedFiles
+from csac.training.learner import Learner
+from csac.types import Spec
+
+SPEC = Spec(3, 1)
+TINY: dict[str, Any] = {"actor_hidden_sizes": (4,), "critic_hidden_sizes": (4,), "batch_size": 8, "warmup_steps": 2}
+
+
+def advance(learner: Learner, seeds: int, first: int, last: int) -> np.ndarray:
+    """Give a learner the steps from `first` to `last`, of which no two are equal, and return its last actions."""
+    generator, none = np.random.default_rng(first), np.zeros(seeds, bool)
+    actions = np.zeros((seeds, SPEC.action_size), np.float32)
+    for step in range(first, last + 1):
+        before, after = generator.normal(size=(2, seeds, SPEC.observation_size)).astype(np.float32)
+        outcome = Steps(after, np.full(seeds, step, np.float32), none, none, after, [], [])
+        actions = learner.step(before, actions, outcome, step)
+    return actions
+
+
+def test_a_checkpoint_names_its_arrays_by_where_they_are_in_the_state(tmp_path):
+    learner = Learner(TD3(**TINY), SPEC, [0], 100)
+    ring = learner.memory(0, 0)
+    name = next(name for name in SeedFiles(tmp_path, 0, {}).write(0, learner.save(0), ring) if "step_0" in name)
+    arrays = safetensors.numpy.load((tmp_path / name).read_bytes())
+
+    networks = ["actor", "target_actor", "critics.0", "critics.1", "target_critics.0", "target_critics.1"]
+    parts = [f"layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
+    of_networks = {f"state.{network}.{part}" for network in networks for part in parts}
+    of_adam = {f"state.actor_optimiser.0.{moment}.{part}" for moment in ("mu", "nu") for part in parts}
+    assert of_networks | of_adam | {"state.actor_loss", "state.actor_optimiser.0.count"} < set(arrays)
+    assert set(arrays) - {name for name in arrays if name.startswith("state.")} == {"sums", "key", "waiting"}
+    np.testing.assert_array_equal(arrays["state.actor.layers.1.bias"], learner.carry(0).state.actor.layers[1].bias)
+
+
+def test_a_checkpoint_of_the_schema_before_is_refused_in_one_line(tmp_path):
+    Checkpoints(tmp_path, 2).commit(5, {}, {})
+    path = tmp_path / "step_5.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "schema_version": 1}))
+    with pytest.raises(Damaged, match=r"step_5\.json is of schema 1, and this csac reads 2"):
+        Checkpoint.open(tmp_path, 5)
+
+
+@pytest.mark.parametrize("seeds", [[5], [5, 6]])
+def test_what_was_saved_of_each_seed_is_taken_back(seeds):
+    learner, again = (
+        Learner(CSAC(reference_period=3, **TINY), SPEC, labels, 100) for labels in (seeds, [9] * len(seeds))
+    )
+    advance(learner, len(seeds), 1, 10)
+    saved = [learner.save(index) for index in range(len(seeds))]
+    rows = [learner.memory(index, 10).rows.copy() for index in range(len(seeds))]
+    again.take_back(saved, [lambda given, own=own: np.copyto(given, own) for own in rows])
+
+    for index in range(len(seeds)):
+        for ours, theirs in zip(
+            jax.tree.leaves(again.carry(index)), jax.tree.leaves(learner.carry(index)), strict=True
+        ):
+            np.testing.assert_array_equal(ours, theirs)
+    assert again.metrics() == learner.metrics()
+    np.testing.assert_array_equal(advance(again, len(seeds), 11, 14), advance(learner, len(seeds), 11, 14))
+
+
+@pytest.mark.parametrize("interval", [1, 3])
+def test_nothing_that_a_program_was_given_is_written_over(monkeypatch, interval):
+    """JAX does not copy NumPy's arrays where they are aligned, and may still read them when a dispatch returns."""
+    learner = Learner(TD3(**TINY, update_interval=interval), SPEC, [0], 100)
+    given: list[tuple[np.ndarray, np.ndarray]] = []
+    for name in ("_explore", "_learn"):
+        own = getattr(learner, name)
+
+        def program(carry, *arguments, own=own):
+            given.extend((array, np.array(array)) for array in arguments)
+            return own(carry, *arguments)
+
+        monkeypatch.setattr(learner, name, program)
+    advance(learner, 1, 1, 12)
+    assert len(given) == 3 * 12 // interval
+    for array, then in given:
+        np.testing.assert_array_equal(array, then)
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_an_algorithm_is_traced_once(monkeypatch, seeds):
+    """Its shapes are asked for before it runs; tracing takes a good part of the start."""
+    traced = []
+    for name in ("init", "update"):
+        own = getattr(CSAC, name)
+        monkeypatch.setattr(CSAC, name, lambda *given, name=name, own=own: traced.append(name) or own(*given))
+    advance(Learner(CSAC(**TINY), SPEC, range(seeds), 100), seeds, 1, 4)
+    assert sorted(traced) == ["init", "update"]
