@@ -78,15 +78,15 @@ def work(connection: Connection, variant: Variant) -> None:
 
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_cpu_enable_async_dispatch", variant.asynchronous)
-    from benchmarks.driver import Driver, make_learner
+    from benchmarks.driver import Driver, make_learner, make_settings
     from csac.training.group import Group
-    from csac.training.messages import Settings
 
     learner = make_learner(variant.algorithm, seeds=variant.seeds, update_interval=variant.interval)
     if variant.evaluation:
         algorithm = dataclasses.replace(learner.algorithm, warmup_steps=WARMUP)  # pyright: ignore[reportArgumentType]
         interval, beside = 10**6 if variant.evaluation == "off" else 5_000, int(variant.evaluation == "beside")
-        trained = Group(Settings(algorithm, TASK, {}, 10**6, interval, 10, evaluation_processes=beside), [0])
+        settings = make_settings(algorithm, TASK, 10**6, evaluation_interval=interval, evaluation_processes=beside)
+        trained = Group(settings, [0])
         events = trained.run(lambda: False)
     else:
         trained = Driver(learner, variant.seeds)

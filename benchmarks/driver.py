@@ -12,7 +12,9 @@ from csac.algorithms import ALGORITHMS
 from csac.presets import hyperparameters
 from csac.tasks.seeds import Steps
 from csac.training.learner import Learner
-from csac.types import Spec
+from csac.training.messages import Settings
+from csac.training.plan import Plan
+from csac.types import Algorithm, Spec
 
 HALF_CHEETAH = Spec(17, 6)
 
@@ -21,6 +23,12 @@ def make_learner(algorithm: str, spec: Spec = HALF_CHEETAH, seeds: int = 1, **ch
     """Return a learner at the paper's settings but for `changes`, whose warm-up is over at once."""
     settings = {**hyperparameters("paper", algorithm, TASK), "warmup_steps": 0, **changes}
     return Learner(ALGORITHMS[algorithm](**settings), spec, range(seeds), settings["replay_size"])
+
+
+def make_settings(algorithm: Algorithm, task: str, steps: int, **options: Any) -> Settings:
+    """Return what a group is told that is evaluated at its end alone, but for `options`, and never saved."""
+    options = {"evaluation_interval": steps, "checkpoint_interval": 0, **options}
+    return Settings(Plan(algorithm=algorithm, task=task, task_name=task, groups=((0,),), steps=steps, **options))
 
 
 class Driver:

@@ -11,12 +11,12 @@ from contextlib import closing
 from statistics import median
 from typing import Any
 
+from benchmarks.driver import make_settings
 from csac.algorithms import ALGORITHMS
 from csac.evaluation.evaluator import Evaluator
 from csac.evaluation.pool import EvaluationPool
 from csac.presets import hyperparameters
 from csac.training.group import Group
-from csac.training.messages import Settings
 
 ALGORITHM, INTERVAL = "csac", 5_000
 WARMUP, STEPS, NEVER = 150, 100, 10**9
@@ -29,7 +29,14 @@ def measure(task: str, seconds: float, episodes: int, environment_arguments: dic
     """
     paper: dict[str, Any] = hyperparameters("paper", ALGORITHM, task)
     learner = ALGORITHMS[ALGORITHM](**{**paper, "replay_size": 100_000, "warmup_steps": WARMUP})
-    settings = Settings(learner, task, environment_arguments, 100_000, NEVER, episodes)
+    settings = make_settings(
+        learner,
+        task,
+        100_000,
+        environment_arguments=environment_arguments,
+        evaluation_interval=NEVER,
+        evaluation_episodes=episodes,
+    )
     alone, slower, beside, in_line = [], [], [], []
     pool = EvaluationPool(Evaluator(task, environment_arguments, episodes), 1)
     with closing(Group(settings, [0])) as group, closing(pool):

@@ -10,10 +10,10 @@ import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.driver import make_settings
 from csac.algorithms import ALGORITHMS
 from csac.presets import hyperparameters
 from csac.training.group import Group
-from csac.training.messages import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,7 +46,7 @@ def measure(task: str, steps: int, episodes: int) -> dict[str, float]:
     paper: dict[str, Any] = hyperparameters("paper", ALGORITHM, task)
     learner = ALGORITHMS[ALGORITHM](**{**paper, "replay_size": 100_000, "warmup_steps": WARMUP})
     last = 2 * WARMUP + steps
-    settings = Settings(learner, task, {}, last + 1, last + 1, episodes)
+    settings = make_settings(learner, task, last + 1, evaluation_episodes=episodes)
     with closing(Group(settings, [0])) as group:
         _train(group, 2 * WARMUP)
         environment, learning = (_timed(part) for part in (group.environments, group.learner))

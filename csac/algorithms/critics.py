@@ -48,4 +48,4 @@ def critic_loss(critics: Critics, transition: Transition, target: Scalar) -> tup
     """Return L(θ₁) + L(θ₂) with L(θᵢ) = [Qᵢ(s, a) - y]² (the paper's Eq. Q_TD_1), and what to log."""
     first, second = q_values(critics, transition.observation, transition.action)
     loss = (first - target) ** 2 + (second - target) ** 2
-    return loss, {"critic_loss": loss, "q_mean": first}
+    return loss, {"critic_loss": loss, "q_mean": (first + second) / 2.0}

@@ -102,7 +102,7 @@ class CSAC:
         else:
             relative_entropy = log_ratio(policy, reference_policy, noise)
         value = q_value - self.entropy_weight * log_prob - self.relative_entropy_weight * relative_entropy
-        return value, {"q_mean": q_value, "entropy": -log_prob, "relative_entropy": relative_entropy}
+        return value, {"entropy": -log_prob, "relative_entropy": relative_entropy}
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Take one gradient step on the critics, then one on the actor, then move the target critics."""

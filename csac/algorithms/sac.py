@@ -92,7 +92,7 @@ class SAC:
         q_value = least_q_value(critics, observation, policy.sample(noise))
         log_prob = policy.log_prob(noise)
         loss = temperature * log_prob - q_value
-        return loss, {"actor_loss": loss, "q_mean": q_value, "entropy": -log_prob}
+        return loss, {"actor_loss": loss, "entropy": -log_prob}
 
     def temperature_loss(
         self, log_temperature: Scalar, entropy: Scalar, *, target_entropy: float

@@ -71,7 +71,7 @@ class Group:
     what they give, so that the order of messages and all that they say is the same as with evaluations in line.
 
     Args:
-        settings: what is trained and how.
+        settings: what is trained and how, and where it begins.
         seeds: the labels of the seeds.
         cores: the processors for the processes that evaluate; None for those of this one.
 
@@ -81,26 +81,25 @@ class Group:
     """
 
     def __init__(self, settings: Settings, seeds: Sequence[int], cores: Sequence[int] | None = None) -> None:
+        plan = settings.plan
         self.settings, self.seeds, self.step = settings, list(seeds), settings.begin
-        self.environments = SeedEnvironments(settings.task, settings.environment_arguments, seeds)
-        self.evaluator = Evaluator(
-            settings.task, settings.environment_arguments, settings.evaluation_episodes, events=settings.events
-        )
-        processes = settings.evaluation_processes
+        self.environments = SeedEnvironments(plan.task, plan.environment_arguments, seeds)
+        self.evaluator = Evaluator(plan.task, plan.environment_arguments, plan.evaluation_episodes, events=plan.events)
+        processes = plan.evaluation_processes
         self._pool = EvaluationPool(self.evaluator, processes, cores) if processes else None
         self._evaluation: Evaluation | None = None  # the one on its way
         self._held: list[GroupMessage] = []  # what has happened after it
         self._info_names: set[str] = set()
-        self.learner = Learner(settings.algorithm, self.environments.spec, seeds, settings.steps)
+        self.learner = Learner(plan.algorithm, self.environments.spec, seeds, plan.steps)
         self._contract = Contract(
             self.environments.task_name,
-            settings.algorithm.name,
+            plan.algorithm.name,
             self.learner.network.activation,
             self.learner.network.head,
             *self.environments.contract_parts,
         )
         self._files: list[SeedFiles] = []
-        self._changes = {item.step for item in settings.perturbations}
+        self._changes = {item.step for item in plan.perturbations}
         self._perturb(max(settings.begin - 1, 0))  # as in the step that the checkpoint came after
         if settings.begin:
             assert settings.checkpoints
@@ -139,18 +138,18 @@ class Group:
                 yield rest
 
     def _train(self, should_stop: Callable[[], bool]) -> Iterator[GroupMessage]:
-        settings, environments = self.settings, self.environments
-        while self.step < settings.steps and environments.is_any_alive and not should_stop():
+        plan, environments = self.settings.plan, self.environments
+        while self.step < plan.steps and environments.is_any_alive and not should_stop():
             yield from self._advance()
-            last = self.step == settings.steps
+            last = self.step == plan.steps
             if self.step % METRICS_INTERVAL == 0 or last:
                 yield Rows("metrics", _metrics_rows(self.learner, environments, self.seeds, self.step))
             if self.step % METRICS_INTERVAL == 0:
                 self.learner.forget_metrics()
-            boundary = is_boundary(settings, self.step)
+            boundary = is_boundary(self.settings, self.step)
             if boundary:
                 yield from self._stop_diverged()
-            due = self.step % settings.evaluation_interval == 0 or last
+            due = self.step % plan.evaluation_interval == 0 or last
             if due:
                 yield from self.settle()  # one at a time
                 self._evaluation = self._begin_evaluation()
@@ -222,12 +221,12 @@ class Group:
     def _perturb(self, step: int) -> None:
         """Have the task as it is in the environment step after the first `step`."""
         if self._changes:
-            self.environments.perturb(values_at(self.settings.perturbations, step))
+            self.environments.perturb(values_at(self.settings.plan.perturbations, step))
 
     def _begin_evaluation(self) -> Evaluation:
         """Begin to evaluate the policies of now, on the task as it was in the last step."""
         policies = self.policies()
-        self.evaluator.perturb(values_at(self.settings.perturbations, self.step - 1))
+        self.evaluator.perturb(values_at(self.settings.plan.perturbations, self.step - 1))
         running = self._pool.begin(list(policies.values())) if self._pool else None
         return Evaluation(self.step, policies, running)
 
@@ -284,7 +283,10 @@ class Group:
             if saved.arrays["actions"].shape != actions[index].shape:
                 raise ValueError(f"the next action has shape {saved.arrays['actions'].shape}")
             actions[index] = saved.arrays["actions"]
-            if not self.environments.take_back(index, saved.part("environment")):
+            environment = saved.part("environment")
+            if self.settings.has_other_task:
+                environment.values["exact"] = False
+            if not self.environments.take_back(index, environment):
                 anew.append(index)
         self.learner.take_back(learnt, [functools.partial(checkpoint.memory, seed) for seed in self.seeds])
         self._files = [SeedFiles(checkpoint.folder, seed, checkpoint.files) for seed in self.seeds]
@@ -295,8 +297,8 @@ class Group:
 
 def is_boundary(settings: Settings, step: int) -> bool:
     """Whether a group says how far it is at this step, so that it can be saved there."""
-    interval = settings.checkpoint_interval
-    return step % PROGRESS_INTERVAL == 0 or step == settings.steps or bool(interval and step % interval == 0)
+    interval = settings.plan.checkpoint_interval
+    return step % PROGRESS_INTERVAL == 0 or step == settings.plan.steps or bool(interval and step % interval == 0)
 
 
 def _without(message: GroupMessage, seeds: set[int]) -> GroupMessage | None:

@@ -10,32 +10,25 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from csac.record.run import Table
-    from csac.tasks.making import Task
-    from csac.tasks.perturbations import Perturbation
+    from csac.training.plan import Plan
     from csac.training.seed_files import Files
-    from csac.types import Algorithm
 
 
 class Settings(NamedTuple):
-    """What a group needs to know to train its seeds; picklable, so that a group can be another process.
+    """What a group is told: the plan, and where it begins. Picklable, so that a group can be another process."""
 
-    `checkpoints` is the folder of the run's checkpoints, None where there are to be none; `begin` is the step of the
-    checkpoint there to go on from, 0 to begin anew. `events` are names in the last `info` of an evaluation episode.
-    Each group has `evaluation_processes` that evaluate while it trains on; with 0 it evaluates in line.
-    """
-
-    algorithm: Algorithm
-    task: Task
-    environment_arguments: dict[str, Any]
-    steps: int
-    evaluation_interval: int
-    evaluation_episodes: int
+    plan: Plan
     checkpoints: Path | None = None
-    checkpoint_interval: int = 0
+    """The folder of the run's checkpoints, to read and, where the plan has an interval, to write; None for neither."""
     begin: int = 0
-    events: tuple[str, ...] = ()
-    perturbations: tuple[Perturbation, ...] = ()
-    evaluation_processes: int = 0
+    """The step of the checkpoint to go on from; 0 begins anew."""
+    has_other_task: bool = False
+    """Whether that checkpoint is of another task, so that its episodes in progress are no use."""
+
+    @property
+    def saves(self) -> bool:
+        """Whether the group is saved from time to time."""
+        return self.checkpoints is not None and self.plan.checkpoint_interval > 0
 
 
 class Rows(NamedTuple):

@@ -12,7 +12,6 @@ from csac.presets import matching_preset
 from csac.record.manifest import CheckpointPlan, EvaluationPlan, Manifest
 from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import Perturbation, perturbations_of
-from csac.training.messages import Settings
 from csac.training.options import Options, check_whole
 from csac.training.scheduler import choose_evaluation_processes, choose_groups, split_seeds
 from csac.types import InputError
@@ -64,22 +63,6 @@ class Plan(Options):
             checkpoints=CheckpointPlan(self.checkpoint_interval, self.keep_checkpoints),
             device=self.device,
             **surroundings,
-        )
-
-    def settings(self, run: RunDirectory) -> Settings:
-        """Return what a group is told."""
-        return Settings(
-            self.algorithm,
-            self.task,
-            self.environment_arguments,
-            self.steps,
-            self.evaluation_interval,
-            self.evaluation_episodes,
-            run.checkpoints.absolute() if self.checkpoint_interval else None,
-            self.checkpoint_interval,
-            events=self.events,
-            perturbations=self.perturbations,
-            evaluation_processes=self.evaluation_processes,
         )
 
 

@@ -111,7 +111,7 @@ def _run_here(settings: Settings, seeds: Sequence[int], should_stop: Callable[[]
             if isinstance(message, Boundary):
                 yield message
                 due = is_regular(settings, message.step) or timer.is_due()
-            if settings.checkpoints and due and group.step > saved:
+            if settings.saves and due and group.step > saved:
                 yield from group.settle()
                 if group.environments.alive.any():
                     saved = group.step
@@ -123,8 +123,8 @@ def _run_here(settings: Settings, seeds: Sequence[int], should_stop: Callable[[]
 
 def is_regular(settings: Settings, step: int) -> bool:
     """Whether there is a checkpoint at this step in any case."""
-    interval = settings.checkpoint_interval
-    return settings.checkpoints is not None and (step == settings.steps or bool(interval and step % interval == 0))
+    plan = settings.plan
+    return settings.saves and (step == plan.steps or step % plan.checkpoint_interval == 0)
 
 
 class _Worker(Child):
@@ -176,7 +176,7 @@ class _Scheduler:
             if not self.stopping and self.should_stop():
                 self.stopping = True
                 self._set_target()
-            elif self.settings.checkpoints and self.timer.is_due():
+            elif self.settings.saves and self.timer.is_due():
                 self._set_target()
             ready = wait([worker.connection for worker in running], timeout=0.1)
             for index, worker in enumerate(self.workers):
@@ -231,9 +231,9 @@ class _Scheduler:
     def _next(self, worker: _Worker) -> None:
         """Say what a group does that has just ended its turn or was saved."""
         due = worker.step == self.target or is_regular(self.settings, worker.step)
-        if self.settings.checkpoints and due and worker.saved < worker.step:
+        if self.settings.saves and due and worker.saved < worker.step:
             worker.tell("save")
-        elif worker.step == self.settings.steps or (self.stopping and worker.step >= self.target):
+        elif worker.step == self.settings.plan.steps or (self.stopping and worker.step >= self.target):
             worker.tell("stop")
         else:
             self.waiting.append(worker)
@@ -242,9 +242,9 @@ class _Scheduler:
         """Choose the next step that every group passes as the one to be saved at, and to stop at if that is asked."""
         self.timer.reset()
         living = [worker for worker in self.workers if not worker.over]
-        if any(worker.step == self.settings.steps for worker in self.workers):
-            self.target = self.settings.steps  # one has made all its steps, and the others are close behind
-        elif not self.settings.checkpoints or any(worker.is_starting for worker in living):
+        if any(worker.step == self.settings.plan.steps for worker in self.workers):
+            self.target = self.settings.plan.steps  # one has made all its steps, and the others are close behind
+        elif not self.settings.saves or any(worker.is_starting for worker in living):
             self.target = -1  # a group that is still starting would keep the others waiting
         else:
             self.target = max(self._end_of_turn(worker) for worker in living)

@@ -20,6 +20,7 @@ from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
 from csac.training.interruptions import Interrupted, caught_signals, storage_failures_told
 from csac.training.learner import misfit
+from csac.training.messages import Settings
 from csac.training.options import checked_options
 from csac.training.plan import (
     Plan,
@@ -81,7 +82,7 @@ def train(
         on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation.
         stop_when: called in the same way; training ends early, and counts as finished, once it returns True.
         **options: `steps`, `seeds`, `first_seed`, `device`, `evaluation_interval`, `evaluation_episodes`,
-            `checkpoint_interval` and `keep_checkpoints`, as `csac.training.plan.Options` explains them, and
+            `checkpoint_interval` and `keep_checkpoints`, as `csac.training.options.Options` explains them, and
 
             - `environment_arguments`: keyword arguments for the environment;
             - `perturbations`: changes of the task, in training and evaluations, such as `("friction=1.5@300000",)`: see
@@ -293,12 +294,9 @@ def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, re
         reporter.start(plan.task_name, plan.algorithm.name, plan.labels, plan.steps, run.path, notes)
         reporter.go_on(begin, run.evaluations, failures)
     log = _tensorboard_log(run, plan.labels, begin) if watchers.tensorboard else None
-    settings = plan.settings(run)._replace(begin=begin)
-    if begin and not settings.checkpoints:  # needed, if only to be read
-        settings = settings._replace(checkpoints=run.checkpoints.absolute())
-    checkpoints = None
-    if settings.checkpoints:
-        checkpoints = Checkpoints(settings.checkpoints, plan.keep_checkpoints, restart.pinned)
+    folder = run.checkpoints.absolute() if begin or plan.checkpoint_interval else None
+    settings = Settings(plan, folder, begin, _begins_on_another_task(run, begin))
+    checkpoints = Checkpoints(folder, plan.keep_checkpoints, restart.pinned) if folder else None
     recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures, by_step(plan.perturbations))
     try:
         with (
@@ -327,6 +325,12 @@ def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, re
     if stopped:
         raise Interrupted(run, received[0], is_saved=checkpoints is not None and checkpoints.newest is not None)
     return run
+
+
+def _begins_on_another_task(run: RunDirectory, begin: int) -> bool:
+    """Whether the checkpoint at this step came from a run of another task."""
+    origin = run.manifest.forked_from
+    return origin is not None and origin.step == begin and any(text.startswith("task is ") for text in origin.changes)
 
 
 def _tensorboard_log(run: RunDirectory, labels: list[int], begin: int) -> TensorBoardLog:

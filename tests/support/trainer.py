@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from unittest.mock import patch
 
 import jax
+from plans import settings
 
 from csac.training import group, messages
 
@@ -41,8 +42,8 @@ def run(
             super().__init__(*arguments)
             learners.append(self)
 
-    settings = messages.Settings(algorithm, task, arguments, steps, steps, episodes)
+    given = settings(algorithm, task, steps, environment_arguments=arguments, evaluation_episodes=episodes)
     with patch.object(group, "Learner", Kept):
-        told = list(group.train_group(settings, seeds, lambda: False))
+        told = list(group.train_group(given, seeds, lambda: False))
     carries = [learners[0].carry(index) for index in range(len(seeds))]
     return Outcome([carry.state for carry in carries], [carry.memory.rows for carry in carries], told)

@@ -17,6 +17,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
 from logs import log_lines
+from plans import settings
 from resuming import LEARNERS, Crash, contents, crash_at, run
 from trajectories import steps_of
 
@@ -536,10 +537,8 @@ def test_a_foreign_policy_meets_the_same_task():
 
 
 def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-v4") -> Group:
-    settings = messages.Settings(
-        LEARNERS[0], task, {}, 400, 30, 1, folder, 0, begin, perturbations=perturbations_of(perturbations)
-    )
-    return Group(settings, (3,))
+    changes = perturbations_of(perturbations)
+    return Group(settings(LEARNERS[0], task, 400, folder, begin, evaluation_interval=30, perturbations=changes), (3,))
 
 
 def advance(group: Group, until: int) -> list[messages.GroupMessage]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import plans
 import pytest
 import safetensors.numpy
 import trainer  # noqa: F401  (its cache of compiled programs)
@@ -39,7 +40,7 @@ from csac.training.checkpoint import (
     remove_unfinished,
     steps_in,
 )
-from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Rows, Saved, Settings
+from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Rows, Saved
 from csac.training.recorder import Recorder
 from csac.training.scheduler import _Scheduler
 from csac.training.seed_files import SeedFiles
@@ -521,7 +522,7 @@ class DeadWorker:
 def test_a_worker_that_dies_while_a_run_stops_is_no_failure_unless_it_died_before(tmp_path, stopping, before, kind):
     scheduler: Any = object.__new__(_Scheduler)
     scheduler.stopping, scheduler.restarted, scheduler.checkpoints = stopping, before, Checkpoints(tmp_path, 2)
-    scheduler.settings = Settings(CSAC(), "Hopper-v4", {}, 900, 100, 1, tmp_path)
+    scheduler.settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
     worker: Any = DeadWorker()
     assert type(scheduler._receive(0, worker)) is kind
     assert worker.over

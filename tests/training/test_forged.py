@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import plans
 import pytest
 import safetensors.numpy
 import trainer  # noqa: F401  (its cache of compiled programs)
@@ -58,7 +59,7 @@ def trained(tmp_path_factory):
 @pytest.fixture(scope="module")
 def group(trained):
     """One group for all: what it takes back is tried in place of what it holds."""
-    settings = messages.Settings(LEARNER, "Hopper-v4", {}, 400, 1000, 1, trained / FOLDER, 0, STEP)
+    settings = plans.settings(LEARNER, "Hopper-v4", 400, trained / FOLDER, STEP, evaluation_interval=1000)
     settings = settings._replace(perturbations=perturbations_of(NOISE))
     return Group(settings, [0, 1])
 

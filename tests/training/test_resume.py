@@ -16,6 +16,7 @@ import numpy as np
 import probes
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
+from plans import settings
 from resuming import LEARNERS, ROLLOUT, Crash, contents, crash_at, run
 
 from csac.record.manifest import Origin
@@ -30,7 +31,7 @@ from csac.types import InputError
 
 
 def group(folder: Path, algorithm, seeds, steps: int, begin: int = 0, task: Any = "Hopper-v4") -> Group:
-    return Group(messages.Settings(algorithm, task, {}, steps, 1000, 1, folder, 0, begin), seeds)
+    return Group(settings(algorithm, task, steps, folder, begin, evaluation_interval=1000), seeds)
 
 
 def advance(group: Group, until: int) -> list[messages.GroupMessage]:
@@ -467,8 +468,8 @@ def test_a_manifest_that_lacks_something_is_refused(tmp_path, finished):
 
 def test_a_diverged_seed_names_its_first_bad_array_and_is_not_saved(tmp_path):
     wild = replace(LEARNERS[0], critic_learning_rate=1e30, actor_learning_rate=1e30)
-    settings = messages.Settings(wild, "Hopper-v4", {}, 300, 1000, 1, tmp_path / "checkpoint", 50)
-    told = [message for _, message in run_groups(settings, [[0]], lambda: False)]
+    given = settings(wild, "Hopper-v4", 300, tmp_path / "checkpoint", evaluation_interval=1000, checkpoint_interval=50)
+    told = [message for _, message in run_groups(given, [[0]], lambda: False)]
     (failed,) = [message for message in told if isinstance(message, messages.Failed)]
     assert "actor.layers.0.weight is not finite" in failed.reason
     assert 40 <= failed.step <= 50
