@@ -11,7 +11,15 @@ STEPS ?= 60000
 SEEDS ?= 2
 ARGS ?=
 
-SETUP := .venv/.installed
+# A Python that is not that of .venv gets an environment of its own: make test PYTHON=python3.13 tests in .venv-3.13.
+version = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
+ifeq ($(origin PYTHON) $(wildcard .venv/bin/python),command line .venv/bin/python)
+ASKED := $(or $(call version,$(PYTHON)),$(error $(PYTHON) does not run: give the path of a Python 3.11 or newer))
+OTHER := $(filter-out $(call version,.venv/bin/python),$(ASKED))
+endif
+VENV := .venv$(addprefix -,$(OTHER))
+
+SETUP := $(VENV)/.installed
 PEERS := .venv-peers/.installed
 PARL := .venv-parl/.installed
 CUDA := .venv/.cuda
@@ -20,31 +28,40 @@ define require_python
 @test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
 endef
 
-.PHONY: help setup train test slow chaos check lock clean peers bench limit growth gpu
+.PHONY: help setup train test slow chaos format check docs lock clean peers bench limit growth gpu
 
 help:  ## List the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
 
 setup: $(SETUP)  ## Install csac and its exact dependencies into .venv
-	@echo "csac is ready: .venv/bin/csac --help, or make train"
+	@echo "csac is ready: $(VENV)/bin/csac --help, or make train"
 
 train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=2 STEPS=60000 ALGORITHM=csac ARGS=
-	.venv/bin/csac train $(TASK) --algorithm $(ALGORITHM) --seeds $(SEEDS) --steps $(STEPS) $(ARGS)
+	$(VENV)/bin/csac train $(TASK) --algorithm $(ALGORITHM) --seeds $(SEEDS) --steps $(STEPS) $(ARGS)
 
 test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
-	.venv/bin/pytest --numprocesses logical --dist loadfile -m 'not slow' $(ARGS)
+	$(VENV)/bin/pytest --numprocesses logical --dist loadfile -m 'not slow' $(ARGS)
 
 slow: $(SETUP)  ## Run the tests that need longer: processes that are killed, clusters, browsers
-	.venv/bin/pytest -m slow $(ARGS)
+	$(VENV)/bin/pytest -m slow $(ARGS)
 
 chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave, 20 minutes: make chaos ARGS='--kills 12'
 	.venv/bin/python tests/support/chaos.py --out results/reliability $(ARGS)
 
+format: $(SETUP)  ## Put the code into its format, and mend what ruff can mend
+	$(VENV)/bin/ruff format --exclude '*.md' .
+	$(VENV)/bin/ruff check --fix .
+
 check: $(SETUP)  ## Check format, lint, types and the direction of imports
-	.venv/bin/ruff format --check --exclude '*.md' .
-	.venv/bin/ruff check .
-	.venv/bin/pyright
-	.venv/bin/lint-imports --no-logo
+	$(VENV)/bin/ruff format --check --exclude '*.md' .
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
+	$(VENV)/bin/lint-imports --no-logo
+
+docs: $(SETUP)  ## Make the site, with the reference from the docstrings: site/index.html
+	$(VENV)/bin/sphinx-apidoc -q --force --remove-old --no-toc --templatedir docs/site/templates --output-dir docs/reference csac csac/__main__.py
+	$(VENV)/bin/sphinx-build -q --fail-on-warning --keep-going --jobs auto -c docs/site -d site/.doctrees . site
+	@echo "The site is ready: site/index.html"
 
 peers: $(PEERS) $(PARL)  ## Install what to measure against: into .venv-peers, and PARL into .venv-parl
 
@@ -60,19 +77,19 @@ growth: $(SETUP)  ## Measure what seeds, widths, batches, observations and repla
 gpu: $(SETUP) $(if $(shell command -v nvidia-smi),$(CUDA))  ## Measure training on a GPU, and compare its numbers with the CPU's: docs/gpu.md
 	.venv/bin/python -m benchmarks gpu --write $(ARGS)
 
-lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml
+lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml, for Python 3.11 and newer
 	$(UV) pip compile pyproject.toml --extra robots --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
 		--no-emit-index-url --no-annotate --no-header --quiet --output-file requirements.lock
 
-clean:  ## Remove .venv, .tools and caches; runs stay
-	rm -rf .venv .tools .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+clean:  ## Remove environments, the site and caches; runs stay
+	rm -rf .venv .venv-3.* .tools site docs/reference .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
 $(SETUP): requirements.lock pyproject.toml | $(UV)
 	$(require_python)
-	@echo "Installing csac into .venv"
-	@test -x .venv/bin/python || $(UV) venv --quiet --python "$$(command -v $(PYTHON))" .venv
-	@$(UV) pip sync --quiet --compile-bytecode --python .venv/bin/python --require-hashes requirements.lock
-	@$(UV) pip install --quiet --python .venv/bin/python --no-deps --editable .
+	@echo "Installing csac into $(VENV)"
+	@test -x $(VENV)/bin/python || $(UV) venv --quiet --python "$$(command -v $(PYTHON))" $(VENV)
+	@$(UV) pip sync --quiet --compile-bytecode --python $(VENV)/bin/python --require-hashes requirements.lock
+	@$(UV) pip install --quiet --python $(VENV)/bin/python --no-deps --editable .
 	@touch $@
 
 $(CUDA): $(SETUP)

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from csac.algorithms.sac import SAC
     from csac.algorithms.sd3 import SD3
     from csac.algorithms.td3 import TD3
-    from csac.deploy.policy import Policy, load
-    from csac.evaluation.evaluator import evaluate
+    from csac.deploy.choosing import load
+    from csac.deploy.policy import Policy
+    from csac.evaluation.evaluator import evaluate, evaluate_episodes
     from csac.training.train import resume, train
     from csac.types import InputError
 
@@ -37,6 +38,7 @@ __all__ = [
     "Policy",
     "__version__",
     "evaluate",
+    "evaluate_episodes",
     "load",
     "resume",
     "train",
@@ -51,7 +53,8 @@ _MODULES = {
     "InputError": "csac.types",
     "Policy": "csac.deploy.policy",
     "evaluate": "csac.evaluation.evaluator",
-    "load": "csac.deploy.policy",
+    "evaluate_episodes": "csac.evaluation.evaluator",
+    "load": "csac.deploy.choosing",
     "train": "csac.training.train",
     "resume": "csac.training.train",
 }

@@ -8,7 +8,7 @@ import json
 import os
 import shlex
 import sys
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -22,8 +22,6 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-    from rich.console import Console
 
     from csac.record.manifest import Manifest
     from csac.record.run import RunDirectory
@@ -103,6 +101,8 @@ class Resume:
     """The directory of a run."""
     steps: Annotated[int | None, arg(help_behavior_hint="(default: as many as it was started for)")] = None
     """Environment steps per seed in all, counted from the run's beginning; may be more than it was started for."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,8 @@ class Evaluate:
     """Change the task, as friction=2 does; the kinds are those of csac train."""
     csv: Annotated[Path | None, arg(metavar="FILE.csv")] = None
     """Write a row for each episode there as well, as in evaluations.csv."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,8 @@ class Play:
     """Write this file instead of opening a window; needs no display."""
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
     """Change the task, as friction=2 does; the kinds are those of csac train."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     failed, 130 SIGINT, 143 SIGTERM.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    _open_standard_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -223,7 +228,12 @@ def _resume(arguments: list[str]) -> int:
     command = shlex.join(["csac", "resume", *arguments])
     return _exit_code(
         lambda: resume(
-            options.run, steps=options.steps, evaluation_processes=None, reporter=Reporter(), command=command
+            options.run,
+            steps=options.steps,
+            evaluation_processes=None,
+            trust_task=options.trust_task,
+            reporter=Reporter(),
+            command=command,
         )
     )
 
@@ -255,21 +265,20 @@ def _perturbations(given: tuple[str, ...]) -> tuple[str, ...] | None:
 
 def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
-    from csac.console.progress import told_progress
     from csac.console.tables import case_table, evaluation_table, make_console, silent_events
+    from csac.console.waiting import progress_shown
     from csac.evaluation.evaluator import EvaluationFailure
-    from csac.evaluation.play import evaluate_run, told_perturbations
+    from csac.evaluation.play import evaluate_run, perturbation_notes
     from csac.record.run import RunDirectory
     from csac.record.tables import COLUMNS, check_new, write_rows
 
     console = make_console()
-    told = told_perturbations(options.run, options.perturb)
+    told = perturbation_notes(options.run, options.perturb)
     if options.csv:
         check_new(options.csv)
     results = {}
     try:
-        with _waiting(console, "evaluating") as status:
-            progress = told_progress(status, "evaluating", "episodes") if status else None
+        with progress_shown(console, "evaluating", "episodes") as on_progress:
             results.update(
                 evaluate_run(
                     options.run,
@@ -278,7 +287,8 @@ def _evaluate(arguments: list[str]) -> int:
                     not options.stochastic,
                     options.perturb,
                     processes=options.processes,
-                    on_progress=progress,
+                    on_progress=on_progress,
+                    trust_task=options.trust_task,
                 )
             )
     except EvaluationFailure as error:
@@ -301,15 +311,24 @@ def _evaluate(arguments: list[str]) -> int:
 def _play(arguments: list[str]) -> int:
     options = parse(Play, arguments, "csac play")
     from csac.console.tables import make_console
-    from csac.evaluation.play import play, told_perturbations
+    from csac.console.waiting import progress_shown
+    from csac.evaluation.play import perturbation_notes, play
     from csac.tasks.spaces import EnvironmentFailure
 
     console = make_console()
-    for line in told_perturbations(options.run, options.perturb):
+    for line in perturbation_notes(options.run, options.perturb):
         console.print(line, soft_wrap=True)
     try:
-        with _waiting(console, "playing"):
-            for episode in play(options.run, options.seed, options.episodes, options.video, options.perturb):
+        with progress_shown(console, "playing", "steps at most") as on_progress:
+            for episode in play(
+                options.run,
+                options.seed,
+                options.episodes,
+                options.video,
+                options.perturb,
+                on_progress=on_progress,
+                trust_task=options.trust_task,
+            ):
                 text = f"return {episode.episode_return:,.2f} in {episode.length:,} steps"
                 console.print(f"episode {episode.episode}: {text}")
     except EnvironmentFailure as error:
@@ -321,13 +340,13 @@ def _play(arguments: list[str]) -> int:
 
 def _runs(arguments: list[str]) -> int:
     options = parse(Runs, arguments, "csac runs")
-    from csac.console.tables import make_console, runs_table
+    from csac.console.tables import make_console, print_runs
     from csac.record.run import find_runs
 
     is_default = options.directory == Path("runs")
     runs = [] if is_default and not options.directory.exists() else find_runs(options.directory)
     if runs:
-        make_console().print(runs_table(runs))
+        print_runs(make_console(), runs)
     else:
         _say(f"no runs in {options.directory} yet; csac train HalfCheetah-v4 starts one")
     return 0
@@ -402,11 +421,6 @@ def _inherited(source: Manifest) -> list[tuple[str, Any, Any]]:
     ]
 
 
-def _waiting(console: Console, doing: str) -> AbstractContextManager[Any]:
-    """Say on a terminal what takes its time."""
-    return console.status(doing) if console.is_interactive else nullcontext()
-
-
 def _say(text: str) -> None:
     with suppress(BrokenPipeError):
         print(text)
@@ -415,6 +429,15 @@ def _say(text: str) -> None:
 def _complain(message: object, code: int) -> int:
     print(f"csac: {' '.join(str(message).split())}", file=sys.stderr)
     return code
+
+
+def _open_standard_streams() -> None:
+    """Lead streams that were closed to nowhere: the next file to be opened would get what libraries print there."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
 
 
 def _settle_output() -> None:

@@ -36,8 +36,10 @@ def gradients(algorithm: CSAC, std: float) -> np.ndarray:
     actor = constant_policy(0.3, std)
 
     def gradient(noise: jax.Array) -> jax.Array:
-        loss = jax.grad(lambda actor_: algorithm.actor_loss(actor_, actor, flat_critics(), jnp.zeros(1), noise)[0])
-        return loss(actor).layers[0].bias[0]
+        def loss(learnt: MLP) -> jax.Array:
+            return algorithm.actor_loss(learnt, jnp.zeros(1), noise, reference=actor, critics=flat_critics())[0]
+
+        return jax.grad(loss)(actor).layers[0].bias[0]
 
     return np.asarray(jax.vmap(gradient)(jnp.asarray(NODES, jnp.float32)[:, None]), np.float64)
 

@@ -58,7 +58,7 @@ class Rail(gymnasium.Env):
 
 
 # From now on `csac train own_task:Rail-v0 --events off_the_rail,reversals` works too, in this folder.
-gymnasium.register("Rail-v0", entry_point=Rail, max_episode_steps=100)
+gymnasium.register("Rail-v0", entry_point=lambda **options: Rail(**options), max_episode_steps=100)
 
 
 def make_task():

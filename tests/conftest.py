@@ -8,6 +8,6 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[threads] = "1"
 
-# Compiled programs are kept for the length of the tests, and not among the user's own.
-_CACHE = tempfile.TemporaryDirectory()
-os.environ["XDG_CACHE_HOME"] = _CACHE.name
+# Compiled programs, and which modules may be imported, are kept for the length of the tests, not among the user's own.
+_KEPT = tempfile.TemporaryDirectory()
+os.environ["XDG_CACHE_HOME"] = os.environ["XDG_STATE_HOME"] = _KEPT.name

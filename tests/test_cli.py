@@ -395,7 +395,7 @@ def test_evaluate_reads_what_train_wrote(trained, capsys):
         "0 10.00 0.00 10.00 10.00 10.0",
         "1 10.00 0.00 10.00 10.00 10.0",
         "mean 10.00",
-        "± 95 % 0.00",
+        "2 seeds: no interval",
     ]
 
 
@@ -406,7 +406,7 @@ def test_evaluate_says_what_was_perturbed(trained, capsys):
     assert words(capsys.readouterr().out) == [
         "perturbed: observation noise 0.1, action noise 0.2",
         "seed mean return ± std min max length",
-        "1 10.00 0.00 10.00 10.00 10.0",
+        "1 10.00 10.00 10.00 10.0",
     ]
 
 
@@ -435,10 +435,16 @@ def test_a_test_without_the_perturbations_of_the_training_says_so(capsys):
     assert first == "not perturbed, unlike its training (action_noise=0.1@50): see --perturb"
 
 
+def test_a_closed_standard_output_is_no_mistake():
+    command = f"{shlex.quote(sys.executable)} -m csac runs >&-"
+    process = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE)
+    assert (process.returncode, process.stderr) == (0, b"")
+
+
 def test_evaluate_takes_one_seed(trained, capsys):
     assert csac(f"evaluate {trained[1]} --seed 1 --episodes 1 --stochastic") == 0
 
-    assert words(capsys.readouterr().out)[1:] == ["1 10.00 0.00 10.00 10.00 10.0"]
+    assert words(capsys.readouterr().out)[1:] == ["1 10.00 10.00 10.00 10.0"]
 
 
 def test_evaluate_names_the_seeds_there(trained, capsys):

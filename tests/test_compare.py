@@ -40,7 +40,13 @@ def test_five_seeds_have_one_with_its_interval(compare):
         many=[[0.0, 100.0, 100.0, 100.0]] * 5,
         outlier=[[100.0], [200.0], [300.0], [400.0], [10_000.0]],
     )
-    assert head.endswith("| maximum average return | IQM, 95 % bootstrap interval |")
-    assert few.endswith("| 50 at 10 | 50 |")  # too few for an interval
-    assert many.endswith("| 2.00 | 100 at 20 | 100 (100 to 100) |")  # of the last three evaluations
+    assert head.endswith("| maximum average return | IQM, 95 % bootstrap interval | above the first, probability |")
+    assert few.endswith("| 50 at 10 | 50 |  |")  # too few for an interval
+    assert many.endswith("| 2.00 | 100 at 20 | 100 (100 to 100) | 1.00 |")  # of the last three evaluations
     assert "| 300 (" in outlier  # the mean of 200, 300 and 400; the mean of all is 2200
+
+
+def test_two_seeds_and_one_have_no_interval(compare):
+    _, _, two, one = compare(two=[[40.0], [60.0]], one=[[30.0]])
+    assert two == "| two | 2 | 10 | 50 ± 14 | 2 seeds: no interval | 1.00 | 50 at 10 |"
+    assert one == "| one | 1 | 10 | 30 | 1 seed: no interval | 0.60 | 30 at 10 |"

@@ -1,15 +1,61 @@
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from policies import contract, random_policy
 
 import csac
+from csac.record.manifest import Manifest
+from csac.record.run import RunDirectory
+
+DRAWN = """
+import gymnasium
+import numpy as np
+
+class Drawn(gymnasium.Env):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 1.0, True, False, {}
+
+    def render(self):
+        return np.zeros((32, 32, 3), np.uint8)
+
+gymnasium.register("Drawn-v0", entry_point=Drawn)
+"""
 
 
-def modules_after(code: str) -> set[str]:
-    """The top-level packages that a fresh interpreter holds after `code`."""
+@pytest.fixture
+def tiny_run(tmp_path):
+    """A folder with a finished run, a policy that has learnt nothing, and its task, which can be drawn."""
+    (tmp_path / "drawn.py").write_text(DRAWN)
+    manifest = Manifest(task="drawn:Drawn-v0", algorithm="sac", seeds=(0,), steps=9, state="finished", steps_done=9)
+    run = RunDirectory.create(tmp_path / "run", manifest)
+    rows = {"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 5, "success": None}
+    run.append("evaluations", [rows])
+    agreement = contract()
+    (run.path / "policy").mkdir()
+    agreement.save(run.path / "policy" / "contract.json")
+    random_policy(agreement).save(run.path / "policy" / "seed_0.safetensors")
+    return tmp_path
+
+
+def modules_after(code: str, folder: Path | None = None) -> set[str]:
+    """The top-level packages that a fresh interpreter, in this folder, holds after `code`."""
     report = "import sys; print('MODULES', *{name.partition('.')[0] for name in sys.modules})"
-    done = subprocess.run([sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"], cwd=folder, capture_output=True, text=True, check=True
+    )
     return set(done.stdout.split("MODULES ")[1].split())
 
 
@@ -23,11 +69,39 @@ def test_the_light_names_stay_light():
     assert not {"jax", "gymnasium", "matplotlib"} & modules_after(code)
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["runs", "."], ["evaluate", "--help"], ["play", "--help"]])
-def test_what_needs_no_learning_imports_no_jax(arguments):
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"],
+        ["--version"],
+        ["runs", "."],
+        ["evaluate", "--help"],
+        ["play", "--help"],
+        ["evaluate", "run", "--trust-task", "--episodes", "40", "--processes", "2", "--csv", "episodes.csv"],
+        ["evaluate", "run", "--trust-task", "--stochastic", "--perturb", "action_noise=0.1"],
+        ["play", "run", "--trust-task", "--video", "film.mp4"],
+    ],
+    ids=" ".join,
+)
+def test_what_needs_no_learning_imports_no_jax(arguments, tiny_run):
     code = f"import csac.cli\nassert csac.cli.main({arguments!r}) == 0"
 
-    assert not {"jax", "equinox", "optax"} & modules_after(code)
+    assert not {"jax", "jaxlib", "equinox", "optax"} & modules_after(code, tiny_run)
+
+
+def test_loading_a_policy_imports_no_jax_and_no_task(tiny_run):
+    code = "from csac import load; import numpy; load('run').predict(numpy.zeros(2))"
+
+    assert not {"jax", "jaxlib", "equinox", "optax", "gymnasium", "safetensors"} & modules_after(code, tiny_run)
+
+
+def test_evaluating_in_python_imports_no_jax(tiny_run):
+    code = """
+from csac import evaluate, evaluate_episodes, load
+assert evaluate(load('run'), 'drawn:Drawn-v0', episodes=1) == evaluate_episodes(load('run'), 'drawn:Drawn-v0', 1)[0][1]
+"""
+
+    assert not {"jax", "jaxlib", "equinox", "optax"} & modules_after(code, tiny_run)
 
 
 def test_the_help_of_train_imports_no_task_and_no_picture():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -84,7 +84,7 @@ def _peak_kib(process: int) -> int:
 
 
 def measure(
-    algorithm: str, task: str, seeds: int, interval: int, device: str, launched: float, **counted: Any
+    algorithm: str, task: str, seeds: int, interval: int, device: Literal["cpu", "gpu"], launched: float, **counted: Any
 ) -> dict[str, float]:
     """Train until the window is over, and return what was measured.
 

@@ -95,13 +95,12 @@ class CSAC:
     ) -> tuple[Scalar, Metrics]:
         """Return min Q - σ log π - τ log(π/π̃) at ã(s, noise) (the bracket of Eq. Q_CSAC), and its parts."""
         policy, reference_policy = policy_at(actor, observation), policy_at(reference, observation)
-        pre_tanh = policy.pre_tanh(noise)
-        q_value = least_q_value(critics, observation, jnp.tanh(pre_tanh))
-        log_prob = policy.log_prob(pre_tanh)
+        q_value = least_q_value(critics, observation, policy.sample(noise))
+        log_prob = policy.log_prob(noise)
         if self.relative_entropy_estimator == "closed_form":
             relative_entropy = kl(policy, reference_policy)
         else:
-            relative_entropy = log_ratio(policy, reference_policy, pre_tanh)
+            relative_entropy = log_ratio(policy, reference_policy, noise)
         value = q_value - self.entropy_weight * log_prob - self.relative_entropy_weight * relative_entropy
         return value, {"q_mean": q_value, "entropy": -log_prob, "relative_entropy": relative_entropy}
 
@@ -178,7 +177,7 @@ class CSAC:
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return ã(s, ξ) to explore (Eq. actor), else tanh(mean)."""
         policy = policy_at(state.actor, observation)
-        return jnp.tanh(policy.pre_tanh(jax.random.normal(key, policy.mean.shape))) if explore else policy.mode()
+        return policy.sample(jax.random.normal(key, policy.mean.shape)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers."""

@@ -44,7 +44,8 @@ class Gaussian(NamedTuple):
 class TanhGaussian(NamedTuple):
     """The distribution of tanh(u), u ~ N(mean, exp(log_std)²) (the paper's Eq. actor).
 
-    Densities are evaluated at the pre-tanh value u, never at a stored action: atanh of a saturated action is infinite.
+    An action is named by the noise ξ ~ N(0, I) that it comes of, u = mean + std ξ: ξ is never sought in the action.
+    Atanh of a saturated action is infinite, and of u - mean rounding leaves little where std is small.
     """
 
     mean: Action
@@ -57,16 +58,17 @@ class TanhGaussian(NamedTuple):
         return cls(mean, jnp.clip(log_std, MINIMUM_LOG_STD, MAXIMUM_LOG_STD))
 
     def pre_tanh(self, noise: Action) -> Action:
-        """Return the reparameterised sample u = mean + std ξ for noise ξ ~ N(0, I); the action is tanh(u)."""
+        """Return the reparameterised sample u = mean + std ξ."""
         return self.mean + jnp.exp(self.log_std) * noise
 
-    def gaussian_log_prob(self, pre_tanh: Action) -> Scalar:
-        """Return log N(u; mean, std²), the density beneath the tanh."""
-        return Gaussian(self.mean, self.log_std).log_prob(pre_tanh)
+    def sample(self, noise: Action) -> Action:
+        """Return the action tanh(mean + std ξ)."""
+        return jnp.tanh(self.pre_tanh(noise))
 
-    def log_prob(self, pre_tanh: Action) -> Scalar:
-        """Return the log-density of the action tanh(u)."""
-        return self.gaussian_log_prob(pre_tanh) - jnp.sum(log_tanh_derivative(pre_tanh))
+    def log_prob(self, noise: Action) -> Scalar:
+        """Return the log-density of the action tanh(mean + std ξ)."""
+        log_gaussian = -0.5 * noise**2 - self.log_std - HALF_LOG_TWO_PI
+        return jnp.sum(log_gaussian - log_tanh_derivative(self.pre_tanh(noise)))
 
     def mode(self) -> Action:
         """Return tanh(mean), the deterministic action."""
@@ -78,9 +80,11 @@ def log_tanh_derivative(pre_tanh: Float[Array, "..."]) -> Float[Array, "..."]:
     return 2.0 * (LOG_TWO - pre_tanh - jax.nn.softplus(-2.0 * pre_tanh))
 
 
-def log_ratio(policy: TanhGaussian, reference: TanhGaussian, pre_tanh: Action) -> Scalar:
-    """Return log π(a) - log π̃(a) at a = tanh(u). The tanh is common to both, so its Jacobian cancels."""
-    return policy.gaussian_log_prob(pre_tanh) - reference.gaussian_log_prob(pre_tanh)
+def log_ratio(policy: TanhGaussian, reference: TanhGaussian, noise: Action) -> Scalar:
+    """Return log π(a) - log π̃(a) at π's action tanh(mean + std ξ). Its Jacobian is common to both and cancels."""
+    log_scale = policy.log_std - reference.log_std
+    reference_noise = (policy.mean - reference.mean) * jnp.exp(-reference.log_std) + jnp.exp(log_scale) * noise
+    return jnp.sum(0.5 * (reference_noise**2 - noise**2) - log_scale)
 
 
 def kl(policy: TanhGaussian, reference: TanhGaussian) -> Scalar:

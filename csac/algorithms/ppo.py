@@ -100,6 +100,11 @@ class PPO:
                 f"minibatches must divide rollout_steps into equal parts: {self.rollout_steps} steps make no "
                 f"{self.minibatches} minibatches"
             )
+        if self.normalise_advantages and self.minibatches == self.rollout_steps:
+            raise InputError(
+                "minibatches of one transition have no spread to normalise advantages by: give fewer minibatches than "
+                "rollout_steps, or normalise_advantages=False"
+            )
 
     def discounted_returns(self, start: Scalar, batch: Transition) -> tuple[Scalars, Scalar]:
         """Return R_t = r_t + γ R_{t-1}, from 0 in each episode, and what the next rollout goes on from."""

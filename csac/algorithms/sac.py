@@ -80,9 +80,8 @@ class SAC:
     ) -> Scalar:
         """Return r + γ [min Q(s', a') - α log π(a'|s')] with a' = tanh(mean + std noise) (SAC, Eq. 3)."""
         policy = policy_at(actor, transition.next_observation)
-        pre_tanh = policy.pre_tanh(noise)
-        q_value = least_q_value(target_critics, transition.next_observation, jnp.tanh(pre_tanh))
-        value = q_value - temperature * policy.log_prob(pre_tanh)
+        q_value = least_q_value(target_critics, transition.next_observation, policy.sample(noise))
+        value = q_value - temperature * policy.log_prob(noise)
         return transition.reward + self.discount * (1.0 - transition.terminated) * value
 
     def actor_loss(
@@ -90,9 +89,8 @@ class SAC:
     ) -> tuple[Scalar, Metrics]:
         """Return α log π - min Q at the reparameterised action (SAC, Eq. 9), and what to log."""
         policy = policy_at(actor, observation)
-        pre_tanh = policy.pre_tanh(noise)
-        q_value = least_q_value(critics, observation, jnp.tanh(pre_tanh))
-        log_prob = policy.log_prob(pre_tanh)
+        q_value = least_q_value(critics, observation, policy.sample(noise))
+        log_prob = policy.log_prob(noise)
         loss = temperature * log_prob - q_value
         return loss, {"actor_loss": loss, "q_mean": q_value, "entropy": -log_prob}
 
@@ -157,7 +155,8 @@ class SAC:
         actor_key, critics_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, 2 * spec.action_size)
         critics = make_critics(critics_key, spec, self.critic_hidden_sizes)
-        log_temperature = jnp.log(jnp.float32(self.entropy_weight))
+        # log 0 is no number to keep; the lowest float is one, and its exponential is 0 too.
+        log_temperature = jnp.maximum(jnp.log(jnp.float32(self.entropy_weight)), jnp.finfo(jnp.float32).min)
         return State(
             actor=actor,
             critics=critics,
@@ -171,7 +170,7 @@ class SAC:
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return a sampled action to explore, else tanh(mean)."""
         policy = policy_at(state.actor, observation)
-        return jnp.tanh(policy.pre_tanh(jax.random.normal(key, policy.mean.shape))) if explore else policy.mode()
+        return policy.sample(jax.random.normal(key, policy.mean.shape)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,23 +14,16 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from csac.console.tables import (
-    duration,
-    events_table,
-    make_console,
-    number,
-    program,
-    recovery_tables,
-    results_table,
-    short,
-)
+from csac.console.tables import duration, events_table, make_console, program, recovery_tables, results_table
+from csac.console.waiting import SECONDS_OF_SILENCE, Speed
+from csac.record.rendering import number, short
+from csac.record.statistics import evaluation_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from rich.console import Console, RenderableType
-    from rich.status import Status
 
     from csac.record.manifest import Manifest
     from csac.record.run import RunDirectory
@@ -39,8 +31,6 @@ if TYPE_CHECKING:
 BLOCKS = "▁▂▃▄▅▆▇█"
 CURVE_WIDTH = 24
 MOST_SEEDS_SHOWN = 12  # of more, only the mean and the range are shown
-SECONDS_OF_SILENCE = 30.0
-SPEED_WINDOW = 20.0  # seconds that the shown speed looks back
 
 
 class Reporter:
@@ -58,6 +48,7 @@ class Reporter:
         self._steps = 0
         self._directory = ""
         self._done: dict[int, int] = {}
+        self._begin = 0
         self._curves: dict[int, list[float]] = {}
         self._failed: dict[int, str] = {}
         self._evaluated_at = 0
@@ -84,25 +75,27 @@ class Reporter:
     def go_on(self, step: int, evaluations: np.ndarray, failures: Mapping[int, str]) -> None:
         """Show what was there when the run was taken up again at `step`."""
         self._failed = {seed: f"failed at {reason}" for seed, reason in failures.items()}
+        self._begin = step
         self._done.update(dict.fromkeys(self._done, step))
-        for at in np.unique(evaluations["step"]):
-            rows = evaluations[evaluations["step"] == at]
-            self._evaluated_at = int(at)
-            for seed in np.unique(rows["seed"]).tolist():
-                self._curves[seed].append(float(rows["return"][rows["seed"] == seed].mean()))
+        steps, seeds, returns = evaluation_matrix(evaluations)
+        self._evaluated_at = int(steps.max(initial=0))
+        for seed, line in zip(seeds.tolist(), returns, strict=True):
+            self._curves[seed] = line[~np.isnan(line)].tolist()
 
     def progress(self, steps_by_seed: Mapping[int, int]) -> None:
         """Note how far each seed is."""
         self._done.update(steps_by_seed)
         self._speed.add(sum(self._done.values()))
         if not self._live and self._clock() - self._spoke >= SECONDS_OF_SILENCE:
-            self._say(f"step {min(self._living().values(), default=0):,} of {self._steps:,}{self._pace()}")
+            step = min(self._living().values(), default=0)
+            self._say(f"step {step:,} of {self._steps:,}{self._pace() or self._why_slow()}")
 
     def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
         """Show the mean return of each seed's evaluation episodes at `step`."""
         self._evaluated_at = step
         for seed, value in returns.items():
             self._curves[seed].append(value)
+            self._done[seed] = max(step, self._done[seed])  # it may be told of before the step is
         if not self._live and returns:
             mean = float(np.mean(list(returns.values())))
             text = f"step {step:,} of {self._steps:,}: mean return {number(mean)}{_spread(returns)}"
@@ -172,6 +165,13 @@ class Reporter:
         left = sum(self._steps - step for step in self._living().values()) / speed
         return f", {speed:,.0f} {unit}" + (f", {duration(left)} left" if left else "")
 
+    def _why_slow(self) -> str:
+        """Return what goes on while no step is made: before the first one, and after the last."""
+        living = self._living()
+        if living and all(step <= self._begin for step in living.values()):
+            return f", compiling for {duration(self._clock() - self._began)}"
+        return ", finishing" if living and all(step >= self._steps for step in living.values()) else ""
+
     def _display(self) -> RenderableType:
         return Group(self._bar(), Text(), self._returns()) if any(self._curves.values()) else self._bar()
 
@@ -179,7 +179,7 @@ class Reporter:
         living = self._living() or self._done
         done, total = sum(living.values()), self._steps * len(living)
         step = f"step {short(min(living.values()))} of {short(self._steps)}"
-        text = f"{100 * done // total} %, {step}{self._pace()}"
+        text = f"{100 * done // total} %, {step}{self._why_slow() or self._pace()}"
         width = min(CURVE_WIDTH, max(self.console.width - len(text) - 2, 4))
         grid = Table.grid(padding=(0, 2))
         grid.add_row(ProgressBar(total=total, completed=done, width=width), Text(text))
@@ -216,44 +216,6 @@ class Reporter:
             )
             add("mean", list(values.mean(axis=0)), note, "bold")
         return Group(Text(f"return at step {self._evaluated_at:,}", "dim"), table)
-
-
-class Speed:
-    """Steps per second over the last `SPEED_WINDOW` seconds."""
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
-        self._samples: deque[tuple[float, int]] = deque()
-
-    def add(self, total: int) -> None:
-        """Note the number of steps made so far."""
-        now = self._clock()
-        self._samples.append((now, total))
-        while now - self._samples[1 if len(self._samples) > 2 else 0][0] > SPEED_WINDOW:
-            self._samples.popleft()
-
-    def per_second(self) -> float | None:
-        """Return the speed, or None as long as there is too little to tell."""
-        if len(self._samples) < 2:
-            return None
-        (begin, first), (end, last) = self._samples[0], self._samples[-1]
-        return (last - first) / (end - begin) if end > begin and last > first else None
-
-
-def told_progress(
-    status: Status, doing: str, unit: str, clock: Callable[[], float] = time.monotonic
-) -> Callable[[int, int], None]:
-    """Return what shows in a status line how much is done, of how much, and the time that the rest will take."""
-    speed = Speed(clock)
-    speed.add(0)
-
-    def tell(done: int, total: int) -> None:
-        speed.add(done)
-        pace = speed.per_second()
-        left = f", {duration((total - done) / pace)} left" if pace and done < total else ""
-        status.update(f"{doing}: {done:,} of {total:,} {unit}{left}")
-
-    return tell
 
 
 def sparkline(values: Sequence[float] | np.ndarray, low: float, high: float, width: int) -> str:

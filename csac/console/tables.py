@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import platform
 import shlex
 import shutil
@@ -11,41 +12,41 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import psutil
+import rich.table
 from rich import box
 from rich.console import Console
-from rich.table import Table
+from rich.measure import Measurement
 from rich.text import Text
 
-from csac.record.statistics import (
-    Recovery,
-    evaluation_matrix,
-    last_evaluations,
-    last_means,
-    mean_and_interval,
-    mean_told,
-    recovery,
-)
-from csac.record.tables import COLUMNS
+from csac.record import summary_tables
+from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric, short
+from csac.record.statistics import last_evaluations
+from csac.record.summaries import case_names, last_rows, over_seeds, perturbation_recoveries, run_results
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from rich.console import ConsoleOptions
 
     from csac.evaluation.evaluator import EvaluationEpisode
     from csac.record.run import RunDirectory
 
 STATE_STYLES = {"running": "cyan", "finished": "green", "failed": "red", "interrupted": "yellow", "killed": "red"}
-ROLLOUTS = 1_000  # that the cases of `csac evaluate` are counted in, as in the paper
-MOST_COLUMNS = 5  # of seeds in that table; of more, only the mean and the deviation
 WIDTH_ELSEWHERE = 200  # characters where there is no terminal: lines stay whole for grep
+PADDINGS = ((0, 1, 0, 1), (0, 1, 0, 0), (0, 0, 0, 0))  # of cells: above, right, below, left; the loosest that fits
+WIDEST = 10_000  # characters: as wide as a table would like to be
 
 
 def make_console() -> Console:
     """Return a console on standard output that takes text as it is, and that goes quiet when nobody reads any more."""
-    width = None if sys.stdout.isatty() else WIDTH_ELSEWHERE
+    output = sys.stdout
+    if output is None or output.closed:
+        output = io.StringIO()
+    width = None if output.isatty() else WIDTH_ELSEWHERE
     console = Console(markup=False, emoji=False, highlight=False, width=width)
-    console.file = _Outliving(console.file)  # pyright: ignore[reportAttributeAccessIssue]
+    console.file = _LenientFile(output)  # pyright: ignore[reportAttributeAccessIssue]
     return console
 
 
@@ -54,20 +55,6 @@ def program() -> str:
     started = sys.argv[0]
     is_ours = Path(started).name == "csac" and shutil.which("csac") is None
     return shlex.quote(started) if is_ours else "csac"
-
-
-def number(value: float, largest: float | None = None) -> str:
-    """Return a return as people read it; `largest` sets the decimals for a whole column."""
-    size = abs(value) if largest is None else largest
-    return f"{value:,.{1 if size >= 100 else 2}f}"
-
-
-def short(steps: int) -> str:
-    """Return a number of steps in little room: 500, 12.5k, 1M."""
-    for size, suffix in ((1_000_000, "M"), (1_000, "k")):
-        if steps >= size:
-            return f"{steps / size:.4g}{suffix}"
-    return str(steps)
 
 
 def duration(seconds: float) -> str:
@@ -80,173 +67,106 @@ def duration(seconds: float) -> str:
     return f"{whole} s"
 
 
-def results_table(run: RunDirectory) -> Table:
-    """Return the results of a run, one row per seed: last evaluation, mean of the last three, best, episodes trained.
+class Fitted:
+    """A table on a terminal, its numbers whole at any width.
 
-    Below them the mean, standard deviation and 95 % t-interval over the seeds that did not fail. Their best is the best
-    evaluation of all seeds together (the paper's maximum average return), not the mean of each seed's own.
+    Where the columns do not fit side by side, they move closer; then some follow below, with the first column again.
     """
-    rows, failures = run.evaluations, run.manifest.failures
-    steps, seeds, returns = evaluation_matrix(rows)
-    trained, last_three = run.rows("episodes")["seed"], last_evaluations(rows, points=3)
-    largest = float(np.nanmax(np.abs(returns), initial=0.0))
-    table = _table("seed", "last return", "last three", "best", "at step", "episodes")
-    for seed, line in zip(seeds.tolist(), returns, strict=True):
-        best = int(np.nanargmax(line))
-        values = (line[~np.isnan(line)][-1], last_three[seed], line[best])
-        cells = [*(number(value, largest) for value in values), f"{steps[best]:,}"]
-        style = "red" if seed in failures else None
-        table.add_row(str(seed), *cells, f"{np.count_nonzero(trained == seed):,}", style=style)
-    sound = np.array([seed not in failures for seed in seeds.tolist()])
-    together = ~np.isnan(returns[sound]).any(axis=0)
-    if sound.sum() > 1 and together.any():
-        steps, returns = steps[together], returns[sound][:, together]
-        best = int(returns.mean(axis=0).argmax())
-        three = np.array([last_three[seed] for seed in seeds[sound].tolist()])
-        table.add_section()
-        for label, cells in _over_seeds(np.stack([returns[:, -1], three, returns[:, best]], axis=1), largest):
-            table.add_row(label, *cells, f"{steps[best]:,}" if label == "mean" else "", "")
-    return table
+
+    def __init__(self, table: Table) -> None:
+        self.table = table
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[rich.table.Table]:
+        def fits(part: rich.table.Table) -> bool:
+            return Measurement.get(console, options.update(max_width=WIDEST), part).maximum <= options.max_width
+
+        columns = range(1, len(self.table.headings))
+        for padding in PADDINGS:
+            if fits(whole := self._part(columns, padding)):
+                yield whole
+                return
+        while columns:
+            count = len(columns)
+            while count > 1 and not fits(self._part(columns[:count], PADDINGS[-1])):
+                count -= 1
+            yield self._part(columns[:count], PADDINGS[-1])
+            columns = columns[count:]
+
+    def _part(self, columns: range, padding: tuple[int, int, int, int]) -> rich.table.Table:
+        part = rich.table.Table(box=box.SIMPLE, pad_edge=False, padding=padding)
+        if columns.start == 1:
+            part.title, part.title_justify, part.title_style = self.table.title or None, "left", "bold"
+        if columns.stop == len(self.table.headings):
+            part.caption, part.caption_justify, part.caption_style = self.table.note or None, "left", "dim"
+        for column in (0, *columns):
+            justify = "right" if self.table.is_numeric(column) else "left"
+            part.add_column(Text(self.table.headings[column]), justify=justify, overflow="fold")
+        in_summary = False
+        for row in self.table.rows:
+            texts = [Text(row.cells[column].text) for column in (0, *columns)]
+            if row.kind == "summary" and not any(texts[1:]):
+                continue
+            if row.kind == "summary" and not in_summary:
+                part.add_section()
+            in_summary = row.kind == "summary"
+            part.add_row(*texts, style="red" if row.kind == "failed" else None)
+        return part
 
 
-def recovery_tables(run: RunDirectory) -> list[Table]:
+def results_table(run: RunDirectory) -> Fitted:
+    """Return the results of a run, one row per seed, and below them what the seeds that did not fail have in common."""
+    trained, episodes = np.unique(run.rows("episodes")["seed"], return_counts=True)
+    counts = dict(zip(trained.tolist(), episodes.tolist(), strict=True))
+    return Fitted(summary_tables.results_table(run_results(run.evaluations, _failed(run), counts)))
+
+
+def recovery_tables(run: RunDirectory) -> list[Fitted]:
     """Return a table for each step at which the task was perturbed: what it cost each seed, and how it came back.
 
     Each looks as far as the next perturbation. There is none where no evaluation lies before the step or none after it.
     """
-    rows, perturbed = run.evaluations, by_step(perturbations_of(run.manifest.perturbations))
-    tables = []
-    for index, (step, text) in enumerate(perturbed):
-        until = perturbed[index + 1][0] if index + 1 < len(perturbed) else None
-        recoveries = recovery(rows, step, until, perturbed[index - 1][0] if index else -1)
-        if any(np.isfinite(seed.drop) for seed in recoveries.values()):
-            title = f"{text} after step {step:,}" + (
-                f", until {until:,}" if until and until < rows["step"].max() else ""
-            )
-            tables.append(_recovery_table(title, recoveries, run.manifest.failures))
-    return tables
+    perturbed = by_step(perturbations_of(run.manifest.perturbations))
+    costs = perturbation_recoveries(run.evaluations, perturbed, _failed(run))
+    return [Fitted(summary_tables.recovery_table([cost])) for cost in costs]
 
 
-def _recovery_table(title: str, recoveries: Mapping[int, Recovery], failures: Mapping[int, str]) -> Table:
-    """Return one row per seed, and below them the mean and standard deviation over seeds that did not fail.
-
-    Where a seed never came back there is no mean of the steps, but how many did; a share of a return of 0 is left out.
-    """
-    table = _table("seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "worst fall")
-    table.title, table.title_justify, table.title_style = title, "left", "bold"
-    values = np.array(list(recoveries.values()))
-    largest = float(np.nanmax(np.abs(values[:, [0, 1, 5, 6]])))
-    for seed, one in recoveries.items():
-        table.add_row(str(seed), *_recovery_cells(one, largest), style="red" if seed in failures else None)
-    sound = np.array([one for seed, one in recoveries.items() if seed not in failures and np.isfinite(one.drop)])
-    if len(sound) > 1:
-        back = np.isfinite(sound[:, 3])
-        columns = np.where(back.all() | (np.arange(7) != 3), sound, np.nan).T
-        known = [column[~np.isnan(column)] for column in columns]
-        means = [column.mean() if len(column) else np.nan for column in known]
-        deviations = [column.std(ddof=1) if len(column) > 1 else np.nan for column in known]
-        mean, std = (_recovery_cells(Recovery(*map(float, row)), largest) for row in (means, deviations))
-        mean[3] = mean[3] or f"{back.sum()} of {len(back)}"
-        table.add_section()
-        table.add_row("mean", *mean)
-        table.add_row("± std", *std)
-    return table
+def events_table(rows: np.ndarray) -> Fitted | None:
+    """Return what the last evaluations say beside returns: success and each event. None where the task says nothing."""
+    table = summary_tables.events_table(last_rows(rows), case_names([rows]))
+    return table and Fitted(table)
 
 
-def _recovery_cells(one: Recovery, largest: float) -> list[str]:
-    texts = [
-        number(one.before, largest),
-        number(one.drop, largest),
-        f"{one.relative_drop:.0%}",
-        "never" if one.steps_to_regain == np.inf else f"{one.steps_to_regain:,.0f}",
-        f"{one.area_lost:,.3g}" if one.area_lost < 1000 else short(round(one.area_lost)),
-        number(one.final, largest),
-        number(one.worst_drawdown, largest),
-    ]
-    return ["" if np.isnan(value) else text for value, text in zip(one, texts, strict=True)]
-
-
-def evaluation_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Table:
+def evaluation_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Fitted:
     """Return one row per seed: mean, standard deviation and range of its episodes' returns, their mean length.
 
-    Where there are several seeds, the last row is the mean of their means with its 95 % t-interval.
+    Where there are several seeds, the last rows are the mean of their means and its 95 % t-interval.
     """
     returns = {seed: np.array([episode.episode_return for episode in result]) for seed, result in results.items()}
     largest = max((float(np.abs(values).max()) for values in returns.values()), default=0.0)
     has_success = any(episode.success is not None for result in results.values() for episode in result)
-    table = _table("seed", "mean return", "± std", "min", "max", "length", *["success"] * has_success)
+    headings = ("seed", "mean return", "± std", "min", "max", "length", *["success"] * has_success)
+    rows = []
     for seed, values in returns.items():
-        std = values.std(ddof=1) if len(values) > 1 else 0.0
-        cells = [number(value, largest) for value in (values.mean(), std, values.min(), values.max())]
-        cells.append(f"{np.mean([episode.length for episode in results[seed]]):,.1f}")
+        over, lengths = over_seeds(values), [episode.length for episode in results[seed]]
+        numbers = (over.mean, over.std, values.min(), values.max())
+        cells = [Cell(str(seed), seed), *(numeric(value, number(value, largest)) for value in numbers)]
+        cells.append(Cell(f"{np.mean(lengths):,.1f}", float(np.mean(lengths))))
         if has_success:
-            cells.append(f"{np.mean([episode.success or 0.0 for episode in results[seed]]):.0%}")
-        table.add_row(str(seed), *cells)
+            share = float(np.mean([episode.success or 0.0 for episode in results[seed]]))
+            cells.append(Cell(f"{share:.0%}", share))
+        rows.append(Row(tuple(cells)))
     if len(returns) > 1:
-        mean, _, high = mean_and_interval(np.array([values.mean() for values in returns.values()]))
-        table.add_section()
-        table.add_row("mean", number(float(mean), largest))
-        table.add_row("± 95 %", number(float(high - mean), largest))
-    return table
+        over = over_seeds(values.mean() for values in returns.values())
+        blank = [EMPTY] * (len(headings) - 2)
+        rows.append(Row((Cell("mean", np.nan), Cell(number(over.mean, largest), over.mean), *blank), "summary"))
+        rows += summary_tables.interval_rows([over], largest, len(blank))
+    return Fitted(Table(headings, tuple(rows), note=summary_tables.few_seeds(len(returns))))
 
 
-def events_table(rows: np.ndarray) -> Table | None:
-    """Return what the last evaluations say beside returns: success and each event, as means per episode.
-
-    One row each: the mean over the seeds and, where there are several, their standard deviation and range. None where
-    the task says nothing.
-    """
-    names = [name for name in rows.dtype.names or () if name == "success" or name not in COLUMNS["evaluations"]]
-    means = {name: np.array(list(last_means(rows, name).values())) for name in names}
-    means = {name: values for name, values in means.items() if name != "success" or not np.isnan(values).all()}
-    if not means:
-        return None
-    several = len(np.unique(rows["seed"])) > 1
-    table = _table("per episode, last evaluation", "mean", *["± std", "min", "max"] * several)
-    table.columns[0].justify = "left"
-    for name, values in means.items():
-        known = values[~np.isnan(values)]
-        cells = [f"{known.mean():.3f}" if len(known) else ""]
-        if several:
-            cells += [f"{known.std(ddof=1):.3f}"] if len(known) > 1 else [""]
-            cells += [f"{known.min():.3f}", f"{known.max():.3f}"] if len(known) else ["", ""]
-        table.add_row(Text(name), *cells)
-    return table
-
-
-def case_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Table | None:
-    """Return the paper's case table: how often success and each event came in 1,000 rollouts, one column per seed.
-
-    A rollout that does not speak of a case counts as one without it. What is a count in itself, such as waypoints
-    reached, is a mean per rollout instead, over those that tell it. Where there are several seeds, the last columns are
-    the mean over them and their standard deviation. None where the task says nothing.
-    """
-    episodes = [episode for result in results.values() for episode in result]
-    rows: dict[str, list[list[float | None]]]
-    rows = {"success": [[_as_bool(episode.success) for episode in result] for result in results.values()]}
-    rows = {} if all(episode.success is None for episode in episodes) else rows
-    for name in episodes[0].events if episodes else ():
-        rows[name] = [[episode.events.get(name) for episode in result] for result in results.values()]
-    if not rows:
-        return None
-    per_seed = len(episodes) // len(results)
-    scaled = "" if per_seed == ROLLOUTS else f" (from {per_seed:,} of each seed)"
-    shown = len(results) <= MOST_COLUMNS
-    headings = [f"seed {seed}" for seed in results] if shown else []
-    table = _table(f"per {ROLLOUTS:,} rollouts{scaled}", *headings, *["mean", "± std"] * (len(results) > 1))
-    table.columns[0].justify = "left"
-    for name, by_seed in rows.items():
-        told = [value for values in by_seed for value in values if value is not None]
-        is_case = all(isinstance(value, bool) for value in told)
-        scale, digits = (ROLLOUTS, 1) if is_case else (1, 3)
-        values = np.array([scale * mean_told(np.array(values, float), is_case and told != []) for values in by_seed])
-        known = values[~np.isnan(values)]
-        cells = [_cell(value, digits) for value in values] if shown else []
-        if len(results) > 1:
-            cells.append(_cell(known.mean() if len(known) else np.nan, digits))
-            cells.append(_cell(known.std(ddof=1) if len(known) > 1 else np.nan, digits))
-        table.add_row(Text(name if is_case else f"{name} (mean)"), *cells)
-    return table
+def case_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Fitted | None:
+    """Return the paper's case table of these episodes, see `summary_tables`; None where the task says nothing."""
+    table = summary_tables.case_table(_rows(results))
+    return table and Fitted(table)
 
 
 def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[str]:
@@ -256,40 +176,43 @@ def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[st
     return [name for name in names if all(episode.events.get(name) is None for episode in episodes)]
 
 
-def runs_table(runs: Sequence[RunDirectory]) -> Table:
-    """Return one row per run: what was trained, how far it is, its last return (mean over its seeds), where it is."""
-    table = _table("task", "algorithm", "seeds", "steps", "state", "last return", "directory")
-    for column in (0, 1, 4, 6):
-        table.columns[column].justify = "left"
-    table.columns[6].overflow = "fold"
+def print_runs(console: Console, runs: Sequence[RunDirectory]) -> None:
+    """Print what was trained in each run, how far it is, its last return (mean over its seeds) and where it is.
+
+    A table where it fits, else a few lines for each run: a path that is cut could not be copied.
+    """
+    headings = ("task", "algorithm", "seeds", "steps", "state", "last return", "directory")
+    table, lines = rich.table.Table(box=box.SIMPLE, pad_edge=False), Text()
+    for heading in headings:
+        table.add_column(heading, justify="right" if heading in ("seeds", "steps", "last return") else "left")
     for run in runs:
-        manifest, state = run.manifest, _state(run)
+        manifest, state, last = run.manifest, _state(run), _last_return(run)
+        task, algorithm, seeds = manifest.task, manifest.algorithm, len(manifest.seeds)
         steps = f"{short(manifest.steps_done)} / {short(manifest.steps)}"
-        table.add_row(
-            Text(manifest.task),
-            manifest.algorithm,
-            str(len(manifest.seeds)),
-            steps,
-            Text(state, STATE_STYLES.get(state, "")),
-            _last_return(run),
-            Text(str(run.path)),
-        )
-    return table
+        coloured = Text(state, STATE_STYLES.get(state, ""))
+        table.add_row(Text(task), algorithm, str(seeds), steps, coloured, last, Text(str(run.path)))
+        of_seeds = f"{seeds} seed{'s' * (seeds > 1)}"
+        lines.append(f"{run.path}\n  {task}, {algorithm}, {of_seeds}, {steps} steps, ")
+        lines.append(coloured).append(f", last return {last}\n" if last else "\n")
+    natural = Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
+    console.print(table if natural <= console.width else lines, soft_wrap=True, end="")
 
 
-def _over_seeds(values: np.ndarray, largest: float) -> Iterable[tuple[str, list[str]]]:
-    """Yield the summary rows for `values` [seed, column]."""
-    mean, _, high = mean_and_interval(values)
-    for label, row in (("mean", mean), ("± std", values.std(axis=0, ddof=1)), ("± 95 %", high - mean)):
-        yield label, [number(value, largest) for value in row]
+def _failed(run: RunDirectory) -> set[int]:
+    return set(run.manifest.failures)
 
 
-def _as_bool(success: float | None) -> bool | None:
-    return None if success is None else bool(success)
-
-
-def _cell(value: float, digits: int) -> str:
-    return "" if np.isnan(value) else f"{value:,.{digits}f}"
+def _rows(results: Mapping[int, Sequence[EvaluationEpisode]]) -> np.ndarray:
+    """Return episodes as rows of evaluations.csv: NaN for what an episode does not say."""
+    episodes = [(seed, episode) for seed, result in results.items() for episode in result]
+    events = list(episodes[0][1].events) if episodes else []
+    columns = [("seed", np.int64), ("return", np.float64), ("success", np.float64)]
+    rows = np.empty(len(episodes), columns + [(name, np.float64) for name in events])
+    for row, (seed, episode) in zip(rows, episodes, strict=True):
+        row["seed"], row["return"] = seed, episode.episode_return
+        for name, value in (("success", episode.success), *((name, episode.events.get(name)) for name in events)):
+            row[name] = np.nan if value is None else float(value)
+    return rows
 
 
 def _state(run: RunDirectory) -> str:
@@ -309,14 +232,7 @@ def _last_return(run: RunDirectory) -> str:
     return number(float(np.mean(list(returns.values())))) if returns else ""
 
 
-def _table(*headings: str) -> Table:
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    for heading in headings:
-        table.add_column(heading, justify="right")
-    return table
-
-
-class _Outliving:
+class _LenientFile:
     """A text file that swallows what can no longer be written: a run goes on after its terminal or pipe is gone."""
 
     def __init__(self, file: IO[str]) -> None:
@@ -325,13 +241,13 @@ class _Outliving:
     def write(self, text: str) -> int:
         try:
             return self._file.write(text)
-        except OSError:
+        except (OSError, ValueError):  # ValueError: it is closed
             return len(text)
 
     def flush(self) -> None:
         try:
             self._file.flush()
-        except OSError:
+        except (OSError, ValueError):
             return
 
     def __getattr__(self, name: str) -> Any:

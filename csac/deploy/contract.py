@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,12 +11,15 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from csac.record.files import write_atomically
 from csac.types import InputError, Spec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 SCHEMA_VERSION = 1
+MOST_AXES = 31  # of a shape; a batch has one more, and NumPy 1 holds 32
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 Activation = Literal["relu", "tanh"]
 Head = Literal["tanh_gaussian", "tanh", "clipped_gaussian"]
@@ -103,7 +105,7 @@ class Contract:
             "action_low": self.action_low.tolist(),
             "action_high": self.action_high.tolist(),
         }
-        write_file(Path(path), (json.dumps(fields, indent=2) + "\n").encode())
+        write_atomically(Path(path), (json.dumps(fields, indent=2) + "\n").encode())
 
     @staticmethod
     def load(path: str | Path) -> Contract:
@@ -113,12 +115,12 @@ class Contract:
             InputError: no such file, or one that is not a contract of this schema.
         """
         try:
-            fields = json.loads(read_file(Path(path)))
-        except ValueError as error:
+            fields = json.loads(read_file(Path(path)).decode())
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path} is not valid JSON ({error}): restore it from a copy") from error
         try:
             return _contract(fields)
-        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else error
             raise InputError(f"{path} is not a policy contract ({reason}): restore it from a copy") from error
 
@@ -152,15 +154,15 @@ def _contract(fields: Any) -> Contract:
         raise ValueError(f"schema_version {fields['schema_version']!r} where this csac reads {SCHEMA_VERSION}")
     parts = tuple((part["key"], _shape(part["shape"])) for part in fields["observation_parts"])
     action_shape = _shape(fields["action_shape"])
-    low, high = (np.array(fields[name], dtype=np.float32) for name in ("action_low", "action_high"))
+    low, high = _bounds(fields["action_low"]), _bounds(fields["action_high"])
     keys = [key for key, _ in parts]
     named = all(isinstance(key, str) for key in keys) and keys == sorted(set(keys))
     if keys != [None] and not (keys and named):
         raise ValueError("observation_parts are not one plain part or sorted, distinct keys")
     if low.shape != (math.prod(action_shape),) or high.shape != low.shape:
         raise ValueError("action bounds and action_shape disagree")
-    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
-        raise ValueError("action bounds are not finite and in order")
+    if not (low <= high).all():
+        raise ValueError("action bounds are not in order")
     if fields["activation"] not in get_args(Activation) or fields["head"] not in get_args(Head):
         raise ValueError(f"activation {fields['activation']!r} or head {fields['head']!r} is not known")
     if not isinstance(fields["algorithm"], str) or not isinstance(fields["task"], str | None):
@@ -173,7 +175,18 @@ def _contract(fields: Any) -> Contract:
 def _shape(numbers: Any) -> tuple[int, ...]:
     if not isinstance(numbers, list) or not all(type(number) is int and number > 0 for number in numbers):
         raise ValueError(f"{numbers!r} is not a shape")
+    if len(numbers) > MOST_AXES:
+        raise ValueError(f"a shape of {len(numbers)} axes")
     return tuple(numbers)
+
+
+def _bounds(numbers: Any) -> np.ndarray:
+    """Return float32 [action]. Raises ValueError where a number is none, or more than float32 can hold."""
+    if not isinstance(numbers, list) or not all(type(number) in (int, float) for number in numbers):
+        raise ValueError("action bounds are not lists of numbers")
+    if not all(abs(number) <= FLOAT32_MAX for number in numbers):
+        raise ValueError("action bounds are not finite")
+    return np.array(numbers, np.float32)
 
 
 def _as_float32(value: Any, name: str) -> np.ndarray:
@@ -189,13 +202,3 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write aside, then rename: a crash leaves the old file or the new one."""
-    aside = path.with_name(path.name + ".tmp")
-    with aside.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)

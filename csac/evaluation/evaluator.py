@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from csac.deploy.policy import Policy
+from csac.deploy.policy import Policy, noise_generator
 from csac.tasks.environment import Environment
-from csac.tasks.perturbations import lasting, values_at
+from csac.tasks.known import events_of
+from csac.tasks.perturbations import constant_perturbations, values_at
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.spaces import EnvironmentFailure
 from csac.types import InputError
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
     OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
 
-ROWS = 10  # of every batch that the policy sees: rounding depends on its shape
+EPISODES_AT_ONCE = 10  # rows of every batch that the policy sees: rounding depends on its shape
 LONGEST_EPISODE = 100_000  # steps; a task that never ends would never let training go on
 
 
@@ -98,7 +99,7 @@ class Evaluator:
             environment.perturb(values)
 
     def run(self, policy: Policy, deterministic: bool = True) -> list[EvaluationEpisode]:
-        """Return the episodes in order; stochastic actions draw from a generator of the episode's own seed.
+        """Return the episodes in order; stochastic actions are drawn by the episode's seed, never as the task draws.
 
         Raises:
             InputError: the policy was trained on other observations or actions, or the task cannot be made.
@@ -123,7 +124,7 @@ class Evaluator:
 
     def batches(self, policies: int) -> list[tuple[int, int]]:
         """Return (which policy, number of its first episode) of every batch, in order."""
-        return [(index, first) for index in range(policies) for first in range(0, self.episodes, ROWS)]
+        return [(index, first) for index in range(policies) for first in range(0, self.episodes, EPISODES_AT_ONCE)]
 
     def run_batch(self, policy: Policy, first: int, deterministic: bool = True) -> list[EvaluationEpisode]:
         """Return the episodes of the batch that begins with number `first`.
@@ -135,7 +136,7 @@ class Evaluator:
             self.close()
         self._make_environments()
         _check_contract(policy, self._environments[0])
-        return self._run_batch(policy, range(first, min(first + ROWS, self.episodes)), deterministic)
+        return self._run_batch(policy, range(first, min(first + EPISODES_AT_ONCE, self.episodes)), deterministic)
 
     def close(self) -> None:
         """Close the environments; another `run` makes new ones."""
@@ -144,7 +145,7 @@ class Evaluator:
         self._environments = []
 
     def _make_environments(self) -> None:
-        while len(self._environments) < min(ROWS, self.episodes):
+        while len(self._environments) < min(EPISODES_AT_ONCE, self.episodes):
             environment = Environment(self._task, self._environment_arguments)
             try:
                 environment.perturb(self.perturbed)
@@ -155,8 +156,8 @@ class Evaluator:
 
     def _run_batch(self, policy: Policy, numbers: range, deterministic: bool) -> list[EvaluationEpisode]:
         observation_size, action_size = policy.contract.spec
-        observations = np.zeros((ROWS, observation_size), np.float32)
-        noise = None if deterministic else np.zeros((ROWS, action_size), np.float32)
+        observations = np.zeros((EPISODES_AT_ONCE, observation_size), np.float32)
+        noise = None if deterministic else np.zeros((EPISODES_AT_ONCE, action_size), np.float32)
         episodes = [
             _Episode(environment, number, self._first_seed + number)
             for environment, number in zip(self._environments, numbers, strict=False)
@@ -186,7 +187,7 @@ class _Episode:
 
     def __init__(self, environment: Environment, number: int, seed: int) -> None:
         self.environment, self._number, self._seed = environment, number, seed
-        self.generator = np.random.default_rng(seed)
+        self.generator = noise_generator(seed)
         self.ended = False
         self._return, self._length = 0.0, 0
         self.last_info: dict[str, Any] = {}
@@ -207,7 +208,7 @@ class _Episode:
         self.ended = terminated or truncated or self._length >= LONGEST_EPISODE
         return observation
 
-    def result(self, events: Sequence[str] = ()) -> EvaluationEpisode:
+    def result(self, events: Sequence[str]) -> EvaluationEpisode:
         said = {name: _number(self.last_info.get(name)) for name in events}
         return EvaluationEpisode(self._number, self._return, self._length, _success(self.last_info), said)
 
@@ -225,22 +226,51 @@ def evaluate(
     environment_arguments: dict[str, Any] | None = None,
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> np.ndarray:
-    """Return the returns [episodes] of a policy on episodes reset with `first_seed`, `first_seed + 1`, ...
+    """Return the returns [episodes] of a policy: those of `evaluate_episodes`, which has the arguments too.
 
-    `policy` is a csac `Policy`, or any object whose `predict` has Stable-Baselines3's shape: that one is given the
-    task's raw observations one at a time and answers on the task's own action scale. `perturbations`, such as
-    `("friction=2",)`, change the task for all of every episode.
+    Raises:
+        InputError, EvaluationFailure: as `evaluate_episodes`.
+    """
+    played = evaluate_episodes(
+        policy, task, episodes, first_seed, deterministic, environment_arguments, perturbations=perturbations
+    )
+    return np.array([episode.episode_return for episode in played])
+
+
+def evaluate_episodes(
+    policy: Any,
+    task: Task,
+    episodes: int = 100,
+    first_seed: int = FRESH_EVALUATION_SEED,
+    deterministic: bool = True,
+    environment_arguments: dict[str, Any] | None = None,
+    events: Sequence[str] | None = None,
+    perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
+) -> list[EvaluationEpisode]:
+    """Return the episodes that a policy plays, each with its return, length, success and events.
+
+    Args:
+        policy: a csac `Policy`, or any object whose `predict` has Stable-Baselines3's shape: that one is given the
+            task's raw observations one at a time and answers on the task's own action scale.
+        task: as `train`'s.
+        episodes: how many.
+        first_seed: what the first is reset with; the next ones with `first_seed + 1`, ...
+        deterministic: whether the policy takes its most likely action, or draws one.
+        environment_arguments: keyword arguments for the environment.
+        events: names in the `info` of an episode's last step; None for those that a known task has by itself.
+        perturbations: what changes the task for all of every episode, such as `("friction=2",)`.
 
     Raises:
         InputError: as `Evaluator`, a policy without `predict`, or perturbations that the task cannot have.
         EvaluationFailure: as `Evaluator.run`.
     """
-    perturbed = values_at(lasting(perturbations), 0)
+    perturbed = values_at(constant_perturbations(perturbations), 0)
+    events = events_of(task) if events is None else tuple(events)
     if isinstance(policy, Policy):
-        evaluator = Evaluator(task, environment_arguments, episodes, first_seed)
+        evaluator = Evaluator(task, environment_arguments, episodes, first_seed, events)
         evaluator.perturb(perturbed)
         try:
-            return np.array([episode.episode_return for episode in evaluator.run(policy, deterministic)])
+            return evaluator.run(policy, deterministic)
         finally:
             evaluator.close()
     if not callable(getattr(policy, "predict", None)):
@@ -248,20 +278,20 @@ def evaluate(
     _check_episodes(episodes)
     environment = Environment(task, environment_arguments)
     try:
-        returns = []
+        played = []
         for number in range(episodes):
             if number and environment.has_memory:
                 environment.close()
                 environment = Environment(task, environment_arguments)
             environment.perturb(perturbed)
             episode = _Episode(environment, number, first_seed + number)
-            returns.append(_play(policy, episode, deterministic).episode_return)
-        return np.array(returns)
+            played.append(_play(policy, episode, deterministic, events))
+        return played
     finally:
         environment.close()
 
 
-def _play(policy: Any, episode: _Episode, deterministic: bool) -> EvaluationEpisode:
+def _play(policy: Any, episode: _Episode, deterministic: bool, events: Sequence[str]) -> EvaluationEpisode:
     episode.start()
     state, start = None, np.ones(1, bool)
     while not episode.ended:
@@ -270,7 +300,7 @@ def _play(policy: Any, episode: _Episode, deterministic: bool) -> EvaluationEpis
         )
         episode.step(action)
         start = np.zeros(1, bool)
-    return episode.result()
+    return episode.result(events)
 
 
 def _check_episodes(episodes: int) -> None:
@@ -295,17 +325,23 @@ def _told(parts: Parts) -> str:
 
 def _number(value: Any) -> bool | float | None:
     """Return a boolean or a finite number out of `info` as Python's own, and None for anything else."""
+    array = _numbers(value)
+    return None if array is None or array.size != 1 else array.item()
+
+
+def _success(info: dict[str, Any]) -> float | None:
+    """Return 1 or 0 for what a task says of its success, and None where it is silent or says nothing that counts."""
+    verdict = _numbers(info.get("is_success", info.get("success")))
+    return None if verdict is None else float(verdict.all())
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """Return booleans or finite numbers as an array, and None for anything else."""
     if value is None or isinstance(value, str | bytes):
         return None
     try:
         array = np.asarray(value)
     except Exception:  # `info` may hold anything
         return None
-    if array.size != 1 or array.dtype.kind not in "buif" or not np.isfinite(array).all():
-        return None
-    return array.item()
-
-
-def _success(info: dict[str, Any]) -> float | None:
-    verdict = info.get("is_success", info.get("success"))
-    return None if verdict is None else float(np.all(verdict))
+    is_number = array.size > 0 and array.dtype.kind in "buif" and np.isfinite(array).all()
+    return array if is_number else None

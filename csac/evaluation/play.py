@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from csac.deploy.policy import load
-from csac.evaluation.evaluator import EvaluationEpisode, Evaluator
+from csac.deploy.choosing import load
+from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
 from csac.tasks.known import adapter_of
-from csac.tasks.perturbations import lasting, perturbations_of, values_at
+from csac.tasks.perturbations import constant_perturbations, perturbations_of, values_at
 from csac.tasks.seeds import FRESH_EVALUATION_SEED
+from csac.tasks.trust import refuse_untrusted
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -38,19 +39,22 @@ def evaluate_run(
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
     processes: int | None = None,
     on_progress: OnProgress | None = None,
+    trust_task: bool = False,
 ) -> Iterator[tuple[int, list[EvaluationEpisode]]]:
     """Yield (seed, episodes) for the last policy of each seed of a run, or of the one asked for.
 
     The episodes are the same for every seed, and none that training or its evaluations have seen. The task is the one
     that the run began with, but for these `perturbations`, which last from beginning to end. The episodes are shared by
     `processes`, by default as many as pay; 1 is this one. Whatever their number, the results are the same.
-    `on_progress(episodes done, of how many)` is called after each batch of episodes.
+    `on_progress(episodes done, of how many)` is called after each batch of episodes. `trust_task` lets the task import
+    its module though nobody has named it here (`csac.tasks.trust`).
 
     Raises:
-        InputError: no run there, no such seed, a damaged file, or a task that can no longer be made or perturbed so.
+        InputError: no run there, no such seed, a damaged file, a task that can no longer be made or perturbed so, or
+            one whose module has never been named here.
         EvaluationFailure: an environment raised, or gave what is not finite; or a process died.
     """
-    run = _open(directory)
+    run = _open(directory, trust_task)
     evaluator = Evaluator(
         run.manifest.task,
         run.manifest.environment_arguments,
@@ -58,22 +62,26 @@ def evaluate_run(
         FRESH_EVALUATION_SEED,
         run.manifest.events,
     )
-    evaluator.perturb(values_at(lasting(perturbations), 0))
+    evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     labels = _seeds_with_policies(run) if seed is None else [seed]
     policies = [load(directory, label) for label in labels]
     processes = choose_processes(evaluator, len(policies)) if processes is None else processes
-    workers = evaluator if processes == 1 else EvaluationPool(evaluator, processes)
+    if processes == 1:
+        workers = evaluator
+    else:
+        Environment(run.manifest.task, run.manifest.environment_arguments).close()  # says what is to be said
+        workers = EvaluationPool(evaluator, processes)
     try:
         yield from zip(labels, workers.run_all(policies, deterministic, on_progress), strict=True)
     finally:
         workers.close()
 
 
-def told_perturbations(
+def perturbation_notes(
     directory: str | Path, perturbations: str | Perturbation | Iterable[str | Perturbation]
 ) -> list[str]:
     """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
-    given = lasting(perturbations)
+    given = constant_perturbations(perturbations)
     trained = perturbations_of(RunDirectory.open(directory).manifest.perturbations)
     if given:
         return [f"perturbed: {', '.join(item.label for item in given)}"]
@@ -86,17 +94,20 @@ def play(
     episodes: int = 1,
     video: str | Path | None = None,
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
+    on_progress: OnProgress | None = None,
+    trust_task: bool = False,
 ) -> Iterator[EvaluationEpisode]:
     """Yield the episodes that a run's policy plays, in a window or, with `video`, into an .mp4 file.
 
     Without `seed` it is the seed with the best last evaluations. The video is there once the last episode was yielded.
-    `perturbations` are as in `evaluate_run`.
+    `on_progress(steps done, of how many at most)` is called after each step. An episode that reaches `LONGEST_EPISODE`
+    steps is broken off there. `perturbations` and `trust_task` are as in `evaluate_run`.
 
     Raises:
         InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
         EnvironmentFailure: the environment raised, or gave what is not finite.
     """
-    run, perturbed = _open(directory), values_at(lasting(perturbations), 0)
+    run, perturbed = _open(directory, trust_task), values_at(constant_perturbations(perturbations), 0)
     if episodes < 1:
         raise InputError(f"{episodes} episodes: play at least one")
     policy = load(directory, seed)
@@ -113,6 +124,7 @@ def play(
         or environment.raw.metadata.get("render_fps")
         or DEFAULT_FRAMES_PER_SECOND
     )
+    longest, done = _longest_episode(environment), 0
     try:
         environment.perturb(perturbed)
         _follow(environment)
@@ -124,8 +136,12 @@ def play(
                 while not ended:
                     action = policy.act(observation[None])[0]
                     observation, reward, terminated, truncated, _ = environment.step(action)
-                    episode_return, length, ended = episode_return + reward, length + 1, terminated or truncated
+                    episode_return, length = episode_return + reward, length + 1
+                    ended = terminated or truncated or length >= longest
                     record()
+                    if on_progress:
+                        on_progress(done + length, done + (episodes - number) * longest)
+                done += length
                 for _ in range(length + 1, round(SECONDS_ON_SCREEN * frames_per_second)):
                     record(again=True)
                 yield EvaluationEpisode(number, episode_return, length, None)
@@ -133,13 +149,21 @@ def play(
         environment.close()
 
 
-def _open(directory: str | Path) -> RunDirectory:
+def _longest_episode(environment: Environment) -> int:
+    """Return how many steps an episode can have."""
+    limit = environment.raw.spec.max_episode_steps if environment.raw.spec else None
+    return min(limit or LONGEST_EPISODE, LONGEST_EPISODE)
+
+
+def _open(directory: str | Path, trust_task: bool) -> RunDirectory:
+    """Open a run whose task is to be made."""
     run = RunDirectory.open(directory)
     if run.manifest.task_is_callable:
         raise InputError(
             f"the task of {directory} was made by a Python function, {run.manifest.task}: "
             "evaluate it in Python, with csac.load and csac.evaluate"
         )
+    refuse_untrusted(run.manifest.task, run.path, trust_task)
     return run
 
 
@@ -153,7 +177,7 @@ def _follow(environment: Environment) -> None:
 
 
 def _seeds_with_policies(run: RunDirectory) -> list[int]:
-    seeds = [seed for seed in run.manifest.seeds if (run.path / "policy" / f"seed_{seed}.safetensors").exists()]
+    seeds = run.seeds_with_policies()
     if not seeds:
         raise InputError(f"{run.path} holds no policy yet: its first evaluation writes one")
     return seeds
@@ -178,7 +202,7 @@ def _check_video(path: Path) -> None:
 
 
 def _drawn_environment(run: RunDirectory, render_mode: str) -> Environment:
-    task, arguments = run.manifest.task, run.manifest.environment_arguments or {}
+    task, arguments = run.manifest.task, run.manifest.environment_arguments
     adapter = adapter_of(task)
     if adapter and render_mode == "rgb_array":
         arguments = {**adapter.picture_arguments, **arguments}

@@ -92,7 +92,9 @@ class EvaluationPool:
         self.info_names |= running.info_names
         return episodes
 
-    def begin(self, policies: Sequence[Policy], deterministic: bool = True, stop_at_failure: bool = False) -> Running:
+    def begin(
+        self, policies: Sequence[Policy], deterministic: bool = True, stop_at_failure: bool = False
+    ) -> PendingEvaluation:
         """Begin to evaluate policies and return. The run before must be over.
 
         With `stop_at_failure` a failing batch leaves out all that no process has begun, else those of its own policy.
@@ -103,7 +105,7 @@ class EvaluationPool:
             (index, first): (policies[index], first, deterministic, self._evaluator.perturbed)
             for index, first in batches
         }
-        return Running(list(self._workers), tasks, len(policies) * self._evaluator.episodes, stop_at_failure)
+        return PendingEvaluation(list(self._workers), tasks, len(policies) * self._evaluator.episodes, stop_at_failure)
 
     def close(self) -> None:
         """End the processes; another run starts new ones."""
@@ -119,7 +121,7 @@ class EvaluationPool:
             self._workers.append(_Worker(self._evaluator, self._cores))
 
 
-class Running:
+class PendingEvaluation:
     """A run of an `EvaluationPool` that is on its way.
 
     The processes have a batch each, in order, and are given the next whenever somebody waits here or asks whether it is

@@ -1,18 +1,18 @@
-"""Statistics over seeds: returns per evaluation point, intervals, and the paper's scores."""
+"""Statistics over episodes, seeds and tasks: means, intervals and comparisons. docs/statistics.md defines each."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
-REGAINED = 0.9  # of the return before a perturbation: the policy is back
-FEWEST_SEEDS = 5  # a bootstrap over fewer has too few distinct resamples to say anything
+FEWEST_FOR_INTERVAL = 3  # seeds: of two, the t-interval is nine standard deviations to either side
+FEWEST_FOR_BOOTSTRAP = 5  # seeds: fewer have too few distinct resamples to say anything
 
 
 class Interval(NamedTuple):
@@ -37,22 +37,17 @@ def evaluation_matrix(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
     return steps, seeds, _divide(total, episodes)
 
 
-def last_means(rows: np.ndarray, column: str) -> dict[int, float]:
-    """Return each seed's mean of one column over the episodes of its own last evaluation, as `mean_told` takes it."""
-    means, cases = {}, is_case(rows[column])
-    for seed in np.unique(rows["seed"]).tolist():
-        own = rows[rows["seed"] == seed]
-        means[seed] = mean_told(own[column][own["step"] == own["step"].max()], cases)
-    return means
-
-
 def is_case(values: np.ndarray) -> bool:
-    """Whether `values` [episode], NaN where an episode said nothing, tell of something that happens or does not."""
-    told = values[~np.isnan(values)]
-    return bool(len(told) and np.isin(told, (0.0, 1.0)).all())
+    """Return whether `values` [episode], NaN where an episode said nothing, are all 0 or 1.
+
+    Then they tell of something that happens or does not, such as a crash. A table does not know a bool from a number,
+    so this is the only definition; where several runs stand side by side, it is asked of all their values together.
+    """
+    known = values[~np.isnan(values)]
+    return bool(len(known) and np.isin(known, (0.0, 1.0)).all())
 
 
-def mean_told(values: np.ndarray, is_case: bool) -> float:
+def mean_over_episodes(values: np.ndarray, is_case: bool) -> float:
     """Return the mean over `values` [episode], NaN where an episode said nothing.
 
     In a case, silence is a no: many tasks speak of a success or a crash only when there is one. A number that an
@@ -97,18 +92,55 @@ def stratified_bootstrap_interval(
 ) -> tuple[float, float] | None:
     """Percentile interval of `statistic`, resampling the seeds of `scores` [seed, ...] anew for every other index.
 
-    Seeds with a NaN are left out whole; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement
-    Learning at the Edge of the Statistical Precipice".
+    The other index is a task: where it is an evaluation of the same seed, average over it first. Seeds with a NaN are
+    left out whole; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge
+    of the Statistical Precipice".
     """
-    scores = np.asarray(scores, dtype=np.float64)
-    scores = scores[~np.isnan(scores).any(axis=tuple(range(1, scores.ndim)))]
-    if len(scores) < FEWEST_SEEDS:
-        return None
-    generator = np.random.default_rng(seed)
-    draws = (generator.integers(len(scores), size=scores.shape) for _ in range(repetitions))
-    resampled = [statistic(np.take_along_axis(scores, draw, axis=0)) for draw in draws]
-    low, high = np.quantile(resampled, [0.5 - confidence / 2, 0.5 + confidence / 2])
-    return float(low), float(high)
+    return _bootstrap_interval([scores], statistic, repetitions, seed, confidence)
+
+
+def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
+    """Probability that a seed of `scores` [seed, task] is above one of `others` [seed, task], averaged over tasks.
+
+    An equal pair counts half; NaNs are left out, NaN where a task has no pair. One task may be given as [seed].
+    Agarwal et al. 2021, there P(X > Y).
+    """
+    scores, others = (np.asarray(array, dtype=np.float64) for array in (scores, others))
+    difference = scores[:, None] - others[None, :]  # [seed, other seed, ...]
+    above = np.where(np.isnan(difference), np.nan, (np.sign(difference) + 1) / 2)
+    pairs = (~np.isnan(above)).sum(axis=(0, 1))
+    return float(np.mean(_divide(np.nansum(above, axis=(0, 1)), pairs)))
+
+
+def improvement_interval(
+    scores: np.ndarray, others: np.ndarray, repetitions: int = 2000, seed: int = 0, confidence: float = 0.95
+) -> tuple[float, float] | None:
+    """Stratified bootstrap interval of `probability_of_improvement`; None where either has fewer than five seeds."""
+    return _bootstrap_interval([scores, others], probability_of_improvement, repetitions, seed, confidence)
+
+
+def performance_profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """Share of all runs in `scores` [seed, ...] that are above each threshold [t], NaNs left out.
+
+    Agarwal et al. 2021, there the score distribution. Its pointwise interval is the bootstrap's for each threshold.
+    """
+    known = np.asarray(scores, dtype=np.float64)
+    known = known[~np.isnan(known)]
+    above = known[None, :] > np.asarray(thresholds)[:, None]
+    return _divide(above.sum(axis=1), np.full(len(above), len(known)))
+
+
+def dispersion_across(returns: np.ndarray) -> float:
+    """Interquartile range over seeds of `returns` [seed, t], averaged over the evaluations that hold every seed.
+
+    How much the outcome depends on the seed; NaN below two seeds. After Chan et al. 2020, "Measuring the Reliability of
+    Reinforcement Learning Algorithms" (dispersion across runs), without its smoothing.
+    """
+    together = returns[:, ~np.isnan(returns).any(axis=0)]
+    if len(returns) < 2 or not together.size:
+        return np.nan
+    low, high = np.quantile(together, [0.25, 0.75], axis=0)
+    return float((high - low).mean())
 
 
 def maximum_average_return(rows: np.ndarray) -> tuple[float, int]:
@@ -131,68 +163,35 @@ def last_evaluations(rows: np.ndarray, points: int = 3) -> dict[int, float]:
     return {int(seed): float(line.mean()) for seed, line in zip(seeds, last, strict=True) if line.size}
 
 
-class Recovery(NamedTuple):
-    """What a perturbation did to the returns of one seed, and how they came back. NaN where nothing can be told."""
-
-    before: float
-    """Mean return of the last three evaluations up to and including the perturbation's step."""
-    drop: float
-    """`before` minus the lowest return after it, 0 where none is lower."""
-    relative_drop: float
-    """The drop as a share of |before|."""
-    steps_to_regain: float
-    """Environment steps from the perturbation to 90 % of `before`: 0 if no evaluation fell below, infinite if never."""
-    area_lost: float
-    """Integral of max(0, before - return) over the steps after the perturbation, in return times steps."""
-    final: float
-    """Mean return of the last three evaluations after the perturbation, or of all where none is after it."""
-    worst_drawdown: float
-    """The largest fall from the highest return so far, over the whole curve, before the perturbation and after it."""
+def mean_returns(rows: Iterable[Mapping[str, Any]]) -> dict[int, float]:
+    """Return each seed's mean return over the episodes of one evaluation, given as rows of evaluations.csv."""
+    numbers = [(row["seed"], row["step"], row["return"]) for row in rows]
+    return last_evaluations(np.array(numbers, [("seed", int), ("step", int), ("return", float)]), points=1)
 
 
-def recovery(rows: np.ndarray, step: int, until: int | None = None, since: int = -1) -> dict[int, Recovery]:
-    """Return each seed's `Recovery` from a perturbation after `step`, of the rows of evaluations.csv until `until`.
-
-    What came until `since`, where the perturbation before it was, is no return before this one; an evaluation at `step`
-    itself still is. Of a negative return before, -100, 90 % are -110: `before` less a tenth of its size. The steps to
-    regain that end at the first evaluation that reaches it after the first one that did not. The area is the
-    trapezoids' between evaluations, beginning with no loss at `step`. Last evaluations are fewer than three where there
-    are no more; those of a seed that are NaN or missing are left out.
-    """
-    steps, seeds, returns = evaluation_matrix(rows)
-    wanted = steps <= (steps.max(initial=0) if until is None else until)
-    there = ~np.isnan(returns) & wanted
-    return {
-        int(seed): _recovery(steps[known], line[known], step, since)
-        for seed, line, known in zip(seeds, returns, there, strict=True)
-        if known.any()
-    }
+def best_returns(rows: np.ndarray) -> dict[int, float]:
+    """Return the highest of each seed's evaluations, each the mean over its episodes."""
+    _, seeds, returns = evaluation_matrix(rows)
+    known = [(seed, line[~np.isnan(line)]) for seed, line in zip(seeds.tolist(), returns, strict=True)]
+    return {seed: float(line.max()) for seed, line in known if line.size}
 
 
-def _recovery(steps: np.ndarray, returns: np.ndarray, step: int, since: int) -> Recovery:
-    is_before, is_after = (since < steps) & (steps <= step), steps > step
-    before = returns[is_before][-3:].mean() if is_before.any() else np.nan
-    final = (returns[is_after] if is_after.any() else returns)[-3:].mean()
-    drawdown = (np.maximum.accumulate(returns) - returns).max()
-    if np.isnan(before) or not is_after.any():
-        return Recovery(*map(float, (before, np.nan, np.nan, np.nan, np.nan, final, drawdown)))
-    steps, after = steps[is_after], returns[is_after]
-    drop = max(before - after.min(), 0.0)
-    shortfall = np.maximum(before - after, 0.0)
-    area = np.trapezoid([0.0, *shortfall], [step, *steps])
-    time = _time_to_regain(steps - step, after, (REGAINED if before >= 0 else 2 - REGAINED) * before)
-    relative = drop / abs(before) if before else np.nan
-    return Recovery(*map(float, (before, drop, relative, time, area, final, drawdown)))
+def _bootstrap_interval(
+    samples: Sequence[np.ndarray], statistic: Callable[..., float], repetitions: int, seed: int, confidence: float
+) -> tuple[float, float] | None:
+    """Percentile interval of `statistic(*samples)`, each sample [seed, ...] resampled for itself."""
+    arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
+    arrays = [array[~np.isnan(array).any(axis=tuple(range(1, array.ndim)))] for array in arrays]
+    if min(map(len, arrays)) < FEWEST_FOR_BOOTSTRAP:
+        return None
+    generator = np.random.default_rng(seed)
 
+    def resampled(array: np.ndarray) -> np.ndarray:
+        return np.take_along_axis(array, generator.integers(len(array), size=array.shape), axis=0)
 
-def _time_to_regain(times: np.ndarray, returns: np.ndarray, threshold: float) -> float:
-    """Return the time of the first return at the threshold or above after the first below it."""
-    below = returns < threshold
-    if not below.any():
-        return 0.0
-    fallen = int(below.argmax())
-    back = ~below[fallen:]
-    return float(times[fallen + int(back.argmax())]) if back.any() else np.inf
+    values = [statistic(*map(resampled, arrays)) for _ in range(repetitions)]
+    low, high = np.quantile(values, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    return float(low), float(high)
 
 
 def _divide(numerator: np.ndarray, count: np.ndarray) -> np.ndarray:

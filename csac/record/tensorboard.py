@@ -13,7 +13,7 @@ from tensorboardX.proto.event_pb2 import Event as TensorBoardEvent  # pyright: i
 from tensorboardX.proto.event_pb2 import SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
-from csac.record.statistics import is_case, mean_told
+from csac.record.statistics import is_case, mean_over_episodes
 from csac.record.tables import COLUMNS
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class TensorBoardLog:
                     self._cases.add(name)
                 elif not np.isnan(told).all():
                     self._cases.discard(name)
-                mean = mean_told(told, name in self._cases)
+                mean = mean_over_episodes(told, name in self._cases)
                 if not np.isnan(mean):
                     values["eval/success_rate" if name == "success" else f"eval/{name}"] = mean
             self._write(seed, step, values)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import multiprocessing
 from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import Any
@@ -33,6 +34,7 @@ from csac.tasks.spaces import (
 from csac.types import InputError, Snapshot, Spec
 
 _log = logging.getLogger(__name__)
+_said: set[str] = set()
 
 
 class Environment:
@@ -55,6 +57,8 @@ class Environment:
             arguments["render_mode"] = render_mode
         self.raw = make(task, arguments)
         self.task_name = task_name(task, self.raw)
+        if multiprocessing.parent_process() is None:  # which has made one too, or will
+            _say_once(self.task_name, known.wrapper_notes(self.raw))
         self._quietly = quietly if known.is_pybullet(self.raw) else nullcontext
         self.has_memory = known.has_memory(task, self.raw)
         try:
@@ -191,6 +195,14 @@ class Environment:
         raw = {key: part.reshape(shape) for (key, shape), part in zip(self._parts, np.split(noisy, ends), strict=True)}
         self.raw_observation = raw.get(None, raw)
         return noisy
+
+
+def _say_once(task_name: str, notes: list[str]) -> None:
+    """Log what the user should know of a task, once in this process."""
+    for note in notes:
+        if note not in _said:
+            _log.warning("note: %s: %s", task_name, note)
+    _said.update(notes)
 
 
 def _check_savable(saved: Snapshot) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 from csac.types import InputError
 
@@ -21,6 +22,7 @@ RESERVED_TAGS = frozenset({"mean_reward", "mean_ep_length", "success_rate"})
 
 _CONTEXT = 2  # waypoints that the policy sees: the one it flies to and the next
 _EYE = np.array([0.0, 0.0, 0.5])  # metres above the drone
+_BESIDE = np.array([-0.6, -0.6, 0.3])  # metres from the drone
 
 
 class Adapter(NamedTuple):
@@ -61,6 +63,22 @@ class FlatWaypoints(gymnasium.ObservationWrapper):
         return np.concatenate([observation["attitude"], waypoints.ravel()])
 
 
+def follow(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
+    """Return what takes a picture of a drone from beside it, always from the same side: uint8 [480, 640, 4].
+
+    PyFlyt's own camera sits in the drone's nose: it never shows the drone.
+    """
+    drone: Any = environment.unwrapped
+
+    def picture() -> np.ndarray:
+        position = drone.env.state(0)[-1]
+        eye = position + _BESIDE
+        eye[2] = max(eye[2], 0.1)
+        return _photograph(drone.env, eye, position)
+
+    return picture
+
+
 def chase(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
     """Return what takes a picture from behind the drone, towards its next waypoint: uint8 [480, 640, 4].
 
@@ -80,12 +98,16 @@ def chase(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
         level = direction * np.array([1.0, 1.0, 0.3])
         eye = position - 1.2 * level + _EYE
         eye[2] = max(eye[2], 0.1)
-        client = drone.env
-        view = client.computeViewMatrix(eye.tolist(), (position + level).tolist(), [0.0, 0.0, 1.0])
-        projection = client.computeProjectionMatrixFOV(fov=60.0, aspect=640 / 480, nearVal=0.05, farVal=60.0)
-        return np.asarray(client.getCameraImage(640, 480, view, projection)[2], np.uint8).reshape(480, 640, 4)
+        return _photograph(drone.env, eye, position + level)
 
     return picture
+
+
+def _photograph(client: Any, eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return what PyBullet sees from `eye` towards `target`, both in metres: uint8 [480, 640, 4]."""
+    view = client.computeViewMatrix(eye.tolist(), target.tolist(), [0.0, 0.0, 1.0])
+    projection = client.computeProjectionMatrixFOV(fov=60.0, aspect=640 / 480, nearVal=0.05, farVal=60.0)
+    return np.asarray(client.getCameraImage(640, 480, view, projection)[2], np.uint8).reshape(480, 640, 4)
 
 
 _WAYPOINTS = Adapter(
@@ -105,7 +127,7 @@ _PANDA = Adapter(
 ADAPTERS: Mapping[str, Adapter] = MappingProxyType(
     {
         "PyFlyt/QuadX-Waypoints-v1": _WAYPOINTS._replace(camera=chase),
-        "PyFlyt/QuadX-Hover-v1": _PYFLYT._replace(events=("out_of_bounds", "collision")),
+        "PyFlyt/QuadX-Hover-v1": _PYFLYT._replace(events=("out_of_bounds", "collision"), camera=follow),
         "PyFlyt/Fixedwing-Waypoints-v1": _WAYPOINTS,
         "PyFlyt/Rocket-Landing-v1": _PYFLYT._replace(events=("out_of_bounds", "fatal_collision", "env_complete")),
         **{
@@ -182,6 +204,24 @@ def has_memory(task: object, environment: gymnasium.Env) -> bool:
     if isinstance(task, str) and (adapter := ADAPTERS.get(task.rpartition(":")[2])):
         return adapter.has_memory
     return "panda_gym" in _packages(environment)
+
+
+def wrapper_notes(environment: gymnasium.Env) -> list[str]:
+    """Return a line for each wrapper that learns something by itself, which csac neither saves nor hands on."""
+    notes = []
+    while isinstance(environment, gymnasium.Wrapper):
+        if isinstance(environment, NormalizeObservation):
+            notes.append(
+                "NormalizeObservation keeps statistics of its own, which are saved neither with the policy nor in "
+                "checkpoints, and each environment has others: leave it out (PPO normalises by itself)"
+            )
+        if isinstance(environment, NormalizeReward):
+            notes.append(
+                "NormalizeReward keeps statistics of its own, which no checkpoint saves, and returns are in units that "
+                "change as they do: leave it out, or put a constant factor in its place"
+            )
+        environment = environment.env
+    return notes
 
 
 def _packages(environment: gymnasium.Env) -> set[str]:

@@ -25,6 +25,7 @@ _log = logging.getLogger(__name__)
 
 def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
     """Return a new environment. Raises InputError where there is no such task or it refuses its arguments."""
+    _check_task(task)
     name = task if isinstance(task, str) else _name_of(task) or "the task"
     adapter = known.adapter_of(task)
     _silence_mujoco()
@@ -46,6 +47,16 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
     if not isinstance(environment, gymnasium.Env):
         raise InputError(f"{name} gave a {type(environment).__name__}: a task's callable returns a gymnasium.Env")
     return environment
+
+
+def _check_task(task: object) -> None:
+    if isinstance(task, gymnasium.Env):
+        raise InputError(
+            f"the task is an environment already made ({type(task).__name__}), and csac makes several: "
+            "give its id, or a function that makes one, such as lambda: gymnasium.make(...)"
+        )
+    if not isinstance(task, str) and not callable(task):
+        raise InputError(f"a task is a Gymnasium id or a function that makes an environment, not {task!r}")
 
 
 def _registered(task: str) -> str:

@@ -95,7 +95,7 @@ def perturbations_of(given: str | Perturbation | Iterable[str | Perturbation]) -
     return tuple(parsed)
 
 
-def lasting(given: str | Perturbation | Iterable[str | Perturbation]) -> tuple[Perturbation, ...]:
+def constant_perturbations(given: str | Perturbation | Iterable[str | Perturbation]) -> tuple[Perturbation, ...]:
     """As `perturbations_of`, where nothing is learnt and so there is no step to wait for. Raises InputError."""
     perturbations = perturbations_of(given)
     for item in perturbations:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
 
     from csac.evaluation.evaluator import EvaluationEpisode
-    from csac.evaluation.pool import Running
+    from csac.evaluation.pool import PendingEvaluation
     from csac.types import PolicyNetwork
 
 METRICS_INTERVAL = 1_000
@@ -48,7 +48,7 @@ class Evaluation(NamedTuple):
 
     step: int
     policies: dict[int, Policy]
-    running: Running | None
+    running: PendingEvaluation | None
 
     @property
     def is_over(self) -> bool:

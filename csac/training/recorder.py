@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from csac.record.run import Table
+from csac.record.statistics import best_returns, mean_returns
 from csac.training.messages import (
     Boundary,
     Ended,
@@ -25,8 +26,7 @@ from csac.training.messages import (
 from csac.training.restore import LOG, keep_best_policies, keep_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Mapping, Sequence
 
     from csac.console.progress import Reporter
     from csac.deploy.policy import Policy
@@ -78,7 +78,7 @@ class Recorder:
         self._pending: dict[Table, list[dict[str, Any]]] = defaultdict(list)
         self._saved: dict[int, dict[int, Files]] = defaultdict(dict)  # step -> group -> its files
         # One that was lost is followed by the best of later evaluations.
-        self._best = {k: v for k, v in _best_means(run.evaluations).items() if self._policy_file(k, ".best").exists()}
+        self._best = {k: v for k, v in best_returns(run.evaluations).items() if self.run.policy(k, "best").exists()}
         # Told once, after the first evaluation of the run.
         self._unheard = set() if len(run.evaluations) else set(run.manifest.events)
         self._info_names: set[str] = set()
@@ -138,10 +138,10 @@ class Recorder:
         self._take(group, "evaluations", message.rows)
         self._info_names |= message.info_names
         self._save(message.policies)
-        for seed, value in _mean_returns(message.rows).items():
+        for seed, value in mean_returns(message.rows).items():
             if value > self._best.get(seed, -np.inf):
                 self._best[seed] = value
-                message.policies[seed].save(self._policy_file(seed, ".best"))
+                message.policies[seed].save(self.run.policy(seed, "best"))
 
     def _commit_when_whole(self, group: int, message: Saved) -> None:
         """Keep a group's best policies with its files; with the last living group's files there is a checkpoint."""
@@ -238,14 +238,10 @@ class Recorder:
 
     def _save(self, policies: dict[int, Policy]) -> None:
         for seed, policy in policies.items():
-            contract = self.run.path / "policy" / "contract.json"
-            if not contract.exists():
-                contract.parent.mkdir(exist_ok=True)
-                policy.contract.save(contract)
-            policy.save(self._policy_file(seed))
-
-    def _policy_file(self, seed: int, kind: str = "") -> Path:
-        return self.run.path / "policy" / f"seed_{seed}{kind}.safetensors"
+            if not self.run.contract.exists():
+                self.run.contract.parent.mkdir(exist_ok=True)
+                policy.contract.save(self.run.contract)
+            policy.save(self.run.policy(seed))
 
     def _flush(self, until: int = OVER) -> None:
         """Write the rows that no group can precede any more, as far as step `until`."""
@@ -269,7 +265,7 @@ class Recorder:
         """Tell whoever watches of each evaluation that every group has passed."""
         for step in sorted({row["step"] for row in rows}):
             self._tell_perturbations(step)
-            returns = _mean_returns([row for row in rows if row["step"] == step])
+            returns = mean_returns([row for row in rows if row["step"] == step])
             self.evaluated.append((step, returns))
             self.run.log(f"step {step}: " + ", ".join(f"seed {seed} {value:.1f}" for seed, value in returns.items()))
             self.run.update_manifest(steps_done=step)
@@ -292,21 +288,5 @@ class Recorder:
             self._note(f"perturbed from step {begin + 1:,} on: {text}")
 
 
-def _best_means(evaluations: np.ndarray) -> dict[int, float]:
-    """Return each seed's best mean return so far."""
-    best: dict[int, float] = {}
-    for step in np.unique(evaluations["step"]):
-        for seed, value in _mean_returns(evaluations[evaluations["step"] == step]).items():
-            best[seed] = max(value, best.get(seed, -np.inf))
-    return best
-
-
 def _seeds(seeds: Sequence[int]) -> str:
     return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
-
-
-def _mean_returns(rows: Iterable[Any]) -> dict[int, float]:
-    returns: dict[int, list[float]] = defaultdict(list)
-    for row in rows:
-        returns[int(row["seed"])].append(float(row["return"]))
-    return {seed: float(np.mean(values)) for seed, values in returns.items()}

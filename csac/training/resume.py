@@ -134,11 +134,10 @@ def roll_back(run: RunDirectory) -> Restart:
         unfinished.unlink()
     if checkpoint is None:
         return BEGINNING
-    Checkpoints(run.checkpoints, run.manifest.checkpoints.keep, checkpoint.values["pinned"]).discard_after(
-        checkpoint.step
-    )
+    step, pinned = checkpoint.step, checkpoint.values["pinned"]
+    Checkpoints(run.checkpoints, run.manifest.checkpoints.keep, pinned).discard_after(step)
     failures = {int(seed): reason for seed, reason in checkpoint.values["failures"].items()}
-    return Restart(checkpoint.step, failures, complaints, checkpoint.values["pinned"])
+    return Restart(step, failures, complaints, pinned)
 
 
 class Source(NamedTuple):

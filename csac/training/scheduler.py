@@ -9,7 +9,7 @@ from itertools import count
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
-from csac.evaluation.evaluator import ROWS
+from csac.evaluation.evaluator import EPISODES_AT_ONCE
 from csac.processes import Child, die_with_parent, move_to, usable_cores
 from csac.training.checkpoint import remove_unfinished
 from csac.training.group import Group, is_boundary
@@ -66,7 +66,7 @@ def choose_evaluation_processes(groups: Sequence[Sequence[int]], episodes: int) 
     Several groups may share the cores that are to spare, since they evaluate for a small part of the time only.
     """
     spare = len(usable_cores()) - len(groups)
-    batches = max(map(len, groups)) * -(-episodes // ROWS)
+    batches = max(map(len, groups)) * -(-episodes // EPISODES_AT_ONCE)
     return min(batches, max(1, spare // len(groups))) if spare > 0 else 0
 
 

@@ -13,6 +13,7 @@ from csac.processes import end_if_unguarded
 from csac.record.run import RunDirectory, default_directory, is_run
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import by_step, perturbations_of, refuse_late
+from csac.tasks.trust import refuse_untrusted, remember
 from csac.training.checkpoint import Checkpoints
 from csac.training.compilation import tidy_programs
 from csac.training.devices import choose_device
@@ -132,6 +133,7 @@ def resume(
     *,
     steps: int | None = None,
     evaluation_processes: int | None = 0,
+    trust_task: bool = False,
     reporter: Reporter | None = None,
     command: str | None = None,
     on_evaluation: OnEvaluation | None = None,
@@ -139,7 +141,8 @@ def resume(
 ) -> RunDirectory:
     """Go on with a run from its newest checkpoint; everything but a larger number of `steps` comes from its manifest.
 
-    `evaluation_processes` and what follows are as in `train`.
+    `trust_task` lets the task import its module though nobody has named it here (`csac.tasks.trust`);
+    `evaluation_processes`, `reporter` and what follows it are as in `train`.
 
     Raises:
         InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
@@ -149,6 +152,7 @@ def resume(
     """
     run = RunDirectory.open(directory)
     task, options = options_of(run)
+    refuse_untrusted(task, run.path, trust_task)
     options["evaluation_processes"], options["groups"] = evaluation_processes, None
     if steps is not None:
         options["steps"] = steps
@@ -207,6 +211,7 @@ def make_plan(
     continued = before.run.manifest if before.run else None
     with closing(Environment(task, arguments)) as environment:
         spec, task_name = environment.spec, environment.task_name
+        remember(task)
         changes = planned_perturbations(asked, before.existing, before.source)
         if not before.existing:  # whose number of steps has its own refusal
             refuse_late(changes, options.steps, planned=before.source is not None and asked is None)

@@ -184,8 +184,8 @@ class Table(NamedTuple):
 
     log_probs: jax.Array  # [action]
 
-    def pre_tanh(self, noise):
-        return noise
+    def sample(self, noise):
+        return jnp.tanh(noise)
 
     def log_prob(self, noise):
         return self.log_probs[choice(noise)]

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from csac.algorithms.distributions import TanhGaussian, kl, log_ratio, log_tanh_derivative
 
@@ -23,9 +24,14 @@ POLICY = TanhGaussian(jnp.array([0.5, -1.0, 2.0]), jnp.array([-0.5, 0.2, -2.0]))
 REFERENCE = TanhGaussian(jnp.array([0.2, -0.5, 2.1]), jnp.array([0.1, 0.0, -1.8]))
 
 
+def noise_of(policy: TanhGaussian, pre_tanh) -> jax.Array:
+    """The noise that gives this value before the tanh."""
+    return (jnp.asarray(pre_tanh, jnp.float32) - policy.mean) / jnp.exp(policy.log_std)
+
+
 def log_density(policy: TanhGaussian) -> np.ndarray:
     """The log-density of the action at each point of the grid."""
-    return np.asarray(jax.vmap(policy.log_prob)(jnp.array(GRID[:, None], jnp.float32)), np.float64)
+    return np.asarray(jax.vmap(lambda u: policy.log_prob(noise_of(policy, u)))(GRID[:, None]), np.float64)
 
 
 def test_log_prob_is_the_change_of_variables():
@@ -33,7 +39,7 @@ def test_log_prob_is_the_change_of_variables():
     jacobian = jax.jacobian(jnp.tanh)(pre_tanh)
     expected = jax.scipy.stats.norm.logpdf(pre_tanh, POLICY.mean, jnp.exp(POLICY.log_std)).sum()
     expected -= jnp.log(jnp.abs(jnp.linalg.det(jacobian)))
-    assert float(POLICY.log_prob(pre_tanh)) == pytest.approx(float(expected), abs=1e-5)
+    assert float(POLICY.log_prob(noise_of(POLICY, pre_tanh))) == pytest.approx(float(expected), abs=1e-5)
 
 
 @pytest.mark.parametrize("policy", [NARROW, WIDE])
@@ -44,7 +50,7 @@ def test_the_density_of_the_action_integrates_to_one(policy):
 @pytest.mark.parametrize("policy", [NARROW, WIDE])
 def test_the_density_agrees_with_where_samples_fall(policy):
     noise = jax.random.normal(jax.random.key(0), (100_000, 1))
-    share = np.mean(np.tanh(jax.vmap(policy.pre_tanh)(noise)) < 0.3)
+    share = np.mean(jax.vmap(policy.sample)(noise) < 0.3)
     expected = np.exp(log_density(policy)) @ (WIDTHS * (np.tanh(GRID) < 0.3))
     assert share == pytest.approx(expected, abs=0.006)  # four standard errors
 
@@ -62,8 +68,7 @@ def test_log_tanh_derivative_where_tanh_is_flat():
 def test_extreme_networks_give_finite_numbers(mean, log_std):
     def loss(output, noise):
         policy = TanhGaussian.from_output(output)
-        pre_tanh = policy.pre_tanh(noise)
-        return policy.log_prob(pre_tanh) + kl(policy, STANDARD) + log_ratio(policy, STANDARD, pre_tanh)
+        return policy.log_prob(noise) + kl(policy, STANDARD) + log_ratio(policy, STANDARD, noise)
 
     value, gradient = jax.value_and_grad(loss)(jnp.array([mean, log_std]), jnp.array([3.0]))
     assert np.isfinite(value)
@@ -84,9 +89,29 @@ def test_kl_by_hand():
     assert float(kl(STANDARD, STANDARD)) == 0.0
 
 
+@pytest.mark.parametrize("log_std", [-4.0, -12.0, -20.0])
+def test_densities_of_a_sharp_policy_are_exact(log_std):
+    # Beside a mean of 0.8, u = mean + std ξ is known to 6e-8, which is 0.01 std at a log_std of -12.
+    noise, mean = np.array([0.7, -1.3]), 0.8
+    policy = TanhGaussian(jnp.full(2, mean), jnp.full(2, log_std))
+    slope = np.log1p(-(np.tanh(mean + np.exp(log_std) * noise) ** 2))
+    expected = np.sum(norm.logpdf(noise) - log_std - slope)
+    assert float(policy.log_prob(jnp.array(noise))) == pytest.approx(expected, rel=1e-6)
+    assert float(log_ratio(policy, policy, jnp.array(noise))) == 0.0
+
+
+def test_log_ratio_by_hand():
+    # A reference half a standard deviation below and twice as wide: ξ̃ = (ξ + ½) / 2.
+    noise = np.array([0.7, -1.3])
+    reference = TanhGaussian(NARROW.mean - 0.5 * np.exp(-1.0), NARROW.log_std + math.log(2.0))
+    expected = norm.logpdf(noise) - norm.logpdf((noise + 0.5) / 2.0) + math.log(2.0)
+    for xi, ratio in zip(noise, expected, strict=True):
+        assert float(log_ratio(NARROW, reference, jnp.array([xi]))) == pytest.approx(ratio, abs=1e-6)
+
+
 def test_kl_is_the_mean_log_ratio():
     noise = jax.random.normal(jax.random.key(0), (200_000, 3))
-    ratios = jax.vmap(lambda xi: log_ratio(POLICY, REFERENCE, POLICY.pre_tanh(xi)))(noise)
+    ratios = jax.vmap(lambda xi: log_ratio(POLICY, REFERENCE, xi))(noise)
     assert float(kl(POLICY, REFERENCE)) == pytest.approx(
         float(ratios.mean()), abs=4 * float(ratios.std()) / 200_000**0.5
     )
@@ -101,7 +126,8 @@ def test_kl_beneath_the_tanh_is_the_kl_of_the_actions(policy, reference):
 
 def test_the_jacobian_cancels_in_the_log_ratio():
     pre_tanh = jnp.array([0.3, -1.2, 1.9])
-    expected = POLICY.log_prob(pre_tanh) - REFERENCE.log_prob(pre_tanh)
-    assert float(log_ratio(POLICY, REFERENCE, pre_tanh)) == pytest.approx(float(expected), abs=1e-5)
+    noise, reference_noise = noise_of(POLICY, pre_tanh), noise_of(REFERENCE, pre_tanh)
+    expected = POLICY.log_prob(noise) - REFERENCE.log_prob(reference_noise)
+    assert float(log_ratio(POLICY, REFERENCE, noise)) == pytest.approx(float(expected), abs=1e-5)
     # At u = 40, where tanh is 1 in float32: log N(40; 0, 1) - log N(40; 1, 1) = (-40² + 39²) / 2 = -39.5.
     assert float(log_ratio(STANDARD, SHIFTED, jnp.array([40.0]))) == pytest.approx(-39.5, abs=1e-3)

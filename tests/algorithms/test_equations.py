@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from csac.algorithms import CSAC, SAC
 from csac.algorithms.critics import critic_loss
@@ -181,6 +182,41 @@ def test_a_fixed_temperature_stays():
     algorithm = SAC(temperature="fixed", entropy_weight=0.2, **LINEAR)
     state, _ = update(algorithm, algorithm.init(jax.random.key(0), ONE, 1000), batch_of(transition()))
     assert float(state.log_temperature) == pytest.approx(math.log(0.2))
+
+
+def test_a_fixed_temperature_may_be_zero_and_its_state_is_finite():
+    algorithm = SAC(temperature="fixed", entropy_weight=0.0, **LINEAR)
+    state, metrics = update(algorithm, algorithm.init(jax.random.key(0), ONE, 1000), batch_of(transition()))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, metrics)))  # else the loop stops the seed
+    assert float(metrics["temperature"]) == 0.0
+
+
+@pytest.mark.parametrize(
+    "algorithm",
+    [
+        CSAC(entropy_weight=1.0, relative_entropy_weight=0.0, **LINEAR),
+        SAC(temperature="fixed", entropy_weight=1.0, **LINEAR),
+    ],
+    ids=lambda algorithm: algorithm.name,
+)
+def test_every_transition_has_noise_of_its_own_for_the_critics_and_for_the_actor(algorithm):
+    # No reward, and critics that are 0 everywhere: y = -0.5 log π of the target's sample, a loss of 2 y², and `entropy`
+    # is -log π of the actor's sample.
+    nothing, one = linear([[0.0], [0.0]], [0.0]), transition(reward=0.0)
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(
+        actor=POLICY, critics=(nothing, nothing), target_critics=(nothing, nothing)
+    )
+    nodes, weights = np.polynomial.hermite_e.hermegauss(60)
+    log_probs = norm.logpdf(nodes) - 2.0 * (math.log(2.0) - np.logaddexp(nodes, -nodes))
+    mean, mean_square = weights @ log_probs / weights.sum(), weights @ log_probs**2 / weights.sum()
+
+    _, metrics = update(algorithm, state, batch_of(*[one] * 4096))
+    assert float(metrics["entropy"]) == pytest.approx(-mean, abs=0.05)
+    assert float(metrics["critic_loss"]) == pytest.approx(0.5 * mean_square, rel=0.15)
+    for key in range(3):
+        _, metrics = update(algorithm, state, batch_of(one), key)
+        of_the_target = math.sqrt(float(metrics["critic_loss"]) / 2.0) / 0.5
+        assert of_the_target != pytest.approx(abs(float(metrics["entropy"])), rel=1e-3)
 
 
 @pytest.mark.parametrize(("log_std", "expected"), [(-2.6, 0.1), (-2.2, -0.1)])

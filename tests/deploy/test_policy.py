@@ -6,8 +6,8 @@ import json
 import math
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,42 +15,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from policies import DICT_PARTS, contract, random_layers, random_network, random_policy
 
-from csac.deploy.contract import Activation, Contract, Head
-from csac.deploy.policy import Policy, load
+from csac.deploy.contract import Activation, Contract
+from csac.deploy.policy import Policy
+from csac.record.manifest import Manifest
+from csac.record.run import RunDirectory
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
-
-DICT_PARTS = (("achieved", (2,)), ("position", (1, 2)), ("speed", ()))
-
-
-def contract(
-    parts=((None, (2,)),),
-    action_shape=(1,),
-    low=-1.0,
-    high=1.0,
-    activation: Activation = "relu",
-    head: Head = "tanh_gaussian",
-) -> Contract:
-    size = math.prod(action_shape)
-    bounds = [np.full(size, bound, np.float32) for bound in (low, high)]
-    return Contract("Task-v0", "csac", activation, head, parts, action_shape, *bounds)
-
-
-def random_layers(*sizes: int, seed: int = 0) -> tuple[Layer, ...]:
-    generator = np.random.default_rng(seed)
-    return tuple(
-        Layer(generator.normal(size=(inputs, outputs)), generator.normal(size=outputs))
-        for inputs, outputs in pairwise(sizes)
-    )
-
-
-def random_network(spec: Spec, width: int = 8, seed: int = 0) -> PolicyNetwork:
-    layers = random_layers(spec.observation_size, width, width, 2 * spec.action_size, seed=seed)
-    return PolicyNetwork(PolicyParameters((layers,)))
-
-
-def random_policy(contract: Contract, seed: int = 0) -> Policy:
-    return Policy(random_network(contract.spec, seed=seed), contract)
 
 
 def hand_made(activation: Activation = "relu", log_std_bias=0.0, **settings) -> Policy:
@@ -293,82 +264,13 @@ def test_equal_policies_are_equal_files(tmp_path):
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def save_run(directory: Path, evaluations: str = "", seeds=(0, 1, 2)) -> dict[int, Policy]:
-    folder = directory / "policy"
-    folder.mkdir(parents=True)
-    agreement = contract()
-    agreement.save(folder / "contract.json")
-    policies = {seed: random_policy(agreement, seed) for seed in seeds}
-    for seed, policy in policies.items():
-        policy.save(folder / f"seed_{seed}.safetensors")
-        random_policy(agreement, seed + 100).save(folder / f"seed_{seed}.best.safetensors")
-    if evaluations:
-        (directory / "evaluations.csv").write_text("seed,step,episode,return,length,success\n" + evaluations)
-    return policies
-
-
-def same(one: Policy, other: Policy) -> bool:
-    return bool(one.predict(np.ones(2))[0] == other.predict(np.ones(2))[0])
-
-
-def test_a_seed_is_loaded_by_its_label(tmp_path):
-    policies = save_run(tmp_path / "run")
-    assert same(load(tmp_path / "run", seed=2), policies[2])
-    assert not same(load(tmp_path / "run", seed=2, which="best"), policies[2])
-    assert same(load(tmp_path / "run", seed=2, which="best"), random_policy(contract(), 102))
-
-
-def test_the_best_seed_is_best_over_its_last_three_evaluation_points(tmp_path):
-    # Means of the last three points: seed 0: (1 + 1 + 30) / 3; seed 1: (12 + 12 + 12) / 3, its 99 being older;
-    # seed 2: (90, its own mean of 60 and 120, then 3 and 0) / 3 = 31.
-    returns = {0: [[0], [1], [1], [30]], 1: [[99], [12], [12], [12]], 2: [[0], [60, 120], [3], [0]]}
-    lines = [
-        f"{seed},{step},{episode},{value},10,"
-        for step in range(4)
-        for seed, points in returns.items()
-        for episode, value in enumerate(points[step])
-    ]
-    policies = save_run(tmp_path / "run", "\n".join(lines) + "\n")
-    assert same(load(tmp_path / "run"), policies[2])
-
-
-def test_a_line_that_is_still_being_written_does_not_count(tmp_path):
-    policies = save_run(tmp_path / "run", "0,1,0,5.0,10,\n1,1,0,6.0,10,\n2,1,0,99")
-    assert same(load(tmp_path / "run"), policies[1])
-
-
-def test_the_first_of_equal_seeds_and_the_only_seed_are_chosen(tmp_path):
-    policies = save_run(tmp_path / "tie", "2,1,0,5,10,\n1,1,0,5,10,\n")
-    assert same(load(tmp_path / "tie"), policies[1])
-    policies = save_run(tmp_path / "one", seeds=[4])
-    assert same(load(tmp_path / "one"), policies[4])
-
-
-def test_load_says_what_is_missing(tmp_path):
-    save_run(tmp_path / "run")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="not a directory"):
-        load(tmp_path / "nowhere")
-    with pytest.raises(InputError, match="holds no policies"):
-        load(tmp_path / "empty")
-    with pytest.raises(InputError, match="no policy of seed 7; it has those of 0, 1, 2"):
-        load(tmp_path / "run", seed=7)
-    with pytest.raises(InputError, match="no evaluations to choose by: give a seed, one of 0, 1, 2"):
-        load(tmp_path / "run")
-    with pytest.raises(InputError, match="choose 'last' or 'best'"):
-        load(tmp_path / "run", which="first")  # pyright: ignore[reportArgumentType]
-    (tmp_path / "run" / "evaluations.csv").write_text("seed,step\n0,x\n")
-    with pytest.raises(InputError, match="damaged"):
-        load(tmp_path / "run")
-
-
 @pytest.mark.parametrize("damage", [lambda whole: whole[:-4], lambda whole: whole[:5], lambda whole: b"x" * 100])
 def test_a_damaged_policy_is_refused(tmp_path, damage):
-    save_run(tmp_path)
-    path = tmp_path / "policy" / "seed_0.safetensors"
+    path = tmp_path / "seed_0.safetensors"
+    random_policy(contract()).save(path)
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(InputError, match=r"seed_0\.safetensors is damaged"):
-        load(tmp_path, seed=0)
+        Policy.load(path, contract())
 
 
 def test_a_policy_that_is_not_a_number_is_refused(tmp_path):
@@ -398,9 +300,14 @@ def test_a_policy_of_another_task_is_refused(tmp_path):
         {"observation_parts": [{"key": "a", "shape": [1]}, {"key": None, "shape": [1]}]},
         {"observation_parts": [{"shape": [2]}]},
         {"action_shape": [2]},
+        {"action_shape": [1] * 64},
         {"action_shape": "1"},
         {"action_low": [float("nan")]},
         {"action_low": [2.0]},
+        {"action_low": [-1e300]},
+        {"action_low": [-(10**400)]},
+        {"action_low": ["-1"]},
+        {"action_low": [True]},
         {"action_high": [[1.0]]},
         {"action_high": ["far"]},
     ],
@@ -414,7 +321,7 @@ def test_a_contract_that_is_not_of_the_schema_is_refused(tmp_path, change):
         Contract.load(path)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "null", "{}", "\xff"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "{}", "\xff", "[" * 100_000, '{"a":' * 100_000, "1" * 5000])
 def test_what_is_no_contract_at_all_is_refused(tmp_path, text):
     path = tmp_path / "contract.json"
     path.write_bytes(text.encode("latin1"))
@@ -427,6 +334,52 @@ def test_a_contract_without_a_named_task_is_kept(tmp_path):
     assert Contract.load(tmp_path / "contract.json").task is None
 
 
-def test_a_policy_needs_neither_jax_nor_gymnasium():
-    code = "import csac.deploy.policy, sys; print({'jax', 'gymnasium', 'equinox'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
+def test_a_policy_needs_numpy_and_nothing_else(tmp_path):
+    """What a robot has: Python, NumPy and this package."""
+    policy = random_policy(contract(DICT_PARTS, (2,)))
+    run = RunDirectory.create(tmp_path / "run", Manifest(task="Task-v0", algorithm="csac", seeds=(3,), steps=9))
+    run.contract.parent.mkdir()
+    policy.save(run.policy(3))
+    policy.contract.save(run.contract)
+    code = f"""
+import sys
+
+class NumpyAlone:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] not in sys.stdlib_module_names | {{"numpy", "csac"}}:
+            raise ImportError(f"{{name}} is not there")
+
+sys.meta_path.insert(0, NumpyAlone())
+from csac import InputError, Policy, load
+policy = load({str(run.path)!r})
+action, _ = policy.predict({{"speed": 0.5, "position": [[0.3, 0.4]], "achieved": [0.1, 0.2]}})
+policy.save({str(tmp_path / "again")!r})
+print(*action.tolist())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    expected, _ = policy.predict({"speed": 0.5, "position": [[0.3, 0.4]], "achieved": [0.1, 0.2]})
+    np.testing.assert_array_equal(np.array(done.stdout.split(), np.float32), expected)
+    assert (tmp_path / "again").read_bytes() == run.policy(3).read_bytes()
+
+
+@given(st.data())
+def test_a_changed_file_is_a_policy_or_is_refused_in_one_line(data):
+    """Files of strangers: bytes changed, cut out, put in, in any of the two files."""
+    policy = random_policy(contract(DICT_PARTS, (2,)))
+    with tempfile.TemporaryDirectory() as folder:
+        files = [Path(folder, "policy"), Path(folder, "contract.json")]
+        policy.save(files[0])
+        policy.contract.save(files[1])
+        file = data.draw(st.sampled_from(files))
+        content = file.read_bytes()
+        begin = data.draw(st.integers(0, len(content) - 1))
+        end = begin + data.draw(st.integers(0, 9))
+        file.write_bytes(content[:begin] + data.draw(st.binary(max_size=9)) + content[end:])
+        complaint = ""
+        try:
+            changed = Policy.load(files[0], Contract.load(files[1]))
+            changed.act(np.ones((3, changed.contract.spec.observation_size), np.float32), deterministic=False)
+        except InputError as error:
+            complaint = str(error)
+        assert "\n" not in complaint

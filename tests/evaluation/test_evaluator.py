@@ -11,11 +11,19 @@ import pytest
 from gymnasium import spaces
 
 from csac.deploy.contract import Contract
-from csac.deploy.policy import Policy
+from csac.deploy.policy import Policy, noise_generator
 from csac.evaluation import evaluator
-from csac.evaluation.evaluator import ROWS, EvaluationEpisode, EvaluationFailure, Evaluator, evaluate
+from csac.evaluation.evaluator import (
+    EPISODES_AT_ONCE,
+    EvaluationEpisode,
+    EvaluationFailure,
+    Evaluator,
+    evaluate,
+    evaluate_episodes,
+)
 from csac.tasks.environment import Environment
 from csac.tasks.making import Task
+from csac.tasks.physics import Noise
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 
@@ -114,10 +122,12 @@ def test_episode_j_is_reset_with_the_first_seed_plus_j():
 def test_an_episode_depends_on_no_other(deterministic):
     policy = policy_for(Lottery, weight=0.7)
     few = Evaluator(Lottery, episodes=3).run(policy, deterministic)
-    many = Evaluator(Lottery, episodes=2 * ROWS + 3).run(policy, deterministic)
-    again = Evaluator(Lottery, episodes=3, first_seed=EVALUATION_SEED + ROWS).run(policy, deterministic)
+    many = Evaluator(Lottery, episodes=2 * EPISODES_AT_ONCE + 3).run(policy, deterministic)
+    again = Evaluator(Lottery, episodes=3, first_seed=EVALUATION_SEED + EPISODES_AT_ONCE).run(policy, deterministic)
     assert few == many[:3]
-    assert [episode[1:] for episode in again] == [episode[1:] for episode in many[ROWS : ROWS + 3]]
+    assert [episode[1:] for episode in again] == [
+        episode[1:] for episode in many[EPISODES_AT_ONCE : EPISODES_AT_ONCE + 3]
+    ]
     assert len({episode.episode_return for episode in many}) == len(many)
 
 
@@ -136,11 +146,61 @@ def test_an_evaluation_can_be_repeated(task):
 def test_stochastic_actions_are_those_of_the_episode():
     policy = policy_for(Lottery, log_std=-1.0)
     (episode,) = Evaluator(Lottery, episodes=1).run(policy, deterministic=False)
-    generator = np.random.default_rng(EVALUATION_SEED)
+    generator = noise_generator(EVALUATION_SEED)
     noise = [generator.standard_normal(2, dtype=np.float32) for _ in range(episode.length)]
     # Actions 1 + 2 tanh(noise / e) in each of two dimensions.
     expected = sum(float(np.sum(1 + 2 * np.tanh(np.exp(-1.0) * part))) for part in noise)
     assert episode.episode_return == pytest.approx(expected, rel=1e-5)
+
+
+class Wind(gymnasium.Env):
+    """The reward is action times wind, which no observation shows: its mean is 0 whatever the policy."""
+
+    observation_space = spaces.Box(-9.0, 9.0, (1,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        wind = self.np_random.standard_normal(dtype=np.float32)
+        return np.zeros(1, np.float32), float(action[0] * wind), False, self.steps == 10, {}
+
+
+def test_what_a_policy_draws_has_nothing_to_do_with_what_its_task_draws():
+    returns = evaluate(policy_for(Wind), Wind, episodes=200, deterministic=False)
+    assert abs(returns.mean()) < 3 * returns.std() / np.sqrt(200)
+
+
+def test_a_policy_of_a_seed_draws_nothing_that_a_task_of_that_seed_draws():
+    policy, environment = policy_for(Wind), Environment(Wind)
+    products = []
+    for seed in range(200):
+        observation = environment.reset(seed)
+        chooser = Policy(policy.network, policy.contract, seed=seed)
+        for _ in range(10):
+            action, _ = chooser.predict(observation, deterministic=False)
+            products.append(environment.step(action)[1])
+    assert abs(np.mean(products)) < 3 * np.std(products) / np.sqrt(len(products))
+
+
+@pytest.mark.parametrize("seed", [0, 7, EVALUATION_SEED])
+def test_task_policy_and_noise_have_streams_of_their_own(seed):
+    noise = Noise()
+    noise.set({"observation_noise": 1.0, "action_noise": 1.0}, seed)
+    zeros, ones = np.zeros(100, np.float32), np.full(100, 1e9, np.float32)
+    children = np.random.default_rng(seed).spawn(3)  # as a task may have generators of its own
+    streams = [
+        noise.on_observation(zeros),
+        noise.on_action(zeros, -ones, ones) / 1e9,
+        noise_generator(seed).standard_normal(100, dtype=np.float32),
+        *(generator.standard_normal(100, dtype=np.float32) for generator in [np.random.default_rng(seed), *children]),
+    ]
+    correlations = np.corrcoef(streams) - np.eye(len(streams))
+    assert np.abs(correlations).max() < 0.5
 
 
 def test_the_environments_are_made_once_and_only_as_many_as_needed():
@@ -158,7 +218,7 @@ def test_the_environments_are_made_once_and_only_as_many_as_needed():
     assert len(made) == 3
     evaluator = Evaluator(task, episodes=35)
     evaluator.run(policy)
-    assert len(made) == 3 + ROWS
+    assert len(made) == 3 + EPISODES_AT_ONCE
 
 
 @pytest.mark.parametrize("key", ["is_success", "success"])
@@ -166,6 +226,35 @@ def test_success_is_what_the_last_step_says(key):
     for bias, success in ((9.0, 1.0), (0.0, 0.0)):
         episodes = Evaluator(Goal, {"success_key": key}, episodes=2).run(policy_for(Goal, bias=bias))
         assert [episode.success for episode in episodes] == [success, success]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "success"),
+    [
+        *((verdict, None) for verdict in ("no", b"yes", None, float("nan"), [], object(), {})),
+        *((verdict, 0.0) for verdict in (False, 0.0, np.array([True, False]))),
+        *((verdict, 1.0) for verdict in (np.True_, 1, [[True], [True]])),
+    ],
+)
+def test_success_is_a_boolean_or_a_number_or_it_is_not_known(verdict, success):
+    def task() -> gymnasium.Env:
+        environment = probes.ConstantReward()
+        step = environment.step
+        environment.step = lambda action: (*step(action)[:4], {"is_success": verdict})
+        return environment
+
+    (episode,) = Evaluator(task, episodes=1).run(policy_for(probes.ConstantReward))
+    assert episode.success == success
+
+
+def test_episodes_are_offered_with_all_that_is_known_of_them():
+    policy = policy_for(Goal, bias=9.0)
+    for evaluated in (policy, Foreign(policy)):
+        episodes = evaluate_episodes(evaluated, Goal, episodes=3, events=("is_success", "missing"))
+        assert episodes == [
+            EvaluationEpisode(number, 2.0, 2, 1.0, {"is_success": True, "missing": None}) for number in range(3)
+        ]
+    np.testing.assert_array_equal(evaluate(policy, Goal, episodes=3), [2.0, 2.0, 2.0])
 
 
 @pytest.mark.parametrize(

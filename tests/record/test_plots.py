@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 
@@ -6,7 +7,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from csac.record import plots
 from csac.record.plots import learning_curve
 
 
@@ -30,29 +30,61 @@ def figures(monkeypatch):
     return drawn
 
 
+def band(axes, step):
+    """Where the only band is at a step."""
+    (area,) = axes.collections
+    heights = [y for x, y in area.get_paths()[0].vertices if x == step]
+    return min(heights), max(heights)
+
+
 def test_equal_rows_give_equal_files_whatever_the_users_style(tmp_path):
-    learning_curve([("csac", evaluations())], tmp_path / "a.png", "Ant-v4", pdf=True)
+    learning_curve([("csac", evaluations())], tmp_path / "a.png", "Ant-v4", formats=("png", "pdf", "svg"))
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "black", "savefig.transparent": True}):
-        learning_curve([("csac", evaluations())], tmp_path / "b.png", "Ant-v4", pdf=True)
+        learning_curve([("csac", evaluations())], tmp_path / "b.png", "Ant-v4", formats=("png", "pdf", "svg"))
         assert matplotlib.rcParams["font.size"] == 30
-    for kind, start in ((".png", b"\x89PNG"), (".pdf", b"%PDF")):
+    for kind, start in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<?xml")):
         content = (tmp_path / f"a{kind}").read_bytes()
         assert content.startswith(start)
         assert content == (tmp_path / f"b{kind}").read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pdf", "a.png", "b.pdf", "b.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pdf", "a.png", "a.svg", "b.pdf", "b.png", "b.svg"]
 
 
-def test_a_run_is_its_mean_its_band_and_its_seeds(tmp_path, figures):
+def test_three_seeds_are_shown_with_their_range_and_their_mean(tmp_path, figures):
     rows = evaluations(seeds=3, points=4)
     learning_curve([("csac", rows)], tmp_path / "curve.png", "Ant-v4")
     axes = figures[0].axes[0]
-    assert len(axes.collections) == 1
     *single, mean = axes.lines
     by_seed = rows["return"].reshape(4, 3).T
     np.testing.assert_allclose([line.get_ydata() for line in single], by_seed)
     np.testing.assert_allclose(mean.get_ydata(), by_seed.mean(axis=0))
     np.testing.assert_array_equal(mean.get_xdata(), [5000, 10000, 15000, 20000])
     assert mean.get_linewidth() > single[0].get_linewidth()
+    for step, returns in zip((5000, 10000, 15000, 20000), by_seed.T, strict=True):
+        assert band(axes, step) == pytest.approx((returns.min(), returns.max()))
+    assert axes.texts[0].get_text() == "line: mean over seeds · thin: single seeds · band: their range"
+
+
+def test_five_seeds_are_shown_by_their_mean_and_its_interval(tmp_path, figures):
+    rows = evaluations(seeds=5, points=1)
+    rows["return"] = [2.0, 4.0, 6.0, 8.0, 10.0]  # t(0.975, 4) sqrt(10 / 5) = 2.776445 * 1.414214 = 3.926486
+    learning_curve([("csac", rows)], tmp_path / "curve.png")
+    axes = figures[0].axes[0]
+    assert len(axes.lines) == 1
+    assert band(axes, 5000) == pytest.approx((6 - 3.926486, 6 + 3.926486))
+    assert axes.texts[0].get_text() == "line: mean over seeds · band: 95 % t-interval"
+
+
+def test_two_seeds_have_no_band(tmp_path, figures):
+    learning_curve([("csac", evaluations(seeds=2))], tmp_path / "curve.png")
+    axes = figures[0].axes[0]
+    assert (len(axes.lines), len(axes.collections)) == (3, 0)
+    assert axes.texts[0].get_text() == "line: mean over seeds · thin: single seeds"
+
+
+def test_a_picture_of_few_and_many_seeds_says_which_band_is_which(tmp_path, figures):
+    learning_curve([("few", evaluations(3)), ("many", evaluations(5))], tmp_path / "curve.png")
+    note = "line: mean over seeds · thin: single seeds · band: their range, from 5 seeds 95 % t-interval"
+    assert figures[0].axes[0].texts[0].get_text() == note
 
 
 def test_one_seed_has_neither_band_nor_thin_lines(tmp_path, figures):
@@ -74,10 +106,10 @@ def test_every_run_is_in_the_legend_under_its_own_label_and_look(tmp_path, figur
 
 
 def test_a_wide_band_does_not_flatten_the_curves(tmp_path, figures):
-    rows = evaluations(seeds=2, points=2)
-    rows["return"] = [0.0, 100.0, 0.0, 100.0]  # t(0.975, 1) = 12.7: the band reaches to 50 ± 635
+    rows = evaluations(seeds=5, points=2)
+    rows["return"] = [0.0, 0.0, 0.0, 0.0, 100.0] * 2  # the band reaches to 20 ± 56
     learning_curve([("csac", rows)], tmp_path / "curve.png")
-    assert figures[0].axes[0].get_ylim() == pytest.approx((-25.0, 125.0))
+    assert figures[0].axes[0].get_ylim()[0] == -25.0
 
 
 def test_marks_are_vertical_lines_with_their_text(tmp_path, figures):
@@ -106,16 +138,21 @@ def test_nothing_to_draw_is_said(tmp_path, figures, runs):
     assert [text.get_text() for text in figures[0].axes[0].texts] == ["no evaluations yet"]
 
 
-@pytest.mark.parametrize(
-    ("step", "text"), [(0, "0"), (500, "500"), (5000, "5k"), (12_500, "12.5k"), (1_000_000, "1M"), (1_500_000, "1.5M")]
-)
-def test_steps_are_written_as_people_say_them(step, text):
-    assert plots._short(step) == text
-
-
 def test_pictures_need_neither_pyplot_nor_jax():
     code = (
         "import sys, csac.record.plots; print([name for name in ('matplotlib.pyplot', 'jax') if name in sys.modules])"
     )
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "[]"
+
+
+def test_a_wrong_choice_of_window_stops_no_picture(tmp_path):
+    path = tmp_path / "curve.png"
+    code = (
+        "import os, numpy as np; from csac.record.plots import learning_curve; "
+        f"learning_curve([], {str(path)!r}); print(os.environ['MPLBACKEND'])"
+    )
+    environment = {**os.environ, "MPLBACKEND": "no_such_window"}
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert answer.stdout.strip() == "no_such_window"
+    assert path.read_bytes().startswith(b"\x89PNG")

@@ -321,6 +321,7 @@ def test_a_line_cut_by_a_crash_is_left_out_and_then_overwritten(run, kept):
         ("seed,step\n1,x\n", "damaged .*'x'"),
         ("seed,step,loss\n1,1,low\n", "damaged .*'low'"),
         ("seed,step\n,1\n", "damaged"),
+        (f"seed,step\n1,{10**30}\n", "damaged"),
     ],
 )
 def test_a_damaged_table_is_refused(tmp_path, content, error):

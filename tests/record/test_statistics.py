@@ -3,14 +3,19 @@ import pytest
 from scipy import stats
 
 from csac.record.statistics import (
+    best_returns,
+    dispersion_across,
     evaluation_matrix,
+    improvement_interval,
     interquartile_mean,
     is_case,
     last_evaluations,
     maximum_average_return,
     mean_and_interval,
-    mean_told,
-    recovery,
+    mean_over_episodes,
+    mean_returns,
+    performance_profile,
+    probability_of_improvement,
     stratified_bootstrap_interval,
 )
 from csac.types import InputError
@@ -122,96 +127,79 @@ def test_the_last_evaluations_are_each_seeds_own():
     assert last_evaluations(rows_of()) == {}
 
 
-def curve(*returns, seed=0):
-    """One seed's evaluations at 100, 200, ..."""
-    return [(seed, 100 * (number + 1), value) for number, value in enumerate(returns)]
-
-
-def test_recovery_worked_by_hand():
-    """A perturbation after step 400; 90 % of the return before are 90.
-
-    before = (90 + 100 + 110) / 3 = 100; lowest 40, so the drop is 60; it is below 90 at 500 and 600 and back at 700;
-    losses 0 60 20 5 0 at 400, 500, ...: area = 100 (30 + 40 + 12.5 + 2.5) = 8500; final = (80 + 95 + 120) / 3;
-    the largest fall from the highest so far is from 110 to 40.
-    """
-    rows = rows_of(*curve(50.0, 90.0, 100.0, 110.0, 40.0, 80.0, 95.0, 120.0))
-    (one,) = recovery(rows, 400).values()
-    assert one._asdict() == pytest.approx(
-        {
-            "before": 100.0,
-            "drop": 60.0,
-            "relative_drop": 0.6,
-            "steps_to_regain": 300.0,
-            "area_lost": 8500.0,
-            "final": 295 / 3,
-            "worst_drawdown": 70.0,
-        }
-    )
-
-
-def test_a_return_that_never_drops_loses_nothing():
-    one = recovery(rows_of(*curve(90.0, 100.0, 110.0, 101.0, 100.0)), 300)[0]
-    assert (one.before, one.drop, one.relative_drop, one.steps_to_regain, one.area_lost) == (100, 0, 0, 0, 0)
-    assert one.worst_drawdown == 10.0
-
-
-def test_a_drop_to_nine_tenths_is_none_to_regain():
-    one = recovery(rows_of(*curve(100.0, 100.0, 90.0, 95.0)), 200)[0]
-    assert (one.drop, one.steps_to_regain) == (10.0, 0.0)
-    assert one.area_lost == 100 * (5 + 7.5)
-
-
-def test_a_late_fall_is_regained_late_and_one_that_lasts_never():
-    assert recovery(rows_of(*curve(100.0, 95.0, 99.0, 80.0, 89.9, 90.0, 0.0)), 100)[0].steps_to_regain == 500.0
-    assert recovery(rows_of(*curve(100.0, 50.0, 89.0)), 100)[0].steps_to_regain == np.inf
-
-
-def test_the_recovery_of_negative_returns():
-    """Of -100, 90 % are -110; the drop is a share of 100."""
-    one = recovery(rows_of(*curve(-100.0, -150.0, -111.0, -110.0)), 100)[0]
-    assert (one.drop, one.relative_drop, one.steps_to_regain) == (50.0, 0.5, 300.0)
-    assert one.area_lost == pytest.approx(100 * (25 + 30.5 + 10.5))
-    assert np.isnan(recovery(rows_of(*curve(0.0, -1.0)), 100)[0].relative_drop)
-
-
-def test_the_drop_of_small_returns_is_a_share_of_them():
-    assert recovery(rows_of(*curve(0.5, 0.1)), 100)[0].relative_drop == pytest.approx(0.8)
-    assert recovery(rows_of(*curve(-0.5, -1.0)), 100)[0].relative_drop == pytest.approx(1.0)
-
-
-def test_final_and_before_stay_between_their_perturbations():
-    """After step 200; the one before it was after step 100."""
-    one = recovery(rows_of(*curve(100.0, 60.0, 30.0, 40.0)), 200, since=100)[0]
-    assert (one.before, one.drop, one.final) == (60.0, 30.0, 35.0)
-
-
 def test_silence_is_a_no_in_cases_and_unknown_in_numbers():
     cases, counts = np.array([1.0, np.nan, np.nan, 0.0]), np.array([3.0, np.nan, 1.0])
     assert (is_case(cases), is_case(counts), is_case(np.array([np.nan]))) == (True, False, False)
-    assert (mean_told(cases, True), mean_told(counts, False)) == (0.25, 2.0)
-    assert np.isnan(mean_told(np.array([np.nan]), False))
+    assert (mean_over_episodes(cases, True), mean_over_episodes(counts, False)) == (0.25, 2.0)
+    assert np.isnan(mean_over_episodes(np.array([np.nan]), False))
 
 
-def test_recovery_begins_between_evaluations():
-    """After step 150: no loss there, 20 at 200 and 10 at 300: 50 / 2 * 20 + 100 * 15."""
-    one = recovery(rows_of(*curve(100.0, 80.0, 90.0)), 150)[0]
-    assert (one.before, one.area_lost, one.steps_to_regain) == (100.0, 2000.0, 150.0)
+def test_the_mean_and_the_best_return_of_each_seed():
+    episodes = [{"seed": 4, "step": 100, "return": value, "success": None} for value in (1.0, 2.0, 6.0)]
+    assert mean_returns([*episodes, {"seed": 2, "step": 100, "return": -1.0}]) == {2: -1.0, 4: 3.0}
+    assert mean_returns([]) == {}
+    # Seed 0 has means 2 and 4, not the 7 of a single episode; seed 1 has -5, and one evaluation that says nothing.
+    rows = rows_of((0, 100, 2.0), (0, 200, 1.0), (0, 200, 7.0), (1, 100, -5.0), (1, 200, np.nan))
+    assert best_returns(rows) == {0: 4.0, 1: -5.0}
 
 
-def test_recovery_with_too_few_evaluations():
-    rows = rows_of(*curve(4.0, 2.0))
-    nothing_before, nothing_after = recovery(rows, 50)[0], recovery(rows, 200)[0]
-    np.testing.assert_array_equal(nothing_before, [np.nan] * 5 + [3.0, 2.0])
-    np.testing.assert_array_equal(nothing_after, [3.0] + [np.nan] * 4 + [3.0, 2.0])
-    assert recovery(rows, 100)[0].before == 4.0
-    assert recovery(rows_of(), 100) == {}
+def test_the_probability_of_improvement_worked_by_hand():
+    # Pairs of 3, 5 with 1, 3, 4: 3 > 1, 3 = 3, 3 < 4 and 5 above all: (1 + 0.5 + 0 + 3) / 6
+    x, y = np.array([3.0, 5.0]), np.array([1.0, 3.0, 4.0])
+    assert probability_of_improvement(x, y) == pytest.approx(4.5 / 6)
+    assert probability_of_improvement(y, x) == pytest.approx(1.5 / 6)
+    assert probability_of_improvement(x, x) == 0.5
+    assert probability_of_improvement(x, np.array([4.0, np.nan])) == 0.5  # of 3 < 4 and 5 > 4
+    assert np.isnan(probability_of_improvement(x, np.array([np.nan])))
 
 
-def test_recovery_is_each_seeds_own_and_ends_where_it_is_told():
-    rows = rows_of(*curve(10.0, 5.0, 9.0, 1.0), *curve(20.0, np.nan, 4.0, 30.0, seed=7))
-    whole, part = recovery(rows, 100), recovery(rows, 100, until=300)
-    assert {seed: one.drop for seed, one in whole.items()} == {0: 9.0, 7: 16.0}
-    assert {seed: one.drop for seed, one in part.items()} == {0: 5.0, 7: 16.0}
-    assert {seed: one.final for seed, one in part.items()} == {0: 7.0, 7: 4.0}
-    assert {seed: one.steps_to_regain for seed, one in part.items()} == {0: 200.0, 7: np.inf}
-    assert whole[7].area_lost == 200 * 8 + 100 * 8
+def test_tasks_weigh_the_same_in_the_probability_of_improvement():
+    # Task 0: 1 of 1 pair; task 1: none of 2 pairs, for a NaN takes one away in task 0.
+    x, y = np.array([[2.0, 0.0], [np.nan, 0.0]]), np.array([[1.0, 5.0]])
+    assert probability_of_improvement(x, y) == 0.5
+
+
+def test_the_interval_of_improvement():
+    low, high = improvement_interval(np.arange(10.0), np.arange(10.0)) or (0.0, 0.0)
+    assert 0.2 < low < 0.35
+    assert 0.65 < high < 0.8
+    assert improvement_interval(np.arange(5.0) + 100, np.arange(5.0)) == (1.0, 1.0)
+    assert improvement_interval(np.arange(5.0), np.arange(4.0)) is None
+
+
+def test_the_performance_profile_worked_by_hand():
+    # Of 1, 2, 2, 4 three are above 1, one is above 2 (an equal one is not), none above 4.
+    scores = np.array([[1.0, 2.0], [2.0, 4.0], [np.nan, np.nan]])
+    np.testing.assert_allclose(performance_profile(scores, np.array([0.0, 1.0, 2.0, 4.0])), [1, 0.75, 0.25, 0])
+
+
+def test_dispersion_across_runs_worked_by_hand():
+    # At 100: quartiles of 0, 1, 2, 3, 4 are 1 and 3, range 2. At 200: of 0, 10, 20, 30, 40 range 20. At 300 one lacks.
+    returns = np.array([[n, 10 * n, n] for n in (0.0, 1.0, 2.0, 3.0, 4.0)])
+    returns[2, 2] = np.nan
+    assert dispersion_across(returns) == pytest.approx((2 + 20) / 2)
+    assert np.isnan(dispersion_across(returns[:1]))
+    assert np.isnan(dispersion_across(np.full((2, 3), np.nan)))
+
+
+# What rliable 1.2.0 gives for these scores [seed, task] of two algorithms with six and five seeds.
+
+FIRST = np.array([[0, 5, 10], [7, 4, 1], [6, 6, 6], [8, 0, 3], [2, 8, 3], [10, 8, 6]], float)
+SECOND = np.array([[1, 5, 9], [6, 1, 7], [10, 7, 4], [2, 1, 0], [4, 5, 6]], float)
+
+
+def test_point_estimates_are_those_of_rliable():
+    assert interquartile_mean(FIRST) == pytest.approx(5.4)
+    assert interquartile_mean(SECOND) == pytest.approx(4.444444444444445)
+    assert probability_of_improvement(FIRST, SECOND) == pytest.approx(0.55)
+    thresholds = np.array([0, 2, 4.5, 5, 9])
+    shares = [0.88888889, 0.77777778, 0.61111111, 0.55555556, 0.11111111]
+    np.testing.assert_allclose(performance_profile(FIRST, thresholds), shares)
+    shares = [0.93333333, 0.66666667, 0.53333333, 0.4, 0.06666667]
+    np.testing.assert_allclose(performance_profile(SECOND, thresholds), shares)
+
+
+def test_intervals_are_those_of_rliable():
+    # rliable's own, of 50,000 and 5,000 resamples: (3.5, 6.9) and (0.344, 0.75); these resamples are others.
+    assert stratified_bootstrap_interval(FIRST, interquartile_mean) == pytest.approx((3.5, 6.9), abs=0.15)
+    assert improvement_interval(FIRST, SECOND) == pytest.approx((0.344, 0.75), abs=0.02)

@@ -68,6 +68,11 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
         ("probes:ConstantRewards-v0", "did you mean ConstantReward-v0"),
         ("CartPole-v1", r"CartPole-v1: the action space is Discrete\(2\)"),
         (lambda: 3, "gave a int: a task's callable returns a gymnasium.Env"),
+        (probes.Endless(), r"already made \(Endless\).*a function that makes one"),
+        (gymnasium.wrappers.TimeLimit(probes.Endless(), 3), r"already made \(TimeLimit\)"),
+        (5, "a Gymnasium id or a function that makes an environment, not 5"),
+        (None, "a Gymnasium id or a function"),
+        (gymnasium.wrappers.TimeLimit, "TimeLimit could not be made: TypeError"),
     ],
 )
 def test_a_task_that_cannot_be_learnt_is_refused(task, message):
@@ -99,6 +104,19 @@ def test_a_task_that_cannot_be_learnt_is_refused(task, message):
 def test_a_space_that_cannot_be_learnt_is_refused(name, space, message):
     with pytest.raises(InputError, match=message):
         scripted(**{name: space})
+
+
+def test_the_advice_for_actions_without_bounds_works():
+    def task() -> gymnasium.Env:
+        return Scripted(action_space=spaces.Box(-np.inf, np.inf, (2,)))
+
+    with pytest.raises(InputError) as refusal:
+        Environment(task)
+    advice = str(refusal.value).rpartition("give it some, as ")[2].removesuffix(" does")
+    bounded = Environment(lambda: eval(advice, {"gymnasium": gymnasium, "environment": task()}))
+    bounded.reset(0)
+    bounded.step(np.array([0.5, -2.0], np.float32))
+    np.testing.assert_array_equal(bounded.raw.unwrapped.actions, [[0.5, -1.0]])  # pyright: ignore
 
 
 @pytest.mark.parametrize(
@@ -437,6 +455,21 @@ def test_a_stopped_seed_steps_no_more():
     assert environments.alive.tolist() == [False, True]
     _, second = steps_of(environments, 2)
     assert [failure.index for failure in second.failures] == [1]
+
+
+@pytest.mark.parametrize("wrapper", ["NormalizeObservation", "NormalizeReward"])
+def test_a_wrapper_that_learns_by_itself_is_told_once(wrapper, caplog, monkeypatch):
+    monkeypatch.setattr("csac.tasks.environment._said", set())
+
+    def wrapped() -> gymnasium.Env:
+        environment = getattr(gymnasium.wrappers, wrapper)(probes.Endless())
+        return gymnasium.wrappers.TimeLimit(environment, 9)
+
+    for _ in range(3):
+        Environment(wrapped).close()
+    Environment(lambda: gymnasium.wrappers.RecordEpisodeStatistics(probes.Endless()))
+    (message,) = caplog.messages
+    assert message.startswith(f"note: wrapped: {wrapper} keeps statistics of its own")
 
 
 # What is printed

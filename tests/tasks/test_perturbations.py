@@ -20,13 +20,22 @@ from logs import log_lines
 from resuming import LEARNERS, Crash, contents, crash_at, run
 from trajectories import steps_of
 
+from csac.deploy.choosing import load
 from csac.deploy.contract import Contract
-from csac.deploy.policy import Policy, load
+from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import Evaluator, evaluate
 from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
-from csac.tasks.perturbations import Perturbation, by_step, continued, lasting, perturbations_of, refuse_late, values_at
+from csac.tasks.perturbations import (
+    Perturbation,
+    by_step,
+    constant_perturbations,
+    continued,
+    perturbations_of,
+    refuse_late,
+    values_at,
+)
 from csac.tasks.seeds import EVALUATION_SEED, SeedEnvironments
 from csac.tasks.snapshots import _mujoco_arrays
 from csac.training import messages
@@ -117,7 +126,7 @@ def test_what_changes_nothing_is_refused():
     with pytest.raises(InputError, match="friction=2@100 would change nothing: the run ends at step 100"):
         refuse_late(perturbations_of("friction=2@100"), 100)
     with pytest.raises(InputError, match=r"friction=2@1: nothing is learnt here.*leave out @1"):
-        lasting("friction=2@1")
+        constant_perturbations("friction=2@1")
 
 
 def test_a_fork_keeps_what_had_happened_and_takes_what_is_to_come():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from scipy.stats import chisquare
+from scipy.stats import chisquare, kstest, uniform
 from trainer import run
 
 from csac.algorithms import CSAC, SAC
@@ -117,7 +118,7 @@ class Watcher:
         return Seen(drawn, jnp.zeros(100), jnp.zeros((spec.observation_size, 2 * spec.action_size)))
 
     def act(self, state, observation, key, explore):
-        return jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)
+        return jnp.sum(state.times)[None] / 100  # says how many updates its policy is made of
 
     def update(self, state, batch, key, step):
         drawn, times = state.drawn.at[step].set(batch.observation), state.times.at[step].add(1)
@@ -152,6 +153,51 @@ def test_the_loop_remembers_what_happened(watched):
         np.testing.assert_array_equal(last_action[number == 0], 0)
 
 
+def actions_of(rows) -> np.ndarray:
+    """The actions in packed rows, in the order of the steps."""
+    return rows[:, 4]
+
+
+def test_the_policy_acts_that_has_learnt_from_the_newest_step(watched):
+    # The action of row k was chosen after k steps, the 10th of which was the first that two updates followed.
+    for rows in watched.memories:
+        np.testing.assert_allclose(actions_of(rows)[10:], 2 * (np.arange(10, 30) - 9) / 100, atol=1e-6)
+
+
+def test_the_updates_of_an_interval_act_from_its_end():
+    # Learning after the steps 12, 16 and 20; those from the end of the warm-up to there act with the first policy.
+    rows = run(Watcher(updates_per_interval=4, update_interval=4), probes.IdEncoded, 22, (3,)).memories[0]
+    expected = [0.0] * 2 + [0.04] * 4 + [0.08] * 4
+    np.testing.assert_allclose(actions_of(rows)[10:20], expected, atol=1e-6)
+
+
+def test_actions_of_the_warm_up_are_uniform_and_each_seed_draws_its_own():
+    first, second = map(actions_of, run(Watcher(warmup_steps=301), probes.IdEncoded, 300, SEEDS).memories)
+    assert len({*first.tolist(), *second.tolist()}) == 600
+    assert kstest(np.concatenate([first, second]), uniform(-1.0, 2.0).cdf).pvalue > 0.01
+
+
+@pytest.mark.parametrize(
+    ("often", "steps", "earlier"), [({"updates_per_step": 2}, 12, 11), ({"update_interval": 2}, 14, 12)]
+)
+def test_a_periodic_reference_counts_updates_whatever_the_steps(often, steps, earlier):
+    # Six updates in all: the reference was renewed before the fifth, as a copy of the actor after four.
+    algorithm = CSAC(
+        reference_period=4,
+        warmup_steps=10,
+        batch_size=8,
+        actor_learning_rate=0.01,
+        actor_hidden_sizes=(4,),
+        critic_hidden_sizes=(4,),
+        **often,
+    )
+    (state,) = run(algorithm, probes.ObservationReward, steps).states
+    (before,) = run(algorithm, probes.ObservationReward, earlier).states
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5), state.reference, before.actor)
+    assert not np.allclose(state.actor.layers[0].weight, before.actor.layers[0].weight)
+    assert not np.allclose(before.reference.layers[0].weight, before.actor.layers[0].weight)
+
+
 def test_updates_are_counted_from_the_end_of_the_warm_up(watched):
     # Two updates after each of the steps 10, 11, ... 30, numbered from 0.
     for state in watched.states:
@@ -175,6 +221,9 @@ class RolloutWatcher(Watcher):
 
     def memory(self, spec, steps):
         return Rollout.create(self.update_interval, spec)
+
+    def act(self, state, observation, key, explore):
+        return jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0)
 
 
 def test_a_rollout_reaches_its_update_whole_and_in_order():

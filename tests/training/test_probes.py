@@ -62,7 +62,7 @@ def best_action(algorithm, state, observation: float) -> float:
 def entropy(policy: TanhGaussian) -> float:
     """The entropy of a policy of one action dimension, by Gauss-Hermite quadrature."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(60)
-    log_prob = jax.vmap(lambda noise: policy.log_prob(policy.pre_tanh(noise)))(jnp.array(nodes, jnp.float32)[:, None])
+    log_prob = jax.vmap(policy.log_prob)(jnp.array(nodes, jnp.float32)[:, None])
     return -float(weights @ np.asarray(log_prob) / weights.sum())
 
 
@@ -114,6 +114,28 @@ def test_entropy_has_its_weight_in_the_value(algorithm):
     np.testing.assert_allclose(values(state, 0.0), (1 + DISCOUNT * policy_entropy) / (1 - DISCOUNT), atol=0.6)
 
 
+class Onward(probes.Endless):
+    """Observation 0, then 1 for ever, which is the reward of the next step; truncated after two steps, at 1 again.
+
+    With a discount γ the value at 1 is 1 / (1 - γ) and at 0 it is γ / (1 - γ). It would be 1 / (1 - γ²) at 1, did the
+    first observation of the next episode stand for the last of this one, and 1 if nothing followed.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(length=2)
+
+    def step(self, action: np.ndarray) -> probes.Result:
+        reward = float(self.observation[0])
+        self.observation = np.ones(1, np.float32)
+        return self.observation, reward, *super().step(action)[2:]
+
+
+def test_a_truncated_episode_goes_on_from_its_last_observation(algorithm):
+    state = run(algorithm, Onward, 2000).states[0]
+    np.testing.assert_allclose(values(state, 1.0), 10.0, atol=0.4)
+    np.testing.assert_allclose(values(state, 0.0), 9.0, atol=0.4)
+
+
 PPO_SETTINGS: dict[str, Any] = {
     "discount": DISCOUNT,
     "learning_rate": 3e-3,
@@ -134,6 +156,7 @@ PPO_SETTINGS: dict[str, Any] = {
         (probes.DelayedReward, 1536, {0.0: DISCOUNT, 1.0: 1.0}),
         # As above: 10, not 3.57. Rollouts of 128 steps end within an episode of 10 as well.
         (probes.Endless, 3072, {0.0: 10.0}),
+        (Onward, 6144, {0.0: 9.0, 1.0: 10.0}),
     ],
 )
 def test_ppo_learns_known_values(probe, steps, expected):

@@ -311,7 +311,7 @@ def test_a_table_that_was_changed_is_told_of_and_restored(tmp_path, finished, sp
     path.write_bytes(spoil(before))
     assert path.read_bytes() != before
     (entry,) = resume(finished, steps=200).manifest.history
-    assert entry.complaints == [f"{path} had changed since the checkpoint; it is restored"]
+    assert entry.complaints == (f"{path} had changed since the checkpoint; it is restored",)
     assert entry.exact
     assert path.read_bytes().startswith(before)
 
@@ -327,7 +327,7 @@ def test_tables_that_are_gone_come_back(finished):
 def test_a_table_s_copy_that_is_damaged_is_not_needed(finished):
     (finished / "checkpoint" / "step_130.evaluations.csv").write_bytes(b"")
     (entry,) = resume(finished, steps=200).manifest.history
-    assert (entry.step, entry.complaints) == (130, [])
+    assert (entry.step, entry.complaints) == (130, ())
 
 
 def test_a_table_that_is_damaged_with_its_copy_costs_a_checkpoint_and_no_more(tmp_path, finished):
@@ -346,7 +346,7 @@ def test_a_best_policy_that_is_damaged_once_comes_back(finished, where):
     before = best.read_bytes()
     flip(finished / where)
     (entry,) = resume(finished, steps=140).manifest.history
-    assert (entry.step, entry.complaints) == (130, [])
+    assert (entry.step, entry.complaints) == (130, ())
     assert Checkpoint.open(finished / "checkpoint", 130).read("step_130.seed_0.best.safetensors") == before
 
 
@@ -369,7 +369,7 @@ def test_transitions_that_are_damaged_in_one_place_are_mended(tmp_path, finished
     shard.write_bytes(before[:1000] + bytes(4096) + before[5096:])
     (entry,) = resume(finished, steps=500).manifest.history
     assert (entry.step, entry.exact) == (130, True)
-    assert entry.complaints == [f"{shard} was damaged in one place; it is mended from its parity"]
+    assert entry.complaints == (f"{shard} was damaged in one place; it is mended from its parity",)
     assert contents(finished)["policy/seed_0.safetensors"] == uninterrupted["policy/seed_0.safetensors"]
 
 

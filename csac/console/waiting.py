@@ -1,0 +1,81 @@
+"""How fast something goes, and what is shown while it takes its time."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from csac.console.tables import duration
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from rich.console import Console
+
+SECONDS_OF_SILENCE = 30.0  # between two lines where there is no terminal
+SPEED_WINDOW = 20.0  # seconds that the shown speed looks back
+
+
+class Speed:
+    """Steps per second over the last `SPEED_WINDOW` seconds."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._samples: deque[tuple[float, int]] = deque()
+
+    def add(self, total: int) -> None:
+        """Note the number of steps made so far."""
+        now = self._clock()
+        self._samples.append((now, total))
+        while now - self._samples[1 if len(self._samples) > 2 else 0][0] > SPEED_WINDOW:
+            self._samples.popleft()
+
+    def per_second(self) -> float | None:
+        """Return the speed, or None as long as there is too little to tell."""
+        if len(self._samples) < 2:
+            return None
+        (begin, first), (end, last) = self._samples[0], self._samples[-1]
+        return (last - first) / (end - begin) if end > begin and last > first else None
+
+
+@contextmanager
+def progress_shown(
+    console: Console, doing: str, unit: str, clock: Callable[[], float] = time.monotonic
+) -> Iterator[Callable[[int, int | None], None]]:
+    """Show that something is being done; yield what is to be called with how much is done, and of how much if known.
+
+    On a terminal it is one line that changes, with the time that the rest will take; elsewhere a line now and then.
+    """
+    speed, spoke = Speed(clock), clock()
+    speed.add(0)
+    status = console.status(doing) if console.is_interactive else None
+
+    def show(done: int, total: int | None = None) -> None:
+        nonlocal spoke
+        speed.add(done)
+        text = f"{doing}: {_amount(done, total)} {unit}{_pace(speed.per_second(), done, total, unit)}"
+        if status:
+            status.update(text)
+        elif clock() - spoke >= SECONDS_OF_SILENCE:
+            console.print(text, soft_wrap=True)
+            spoke = clock()
+
+    if status is None:
+        yield show
+        return
+    with status:
+        yield show
+
+
+def _amount(done: int, total: int | None) -> str:
+    return f"{done:,}" if total is None else f"{done:,} of {total:,}"
+
+
+def _pace(speed: float | None, done: int, total: int | None, unit: str) -> str:
+    if not speed:
+        return ""
+    if total is None:
+        return f", {speed:,.0f} {unit}/s"
+    return f", {duration((total - done) / speed)} left" if done < total else ""

@@ -1,0 +1,73 @@
+"""Which of a run's policies to load: one seed's, or that of the seed with the best last evaluations."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, get_args
+
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
+from csac.record.run import RunDirectory, Which
+from csac.record.statistics import last_evaluations
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def load(directory: str | Path, seed: int | None = None, which: Which = "last") -> Policy:
+    """Return a policy of a run.
+
+    Args:
+        directory: the run directory.
+        seed: the seed's label; by default the seed with the best mean return over its last three evaluation points,
+            among those that did not fail. That choice favours a lucky seed: report the policy on fresh evaluation
+            seeds.
+        which: the seed's `last` policy, or the one of its `best` evaluation. The best is a maximum over all evaluation
+            points, each a mean over a few fixed starts (ten by default), so that its own number is too high, and more
+            so the noisier they are: evaluate it on fresh seeds before you say how good it is.
+
+    Raises:
+        InputError: no run there, no such seed (the message names those there), a damaged file, or every seed failed and
+            none was asked for.
+    """
+    if which not in get_args(Which):
+        raise InputError(f"which={which!r}: choose 'last' or 'best'")
+    run = RunDirectory.open(directory)
+    seeds = run.seeds_with_policies()
+    if not seeds:
+        raise InputError(f"{directory} holds no policies yet: its first evaluation writes them")
+    if seed is None:
+        seed = _best_seed(run, _without_failed(run, seeds))
+    elif seed not in seeds:
+        raise InputError(f"{directory} has no policy of seed {seed}; it has those of {_listed(seeds)}")
+    return Policy.load(run.policy(seed, which), Contract.load(run.contract))
+
+
+def _without_failed(run: RunDirectory, seeds: list[int]) -> list[int]:
+    """Return the seeds that did not fail. What a failed one has left may never have learnt anything."""
+    failures = run.manifest.failures
+    sound = [seed for seed in seeds if seed not in failures]
+    if not sound:
+        raise InputError(
+            f"every seed of {run.path} failed (seed {seeds[0]} at {failures[seeds[0]]}): train again, "
+            f"or ask for what one has left by its seed, one of {_listed(seeds)}"
+        )
+    return sound
+
+
+def _best_seed(run: RunDirectory, seeds: list[int]) -> int:
+    if len(seeds) == 1:
+        return seeds[0]
+    rows = run.evaluations
+    if "return" not in (rows.dtype.names or ()):
+        raise InputError(f"the evaluations.csv of {run.path} has no returns: give a seed, or restore it from a copy")
+    scores = {seed: score for seed, score in last_evaluations(rows).items() if not math.isnan(score)}
+    ranked = [(scores[seed], -seed) for seed in seeds if seed in scores]
+    if not ranked:
+        raise InputError(f"{run.path} has no evaluations to choose by: give a seed, one of {_listed(seeds)}")
+    return -max(ranked)[1]
+
+
+def _listed(seeds: list[int]) -> str:
+    return ", ".join(str(seed) for seed in seeds)

@@ -1,0 +1,269 @@
+"""Summaries as tables of text, the same for the terminal, Markdown and HTML: see `rendering`."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from csac.record.curves import REGAINED, Recovery
+from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric, short
+from csac.record.statistics import FEWEST_FOR_BOOTSTRAP, FEWEST_FOR_INTERVAL
+from csac.record.summaries import OverSeeds, case_names, cases
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import numpy as np
+
+    from csac.record.summaries import CaseSummary, RecoverySummary, RunResults, RunSummary
+
+ROLLOUTS = 1_000  # that cases are counted in, as in the paper
+MOST_COLUMNS = 5  # of seeds in that table; of more, only the mean and the deviation
+
+
+def results_table(results: RunResults) -> Table:
+    """Return one row per seed of a run; below them mean, standard deviation and interval over those that did not fail.
+
+    The best of the mean is the best evaluation of all seeds together. Below two seeds there is no summary.
+    """
+    largest = max((abs(value) for one in results.seeds for value in (one.last, one.last_three, one.best)), default=0.0)
+
+    def returns(*values: float) -> list[Cell]:
+        return [numeric(value, number(value, largest)) for value in values]
+
+    rows = [
+        Row(
+            (
+                _whole(one.seed),
+                *returns(one.last, one.last_three, one.best),
+                _whole(one.best_step),
+                _whole(one.episodes),
+            ),
+            "failed" if one.has_failed else "plain",
+        )
+        for one in results.seeds
+    ]
+    over = (results.last, results.last_three, results.best)
+    if results.last.count > 1:
+        step = EMPTY if results.best_step is None else _whole(results.best_step)
+        rows.append(_summary("mean", *returns(*(one.mean for one in over)), step, EMPTY))
+        rows.append(_summary("± std", *returns(*(one.std for one in over)), EMPTY, EMPTY))
+        rows += interval_rows(over, largest, blank=2)
+    headings = ("seed", "last return", "last three", "best", "at step", "episodes")
+    return Table(headings, tuple(rows), note=few_seeds(results.last.count))
+
+
+def comparison_table(runs: Sequence[RunSummary]) -> Table:
+    """Return one row per run: its last evaluations, how certain they are, its maximum average return.
+
+    The ratio to the first is one of positive returns only: of costs, it would be the larger the worse. Interquartile
+    means are shown where any run has seeds enough for their interval.
+    """
+    last = "last three evaluations" if not runs or runs[0].points == 3 else f"last {runs[0].points} evaluations"
+    columns: list[tuple[str, Callable[[RunSummary], Cell]]] = [
+        ("run", lambda run: Cell(run.label)),
+        ("seeds", _seeds),
+        ("steps", lambda run: _whole(run.steps)),
+        (f"{last}, mean ± std over seeds", lambda run: plus_minus(run.last)),
+        ("95 % t-interval", lambda run: interval(run.last)),
+        ("to the first", lambda run: _ratio(run, runs[0])),
+        ("maximum average return", _maximum),
+    ]
+    if any(run.last.count >= FEWEST_FOR_BOOTSTRAP for run in runs):
+        columns.append(("IQM, 95 % bootstrap interval", _middle))
+        columns.append(("above the first, probability", _above_first))
+    if any(run.success for run in runs):
+        columns.append((f"success, {last}", lambda run: _share(run.success)))
+    rows = tuple(Row(tuple(cell(run) for _, cell in columns)) for run in runs)
+    return Table(tuple(heading for heading, _ in columns), rows)
+
+
+def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
+    """Return what a perturbation cost each seed, and below the seeds of each run their mean and standard deviation.
+
+    Where a seed never came back there is no mean of the steps, but how many did. Several runs are told apart by their
+    labels; that of a single one is the title.
+    """
+    headings = ("seed", "before", "drop", "relative", f"steps to {REGAINED:.0%}".replace("%", " %"))
+    headings += ("area lost", "final", "drawdown")
+    rows: list[Row] = []
+    for run in runs:
+        label = [Cell(run.label)] if len(runs) > 1 else []
+        largest = _largest(run)
+        for seed, one in run.seeds.items():
+            cells = (*label, _whole(seed), *_recovery_cells(one, largest))
+            rows.append(Row(cells, "failed" if seed in run.failed else "plain"))
+        if run.known > 1:
+            for name, of in (("mean", lambda one: one.mean), ("± std", lambda one: one.std)):
+                cells = _recovery_cells(Recovery(*(of(run.metrics[field]) for field in Recovery._fields)), largest)
+                if name == "mean" and run.regained < run.known:
+                    cells[3] = Cell(f"{run.regained} of {run.known}", math.inf)
+                rows.append(Row((*label, Cell(name, math.nan), *cells), "summary"))
+    title = runs[0].label if len(runs) == 1 else ""
+    return Table((*["run"] * (len(runs) > 1), *headings), tuple(rows), title)
+
+
+def case_table(rows: np.ndarray) -> Table | None:
+    """Return the paper's case table of one run: how often success and each event came in 1,000 rollouts, seed by seed.
+
+    A rollout that does not speak of a case counts as one without it. What is a count in itself, such as waypoints
+    reached, is a mean per rollout instead, over those that tell it. The last columns are over the seeds, where there
+    are several. None where the task says nothing. `rows` [episode] are as in evaluations.csv.
+    """
+    found = cases(rows)
+    if not found:
+        return None
+    seeds = list(found[0].by_seed)
+    shown = seeds if len(seeds) <= MOST_COLUMNS else []
+    headings = [_rollouts([rows]), *(f"seed {seed}" for seed in shown), *["mean", "± std"] * (len(seeds) > 1)]
+    body = []
+    for case in found:
+        values = [case.by_seed[seed] for seed in shown]
+        values += [case.over_seeds.mean, case.over_seeds.std] if len(seeds) > 1 else []
+        body.append(Row((Cell(_case_name(case.name, case.is_case)), *(_rate(case.is_case, value) for value in values))))
+    return Table(tuple(headings), tuple(body))
+
+
+def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | None:
+    """Return the case table of several runs, given as `(label, rows)`: a column for each, mean ± std over its seeds."""
+    names = case_names([rows for _, rows in runs])
+    by_run = [{case.name: case for case in cases(rows, names)} for _, rows in runs]
+    body = [
+        Row((Cell(_case_name(name, happens)), *(_rate_over_seeds(found.get(name)) for found in by_run)))
+        for name, happens in names.items()
+    ]
+    headings = (_rollouts([rows for _, rows in runs]), *(label for label, _ in runs))
+    return Table(headings, tuple(body)) if body else None
+
+
+def events_table(last: np.ndarray, names: dict[str, bool]) -> Table | None:
+    """Return what the `last` evaluations say beside returns: success and each event, as means per episode.
+
+    One row each: the mean over the seeds and, where there are several, their standard deviation and range. None where
+    the task says nothing. `names` are those of `case_names`, of all evaluations.
+    """
+    found = cases(last, names)
+    several = any(len(case.by_seed) > 1 for case in found)
+    rows = []
+    for case in found:
+        known = [value for value in case.by_seed.values() if not math.isnan(value)]
+        values = [case.over_seeds.mean]
+        if several:
+            values += [case.over_seeds.std, min(known, default=math.nan), max(known, default=math.nan)]
+        rows.append(Row((Cell(case.name), *(numeric(value, f"{value:.3f}") for value in values))))
+    headings = ("per episode, last evaluation", "mean", *["± std", "min", "max"] * several)
+    return Table(headings, tuple(rows)) if rows else None
+
+
+def plus_minus(over: OverSeeds) -> Cell:
+    """Return `mean ± std`, of one seed its value alone; whole numbers from 20 on."""
+    form = _form(over.mean)
+    return numeric(over.mean, f"{over.mean:{form}}" + ("" if math.isnan(over.std) else f" ± {over.std:{form}}"))
+
+
+def interval(over: OverSeeds) -> Cell:
+    """Return the interval of a mean, or that there are too few seeds for one."""
+    if over.count < FEWEST_FOR_INTERVAL:
+        return Cell(f"{over.count} seed{'s' * (over.count != 1)}: no interval", math.nan)
+    form = _form(over.mean)
+    return Cell(f"{over.low:{form}} to {over.high:{form}}", over.mean)
+
+
+def interval_rows(over: Sequence[OverSeeds], largest: float, blank: int) -> list[Row]:
+    """Return a row with the reach of these intervals and `blank` empty cells, or none where there are too few seeds."""
+    if over[0].count < FEWEST_FOR_INTERVAL:
+        return []
+    reach = [numeric(one.high - one.mean, number(one.high - one.mean, largest)) for one in over]
+    return [_summary("± 95 %", *reach, *[EMPTY] * blank)]
+
+
+def few_seeds(count: int) -> str:
+    """Return what a table says where seeds are too few for an interval, nothing where there is but one."""
+    return f"{count} seeds: no interval" if 1 < count < FEWEST_FOR_INTERVAL else ""
+
+
+def _summary(label: str, *cells: Cell) -> Row:
+    return Row((Cell(label, math.nan), *cells), "summary")
+
+
+def _whole(value: int) -> Cell:
+    return Cell(f"{value:,}", value)
+
+
+def _form(value: float) -> str:
+    return ",.0f" if abs(value) >= 20 else ".2f"
+
+
+def _seeds(run: RunSummary) -> Cell:
+    return Cell(str(run.last.count) + (f" ({run.failed} failed)" if run.failed else ""), run.last.count)
+
+
+def _ratio(run: RunSummary, first: RunSummary) -> Cell:
+    ratio = run.last.mean / first.last.mean if first.last.mean > 0 else math.nan
+    return numeric(ratio, f"{ratio:.2f}")
+
+
+def _maximum(run: RunSummary) -> Cell:
+    return EMPTY if run.best_step is None else Cell(f"{run.best:{_form(run.best)}} at {run.best_step:,}", run.best)
+
+
+def _middle(run: RunSummary) -> Cell:
+    return _with_interval(run.middle, run.middle_interval, _form(run.middle))
+
+
+def _above_first(run: RunSummary) -> Cell:
+    return _with_interval(run.above_first, run.above_first_interval, ".2f")
+
+
+def _with_interval(value: float, bounds: tuple[float, float] | None, form: str) -> Cell:
+    between = f" ({bounds[0]:{form}} to {bounds[1]:{form}})" if bounds else ""
+    return numeric(value, f"{value:{form}}{between}")
+
+
+def _share(success: OverSeeds | None) -> Cell:
+    if success is None:
+        return EMPTY
+    return Cell(f"{success.mean:.0%}" + ("" if math.isnan(success.std) else f" ± {success.std:.0%}"), success.mean)
+
+
+def _largest(run: RecoverySummary) -> float:
+    """The largest of the returns in a table, which sets their decimals."""
+    returns = [abs(value) for one in run.seeds.values() for value in (one.before, one.drop, one.final)]
+    return max((value for value in returns if not math.isnan(value)), default=0.0)
+
+
+def _recovery_cells(one: Recovery, largest: float) -> list[Cell]:
+    return [
+        numeric(one.before, number(one.before, largest)),
+        numeric(one.drop, number(one.drop, largest)),
+        numeric(one.relative_drop, f"{one.relative_drop:.0%}"),
+        numeric(one.steps_to_regain, "never" if math.isinf(one.steps_to_regain) else f"{one.steps_to_regain:,.0f}"),
+        numeric(one.area_lost, f"{one.area_lost:,.3g}" if one.area_lost < 1000 else short(one.area_lost)),
+        numeric(one.final, number(one.final, largest)),
+        numeric(one.worst_drawdown, number(one.worst_drawdown, largest)),
+    ]
+
+
+def _rollouts(runs: Sequence[np.ndarray]) -> str:
+    """What the numbers of a case table are per, and what they are from where that is not the same."""
+    per_seed = {int((rows["seed"] == seed).sum()) for rows in runs for seed in set(rows["seed"].tolist())}
+    if per_seed == {ROLLOUTS}:
+        return f"per {ROLLOUTS:,} rollouts"
+    fewest, most = min(per_seed), max(per_seed)
+    counts = f"{fewest:,}" if fewest == most else f"{fewest:,} to {most:,}"
+    return f"per {ROLLOUTS:,} rollouts (from {counts} of each seed)"
+
+
+def _case_name(name: str, is_case: bool) -> str:
+    return name if is_case else f"{name} (mean)"
+
+
+def _rate(is_case: bool, value: float) -> Cell:
+    return numeric(value, f"{ROLLOUTS * value:,.1f}" if is_case else f"{value:,.3f}")
+
+
+def _rate_over_seeds(case: CaseSummary | None) -> Cell:
+    if case is None:
+        return EMPTY
+    mean, std = (_rate(case.is_case, value).text for value in (case.over_seeds.mean, case.over_seeds.std))
+    return numeric(case.over_seeds.mean, f"{mean} ± {std}" if std else mean)

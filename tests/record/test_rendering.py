@@ -1,0 +1,56 @@
+import pytest
+
+from csac.record.rendering import EMPTY, Cell, Row, Table, html, markdown, number, short
+
+
+@pytest.mark.parametrize(("steps", "text"), [(999, "999"), (12_500, "12.5k"), (663_250, "663.2k"), (1_000_000, "1M")])
+def test_steps_in_little_room(steps, text):
+    assert short(steps) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "largest", "text"), [(1.234, None, "1.23"), (-1234.56, None, "-1,234.6"), (1.234, 5000.0, "1.2")]
+)
+def test_a_column_has_one_number_of_decimals(value, largest, text):
+    assert number(value, largest) == text
+
+
+TABLE = Table(
+    ("run", "return"),
+    (
+        Row((Cell("a | b", None), Cell("1,000.5", 1000.5))),
+        Row((Cell("<c>", None), EMPTY), "failed"),
+        Row((Cell("mean", None), Cell("never", float("inf"))), "summary"),
+    ),
+    title="T & U",
+    note="2 seeds: no interval",
+)
+
+
+def test_markdown_puts_numbers_to_the_right_and_keeps_bars_out():
+    assert markdown(TABLE).splitlines() == [
+        "**T & U**",
+        "",
+        "| run | return |",
+        "| --- | ---: |",
+        "| a \\| b | 1,000.5 |",
+        "| <c> |  |",
+        "| mean | never |",
+        "",
+        "2 seeds: no interval",
+    ]
+
+
+def test_html_says_what_a_row_is_and_what_to_sort_by():
+    assert html(TABLE).splitlines() == [
+        "<table>",
+        "<caption>T &amp; U</caption>",
+        '<thead><tr><th scope="col">run</th><th scope="col" class="number">return</th></tr></thead>',
+        "<tbody>",
+        '<tr class="plain"><td>a | b</td><td class="number" data-value="1000.5">1,000.5</td></tr>',
+        '<tr class="failed"><td>&lt;c&gt;</td><td class="number"></td></tr>',
+        '<tr class="summary"><td>mean</td><td class="number" data-value="inf">never</td></tr>',
+        "</tbody>",
+        '<tfoot><tr><td colspan="2">2 seeds: no interval</td></tr></tfoot>',
+        "</table>",
+    ]

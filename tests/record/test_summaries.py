@@ -1,0 +1,173 @@
+"""What runs have reached, with the arithmetic worked out."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from csac.record.summaries import (
+    case_names,
+    cases,
+    compare,
+    last_rows,
+    over_seeds,
+    perturbation_recoveries,
+    recoveries,
+    run_results,
+)
+from csac.record.summary_tables import (
+    case_comparison_table,
+    case_table,
+    comparison_table,
+    events_table,
+    recovery_table,
+    results_table,
+)
+
+NAN = np.nan
+
+
+def rows_of(*returns, success: Any = NAN, **events):
+    """Rows of one episode each at 10, 20, ..., with `returns` [seed][point]."""
+    columns = [("seed", int), ("step", int), ("episode", int), ("return", float), ("length", int), ("success", float)]
+    rows = [(seed, 10 * (t + 1), 0, value, 5) for seed, line in enumerate(returns) for t, value in enumerate(line)]
+    table = np.zeros(len(rows), [*columns, *((name, float) for name in events)])
+    for name, column in zip(("seed", "step", "episode", "return", "length"), zip(*rows, strict=True), strict=False):
+        table[name] = column
+    table["success"] = success
+    for name, values in events.items():
+        table[name] = values
+    return table
+
+
+def lines(table):
+    return [list(table.headings), *([cell.text for cell in row.cells] for row in table.rows)]
+
+
+def test_over_seeds_says_no_more_than_there_is():
+    # 2, 4, 6: std 2, reach 4.302653 * 2 / sqrt 3 = 4.968275
+    assert over_seeds([2.0, 4.0, NAN, 6.0]) == pytest.approx((3, 4.0, 2.0, 4 - 4.968275, 4 + 4.968275), abs=1e-6)
+    assert over_seeds([2.0, 4.0]) == pytest.approx((2, 3.0, np.sqrt(2), NAN, NAN), nan_ok=True)
+    assert over_seeds([2.0]) == pytest.approx((1, 2.0, NAN, NAN, NAN), nan_ok=True)
+    assert over_seeds([NAN]) == pytest.approx((0, NAN, NAN, NAN, NAN), nan_ok=True)
+
+
+def test_the_results_of_a_run():
+    # Of seeds 0 and 1, at 10: 0 and 8; at 20: 9 and 3; at 30: 2 and 4. Together they are best at 20: 6.
+    results = run_results(rows_of([0.0, 9.0, 2.0], [8.0, 3.0, 4.0], [99.0]), failed={2}, episodes={0: 7})
+    first, second, failed = results.seeds
+    assert first == (0, False, 2.0, pytest.approx(11 / 3), 9.0, 20, 7)
+    assert second == (1, False, 4.0, 5.0, 8.0, 10, 0)
+    assert failed == (2, True, 99.0, 99.0, 99.0, 10, 0)
+    assert (results.last.mean, results.best.mean, results.best_step) == (3.0, 6.0, 20)
+    assert results.last_three.mean == pytest.approx((11 / 3 + 5) / 2)
+
+
+def test_the_last_of_all_is_where_all_are():
+    assert run_results(rows_of([1.0, 50.0], [3.0])).last.mean == 2.0
+
+
+@pytest.mark.parametrize("rows", [rows_of([NAN, NAN]), rows_of([1.0])[:0]])
+def test_a_run_without_returns_has_no_results(rows):
+    results = run_results(rows)
+    assert (results.seeds, results.last.count, results.best_step) == ((), 0, None)
+    assert results_table(results).rows == ()
+
+
+def test_a_run_beside_the_first():
+    first, second = compare([("a", rows_of([1.0, 4.0], [2.0, 6.0])), ("b", rows_of([5.0, 4.0]))], points=1)
+    assert first[:3] == ("a", 20, 0)
+    assert (first.last.mean, first.best, first.best_step, first.success) == (5.0, 5.0, 20, None)
+    assert np.isnan(first.above_first)
+    assert (second.last.mean, second.best, second.best_step) == (4.0, 5.0, 10)
+    assert second.above_first == 0.25  # 4 equals one of 4, 6 and is below the other
+
+
+def test_a_failed_seed_is_counted_and_left_out():
+    (one,) = compare([("a", rows_of([1.0, 3.0], [500.0]))], failed={"a": [1]})
+    assert (one.failed, one.last.count, one.last.mean, one.best) == (1, 1, 2.0, 3.0)
+    assert lines(comparison_table([one]))[1][:4] == ["a", "1 (1 failed)", "20", "2.00"]
+
+
+def test_seeds_that_were_never_evaluated_together_have_no_maximum():
+    rows = rows_of([1.0, 2.0], [3.0])
+    (one,) = compare([("a", rows[1:])])
+    assert (np.isnan(one.best), one.best_step) == (True, None)
+    assert lines(comparison_table([one]))[1][6] == ""
+
+
+def test_the_bootstrap_resamples_seeds_and_not_their_evaluations():
+    """Each seed's last evaluations are 0 and 100: their mean is 50 in every resample of the seeds."""
+    (one,) = compare([("a", rows_of(*[[0.0, 100.0]] * 6))])
+    assert (one.middle, one.middle_interval) == (50.0, (50.0, 50.0))
+
+
+def test_success_is_over_all_of_the_last_evaluations():
+    # Of each seed 2 of 4, of the last three 2 of 3; one episode says nothing, which is a no.
+    rows = rows_of([1.0] * 4, [1.0] * 4, success=[0, 1, NAN, 1, 0, 0, 1, 1])
+    (one,) = compare([("a", rows)])
+    assert one.success is not None
+    assert one.success[:3] == (2, pytest.approx(2 / 3), 0.0)
+    assert lines(comparison_table([one]))[1][-1] == "67% ± 0%"
+
+
+def test_what_a_perturbation_cost_several_runs():
+    """After step 10. Seed 0 of `a` falls from 100 to 40 and is back at 30; its seed 1 never is; `b` loses nothing."""
+    a = recoveries("a", rows_of([100.0, 40.0, 95.0], [200.0, 100.0, 150.0]), 10)
+    b = recoveries("b", rows_of([10.0, 11.0]), 10)
+    assert (a.regained, a.known, a.metrics["drop"].mean, b.regained, b.known) == (1, 2, 80.0, 1, 1)
+    assert a.metrics["steps_to_regain"].count == 0
+    assert lines(recovery_table([a, b])) == [
+        ["run", "seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "drawdown"],
+        ["a", "0", "100.0", "60.0", "60%", "20", "625", "67.5", "60.0"],
+        ["a", "1", "200.0", "100.0", "50%", "never", "1.25k", "125.0", "100.0"],
+        ["a", "mean", "150.0", "80.0", "55%", "1 of 2", "938", "96.2", "80.0"],
+        ["a", "± std", "70.7", "28.3", "7%", "", "442", "40.7", "28.3"],
+        ["b", "0", "10.00", "0.00", "0%", "0", "0", "11.00", "0.00"],
+    ]
+    assert recovery_table([a]).title == "a"
+
+
+def test_each_perturbation_is_looked_at_as_far_as_the_next():
+    rows = rows_of([10.0, 5.0, 8.0, 1.0])
+    first, second = perturbation_recoveries(rows, [(0, "gravity"), (10, "friction"), (30, "mass"), (90, "gain")])
+    assert (first.label, first.seeds[0].drop) == ("friction after step 10, until 30", 5.0)
+    assert (second.label, second.seeds[0].drop) == ("mass after step 30", 5.5)  # before: (5 + 8) / 2
+    assert perturbation_recoveries(rows[:0], [(10, "friction")]) == []
+
+
+def test_cases_are_shares_and_numbers_are_means():
+    rows = rows_of([1.0] * 2, [1.0] * 2, crashed=[1, NAN, 0, 0], stops=[4, NAN, 1, 3])
+    crashed, stops = cases(rows)
+    assert (crashed.name, crashed.is_case, crashed.by_seed) == ("crashed", True, {0: 0.5, 1: 0.0})
+    assert (stops.name, stops.is_case, stops.by_seed) == ("stops", False, {0: 4.0, 1: 2.0})
+    assert (crashed.over_seeds.mean, stops.over_seeds.mean) == (0.25, 3.0)
+    assert lines(case_table(rows)) == [
+        ["per 1,000 rollouts (from 2 of each seed)", "seed 0", "seed 1", "mean", "± std"],
+        ["crashed", "500.0", "0.0", "250.0", "353.6"],
+        ["stops (mean)", "4.000", "2.000", "3.000", "1.414"],
+    ]
+
+
+def test_a_number_that_is_only_ever_0_or_1_in_one_run_is_no_case_beside_another():
+    few, many = rows_of([1.0] * 2, stops=[0, 1]), rows_of([1.0] * 2, stops=[2, 3], crashed=[1, 1])
+    assert case_names([few]) == {"stops": True}
+    assert case_names([few, many]) == {"stops": False, "crashed": True}
+    assert lines(case_comparison_table([("few", few), ("many", many)])) == [
+        ["per 1,000 rollouts (from 2 of each seed)", "few", "many"],
+        ["stops (mean)", "0.500", "2.500"],
+        ["crashed", "", "1,000.0"],
+    ]
+
+
+def test_what_nobody_tells_of_is_no_case():
+    assert case_table(rows_of([1.0])) is None
+    assert case_comparison_table([("a", rows_of([1.0]))]) is None
+    assert lines(case_table(rows_of([1.0], crashed=[NAN])))[1:] == [["crashed (mean)", ""]]
+
+
+def test_events_are_those_of_the_last_evaluation_as_cases_in_all():
+    """The last episode of seed 0 does not say that it crashed: in a case that is a no."""
+    rows = rows_of([1.0] * 2, [1.0] * 2, crashed=[1, NAN, 0, 1])
+    table = events_table(last_rows(rows), case_names([rows]))
+    assert lines(table)[1] == ["crashed", "0.500", "0.707", "0.000", "1.000"]

@@ -1,0 +1,165 @@
+"""Only modules that somebody here has named are imported: a run directory alone runs nobody's code."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from policies import contract, random_policy
+
+from csac.record.manifest import Manifest
+from csac.record.run import RunDirectory
+from csac.tasks import trust
+from csac.types import InputError
+
+TASK = """
+from pathlib import Path
+import gymnasium, numpy as np
+
+Path({marker!r}).write_text("this code was run")
+
+class Stranger(gymnasium.Env):
+    metadata = {{"render_modes": ["rgb_array"]}}
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {{}}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 1.0, True, False, {{}}
+
+    def render(self):
+        return np.zeros((32, 32, 3), np.uint8)
+
+gymnasium.register("Stranger-v0", entry_point=Stranger)
+"""
+
+
+@pytest.fixture
+def stranger(tmp_path, monkeypatch):
+    """A folder with a run whose task is that of a module beside it, and a place for notes that is empty."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    folder = tmp_path / "downloaded"
+    (folder / "package").mkdir(parents=True)
+    marker = tmp_path / "marker"
+    (folder / "stranger.py").write_text(TASK.format(marker=str(marker)))
+    (folder / "package" / "__init__.py").write_text(f"open({str(marker)!r}, 'w')")
+    (folder / "package" / "stranger.py").write_text(TASK.format(marker=str(marker)))
+
+    def make_run(task: str) -> Path:
+        path = folder / "run"
+        manifest = Manifest(task=task, algorithm="csac", seeds=(0,), steps=9, state="finished", steps_done=9)
+        RunDirectory.create(path, manifest)
+        (path / "policy").mkdir()
+        random_policy(contract()).save(path / "policy" / "seed_0.safetensors")
+        contract().save(path / "policy" / "contract.json")
+        return path
+
+    return SimpleNamespace(folder=folder, marker=marker, make_run=make_run, state=tmp_path / "state")
+
+
+def csac(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "csac", *arguments], cwd=folder, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("task", "command"),
+    [
+        ("stranger:Stranger-v0", ["evaluate", "run"]),
+        ("stranger:Stranger-v0", ["play", "run", "--video", "a.mp4"]),
+        ("stranger:Stranger-v0", ["resume", "run"]),
+        ("package.stranger:Stranger-v0", ["evaluate", "run"]),
+    ],
+)
+def test_a_strangers_run_runs_none_of_its_code(stranger, task, command):
+    stranger.make_run(task)
+    done = csac(stranger.folder, *command)
+    module = task.partition(":")[0]
+    path = stranger.folder / f"{module.replace('.', '/')}.py"
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"run wants to run the code of {path} (its task is {task})" in done.stderr
+    assert "add --trust-task" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not stranger.marker.exists()
+
+
+def test_a_task_that_was_trusted_once_is_trusted_where_it_was_found(stranger):
+    stranger.make_run("stranger:Stranger-v0")
+    trusting = csac(stranger.folder, "evaluate", "run", "--episodes", "1", "--trust-task")
+    assert trusting.returncode == 0, trusting.stderr
+    assert stranger.marker.exists()
+    again = csac(stranger.folder, "evaluate", "run", "--episodes", "1")
+    assert (again.returncode, again.stdout) == (0, trusting.stdout)
+    moved = stranger.folder.rename(stranger.folder.with_name("elsewhere"))
+    assert csac(moved, "evaluate", "run", "--episodes", "1").returncode == 2
+
+
+def test_a_module_that_is_not_there_is_told_and_not_looked_for_by_importing(stranger):
+    stranger.make_run("package.nowhere:Task-v0")
+    done = csac(stranger.folder, "evaluate", "run")
+    assert done.returncode == 2
+    assert "needs the module package.nowhere, which is not found here" in done.stderr
+    assert not stranger.marker.exists()
+
+
+def test_who_trains_has_named_the_module(tmp_path, monkeypatch):
+    """One's own runs stay one command."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "support"))
+    tiny = [
+        "--batch-size",
+        "4",
+        "--actor-hidden-sizes",
+        "4",
+        "--critic-hidden-sizes",
+        "4",
+        "--evaluation-episodes",
+        "1",
+    ]
+    assert csac(tmp_path, "evaluate", "run").returncode == 2
+    assert csac(tmp_path, "train", "probes:Cases-v0", "--steps", "20", "--directory", "run", *tiny).returncode == 0
+    done = csac(tmp_path, "evaluate", "run", "--episodes", "1")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("task", ["Hopper-v4", "PyFlyt/QuadX-Hover-v1", "sys:Task-v0", len])
+def test_what_imports_nothing_new_is_not_asked_about(task):
+    trust.refuse_untrusted(task, "run")
+
+
+@pytest.mark.parametrize(
+    "task", [":Task-v0:", "a..b:Task", ".a:Task", "a\0b:Task", "\ud800:Task", "nowhere.at.all:Task"]
+)
+def test_what_cannot_be_a_module_is_not_found(task):
+    with pytest.raises(InputError, match="which is not found here"):
+        trust.refuse_untrusted(task, "run")
+    trust.remember(task)
+
+
+def test_where_nothing_can_be_noted_one_is_asked_each_time(stranger, monkeypatch):
+    monkeypatch.syspath_prepend(stranger.folder)
+    monkeypatch.setenv("XDG_STATE_HOME", os.devnull)
+    trust.refuse_untrusted("stranger:Stranger-v0", "run", trust_task=True)
+    with pytest.raises(InputError, match="add --trust-task"):
+        trust.refuse_untrusted("stranger:Stranger-v0", "run")
+    assert not stranger.marker.exists()
+
+
+def test_a_note_can_be_read_and_taken_back(stranger, monkeypatch):
+    monkeypatch.syspath_prepend(stranger.folder)
+    trust.remember("stranger:Stranger-v0")
+    (note,) = (stranger.state / "csac" / "trusted_tasks").iterdir()
+    assert note.read_text() == f"stranger\n{stranger.folder / 'stranger.py'}\n"
+    trust.refuse_untrusted("stranger:Other-v3", "run")
+    note.unlink()
+    with pytest.raises(InputError, match="add --trust-task"):
+        trust.refuse_untrusted("stranger:Other-v3", "run")
