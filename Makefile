@@ -78,7 +78,8 @@ gpu: $(SETUP) $(if $(shell command -v nvidia-smi),$(CUDA))  ## Measure training 
 	.venv/bin/python -m benchmarks gpu --write $(ARGS)
 
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml, for Python 3.11 and newer
-	$(UV) pip compile pyproject.toml --extra robots --group dev --universal --python-version 3.11 --upgrade --generate-hashes \
+	$(UV) pip compile pyproject.toml --extra robots --extra cluster --group dev --universal \
+		--python-version 3.11 --upgrade --generate-hashes \
 		--no-emit-index-url --no-annotate --no-header --quiet --output-file requirements.lock
 
 clean:  ## Remove environments, the site and caches; runs stay

@@ -37,6 +37,7 @@ Train controllers for continuous-control tasks with Conservative Soft Actor-Crit
   csac evaluate DIR    test the policies of a run on fresh episodes
   csac play DIR        watch the policy of a run, or write a video of it
   csac runs [DIR]      list the runs below a directory
+  csac study COMMAND   run the paper's experiments, or your own
 
   csac COMMAND --help  explain a command and its options
   csac --version       print the version
@@ -186,7 +187,14 @@ def _dispatch(arguments: list[str]) -> int:
 
         _say(f"csac {__version__}")
         return 0
-    commands = {"train": _train, "resume": _resume, "evaluate": _evaluate, "play": _play, "runs": _runs}
+    commands = {
+        "train": _train,
+        "resume": _resume,
+        "evaluate": _evaluate,
+        "play": _play,
+        "runs": _runs,
+        "study": _study,
+    }
     if arguments[0] not in commands:
         raise InputError(f"no command is called {arguments[0]!r}{nearest(arguments[0], commands)} (csac --help)")
     try:
@@ -350,6 +358,19 @@ def _runs(arguments: list[str]) -> int:
     else:
         _say(f"no runs in {options.directory} yet; csac train HalfCheetah-v4 starts one")
     return 0
+
+
+def _study(arguments: list[str]) -> int:
+    from csac.studies.commands import COMMANDS, HELP
+
+    if not arguments or arguments[0] in ("-h", "--help"):
+        _say(HELP.rstrip())
+        return 0
+    if arguments[0] not in COMMANDS:
+        hint = nearest(arguments[0], COMMANDS)
+        raise InputError(f"no study command is called {arguments[0]!r}{hint} (csac study --help)")
+    kind, run = COMMANDS[arguments[0]]
+    return run(parse(kind, arguments[1:], f"csac study {arguments[0]}"))
 
 
 class Chosen(NamedTuple):

@@ -82,13 +82,14 @@ def learning_curve(
     title: str = "",
     marks: Sequence[tuple[int, str]] = (),
     formats: Sequence[Format] = ("png",),
+    quantity: str = "return per evaluation episode",
 ) -> None:
     """Draw evaluation returns against environment steps per seed and save them, whole or not at all, as `path`.
 
     Each run is `(label, rows of evaluations.csv)`: a thick line for the mean over seeds; with it, thin lines for single
     seeds below five of them, a band for the range of three or four, and for the 95 % t-interval from five seeds on.
     `marks` are `(step, text)`: vertical lines, for what changed there. The suffix of `path` is replaced by each of
-    `formats`.
+    `formats`; `quantity` is what the column `return` holds.
     """
     with matplotlib.style.context(["default", STYLE]):
         figure = Figure(figsize=(7.5, 4.8), layout="constrained")
@@ -96,11 +97,16 @@ def learning_curve(
         axes = figure.add_subplot()
         evaluated = [(label, rows) for label, rows in runs if not np.isnan(rows["return"]).all()]
         returns = draw_curves(axes, evaluated)
-        _dress(axes, title, returns)
+        _dress(axes, title, returns, quantity)
         _draw_marks(axes, marks)
         _draw_legend(figure, [(label, len(seeds)) for (label, _), seeds in zip(evaluated, returns, strict=True)])
-        for kind in formats:
-            _write(figure, Path(path).with_suffix(f".{kind}"), kind)
+        save(figure, path, formats)
+
+
+def save(figure: Figure, path: str | Path, formats: Sequence[Format]) -> None:
+    """Save a figure in each format, whole or not at all, equal figures in equal files."""
+    for kind in formats:
+        _write(figure, Path(path).with_suffix(f".{kind}"), kind)
 
 
 def draw_curves(axes: Axes, runs: Sequence[tuple[str, np.ndarray]]) -> list[np.ndarray]:
@@ -130,11 +136,11 @@ def _look(index: int) -> tuple[str, Literal["-", "--", "-.", ":"]]:
     return COLOURS[index % len(COLOURS)], LINE_STYLES[index // len(COLOURS) % len(LINE_STYLES)]
 
 
-def _dress(axes: Axes, title: str, returns: list[np.ndarray]) -> None:
+def _dress(axes: Axes, title: str, returns: list[np.ndarray], quantity: str) -> None:
     several = any(len(seeds) > 1 for seeds in returns)
     axes.set_title(title, pad=24 if several else 12)
     axes.set_xlabel("environment steps per seed")
-    axes.set_ylabel("return per evaluation episode")
+    axes.set_ylabel(quantity)
     axes.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda step, _: short(step)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace("-", "−")))

@@ -1,0 +1,401 @@
+"""`csac study ...`: the options of each sub-command and what it does."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+import sys
+from collections import Counter
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from csac.console.tables import duration, make_console, program, short
+from csac.processes import usable_cores
+from csac.studies.calibration import Calibration, Prediction, predict
+from csac.studies.cells import HOME, Cell, Store, is_final
+from csac.studies.engines import run_here, run_in_processes
+from csac.studies.job import Ended, Job, Message, Stopped, is_over
+from csac.studies.named import NAMED, find
+from csac.studies.progress import StudyProgress
+from csac.studies.results import Results, Runs, collect
+from csac.studies.study import Study, cells_of
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from rich.console import Console
+
+    from csac.studies.cells import Status
+    from csac.studies.engines import Engine
+
+HELP = """\
+usage: csac study COMMAND ...
+
+The paper's experiments, and your own, as studies: tasks x methods x seeds, one run for each, shared among studies.
+
+  csac study list           the studies that there are
+  csac study show NAME      the cells of one, how far they are, and what the rest will take
+  csac study run NAME       run what is not complete yet; Ctrl-C at any time, and run it again
+  csac study report NAME    claims, tables and figures of what is complete
+
+  csac study COMMAND --help  explain a command and its options
+
+NAME may also be a TOML file of your own (docs/studies.md).
+To begin: csac study run smoke
+"""
+STATE_STYLES = {"complete": "green", "running": "cyan", "partial": "yellow", "waiting": "dim", "failed": "red"}
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Which study, and what of it."""
+
+    name: Annotated[Positional[str], arg(metavar="NAME")]
+    """One of csac study list, or a TOML file."""
+    scale: float = 1.0
+    """Shorten every run to this share of its steps; all that comes of it says so."""
+    tasks: Annotated[str | None, arg(metavar="ID,...", help_behavior_hint="(default: all)")] = None
+    """Only these tasks."""
+    algorithms: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: all)")] = None
+    """Only these algorithms or methods."""
+    seeds: Annotated[int | None, arg(help_behavior_hint="(default: as the study has)")] = None
+    """How many seeds; more later reuse what is there."""
+    directory: Path = HOME
+    """Where the runs of all cells are."""
+
+    def studies(self) -> list[Study]:
+        """Return the studies that are meant."""
+        tasks, algorithms = (None if text is None else text.split(",") for text in (self.tasks, self.algorithms))
+        return narrowed([study.shortened(self.scale) for study in find(self.name)], tasks, algorithms, self.seeds)
+
+    def words(self) -> list[str]:
+        """Return what to type for the same choice, wherever the runs are."""
+        words = [self.name]
+        words += ["--scale", f"{self.scale:g}"] * (self.scale != 1)
+        for name, value in (("--tasks", self.tasks), ("--algorithms", self.algorithms), ("--seeds", self.seeds)):
+            words += [] if value is None else [name, str(value)]
+        return words
+
+
+@dataclass(frozen=True)
+class List:
+    """List the studies."""
+
+
+@dataclass(frozen=True)
+class Show(Chosen):
+    """Show the cells of a study, how far they are, and what the rest will take on this machine.
+
+    A kind of cell that this machine has not run yet is measured first, for some seconds each, and remembered.
+    """
+
+    measure: FlagCreatePairsOff[bool] = True
+    """Measure how fast this machine is; without it, only what was measured before is told."""
+
+
+@dataclass(frozen=True)
+class Run(Chosen):
+    """Run every cell of a study that is not complete: partial ones go on, failed ones are listed and stop no other.
+
+    Exit codes: 0 done, 2 wrong arguments, 3 a cell failed, 130 or 143 stopped by a signal (every cell is saved).
+    """
+
+    engine: Annotated[
+        Literal["local", "processes", "ray"] | None,
+        arg(help_behavior_hint="(default: processes, where there are cores)"),
+    ] = None
+    """local: one cell after another, in this process. processes: as many at once as there are workers. ray: as many as
+    a Ray cluster has room for (docs/cluster.md)."""
+    workers: Annotated[int | None, arg(help_behavior_hint="(default: one for each core)")] = None
+    """Processes that run a cell each, on their own share of the cores."""
+    cell: Annotated[int | None, arg(help_behavior_hint="(default: all)")] = None
+    """Run the cell of this number alone, as csac study show counts them: one job of an array."""
+    address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: a new one, here)")] = None
+    """The Ray cluster, with --engine ray; auto is the one that this machine belongs to."""
+    cell_cores: int = 1
+    """Cores that each cell asks Ray for."""
+    cell_gpus: float = 0.0
+    """GPUs, or a share of one, that each cell asks Ray for."""
+    cell_memory: float = 0.0
+    """GiB of memory that each cell asks Ray for; 0 asks for none in particular."""
+    device: Literal["cpu", "gpu"] = "cpu"
+    """Where the networks learn."""
+    results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
+    """Copy the evaluations and a small manifest of each cell that is over there: what a report needs."""
+    keep_checkpoints: FlagCreatePairsOff[bool] = False
+    """Keep the checkpoints of finished cells too: they hold the replay, and take most of the room."""
+
+
+@dataclass(frozen=True)
+class Report(Chosen):
+    """Write a report of a study: the paper's claims, its numbers beside those measured, figures, commands."""
+
+    results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the runs themselves)")] = None
+    """Make it from the files that csac study run --results has collected, and from nothing else."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: below runs/studies/reports)")] = None
+    """Where report.md and its figures go; with --results beside them by default."""
+
+
+def narrowed(
+    studies: Sequence[Study], tasks: Sequence[str] | None, algorithms: Sequence[str] | None, seeds: int | None
+) -> list[Study]:
+    """Narrow each of the studies; those of several that have none of the tasks or algorithms are left out.
+
+    Raises:
+        InputError: none of them has one that is asked for.
+    """
+    chosen, complaint = [], None
+    for study in studies:
+        try:
+            chosen.append(study.narrowed(tasks, algorithms, seeds))
+        except InputError as error:
+            complaint = complaint or error
+    if complaint and not chosen:
+        raise complaint
+    return chosen
+
+
+def list_studies(_: List) -> int:
+    """Print the named studies."""
+    table = _table("study", "what it shows", "tasks", "methods", "seeds", "steps", "cells")
+    for name, studies in NAMED.items():
+        title = studies[0].title if len(studies) == 1 else "All of them, tiny: that everything works"
+        steps = {study.steps_for(task) for study in studies for task in study.tasks}
+        table.add_row(
+            name,
+            title,
+            str(len({task for study in studies for task in study.tasks})),
+            str(len({method.label for study in studies for method in study.methods})),
+            str(studies[0].seeds),
+            " to ".join(dict.fromkeys(short(count) for count in (min(steps), max(steps)))),
+            str(len(cells_of(studies))),
+        )
+    make_console().print(table)
+    return 0
+
+
+def show(options: Show) -> int:
+    """Print the cells of a study, one row for each."""
+    studies, store, console = options.studies(), Store(options.directory), make_console()
+    cells, labels = cells_of(studies), labels_of(studies)
+    statuses = {cell.key: store.status(cell) for cell in cells}
+    rest = [cell for cell in cells if not is_final(store.path(cell))]
+    predictions = _predictions(rest, statuses, options.measure, console)
+    table = _table("cell", "what", "steps", "state", "time", "directory")
+    table.columns[5].overflow = "fold"
+    for index, cell in enumerate(cells):
+        status = statuses[cell.key]
+        text = Text(status.state + (f": {status.reason}" if status.reason else ""), STATE_STYLES[status.state])
+        prediction = predictions.get(cell.key)
+        table.add_row(
+            str(index),
+            labels[cell.key],
+            f"{short(status.steps)} / {short(cell.steps)}",
+            text,
+            f"about {duration(prediction.seconds)}"
+            if prediction
+            else duration(status.seconds)
+            if status.seconds
+            else "",
+            str(store.path(cell).relative_to(store.root)),
+        )
+    console.print(table)
+    console.print(f"{len(cells)} cells below {store.root}: {_counted(statuses.values())}", soft_wrap=True)
+    if rest:
+        console.print(_told(rest, predictions), soft_wrap=True)
+    return 0
+
+
+def _predictions(
+    cells: Sequence[Cell], statuses: Mapping[str, Status], measure: bool, console: Console
+) -> dict[str, Prediction]:
+    """Return what each cell will take, of those whose kind was measured or can be."""
+    calibration, predictions, refused = Calibration(), {}, set()
+    for cell in cells:
+        cost, kind = calibration.cost(cell), f"{cell.algorithm} on {cell.task}"
+        if cost is None and measure and kind not in refused:
+            try:
+                with console.status(f"measuring {kind}") if console.is_interactive else nullcontext():
+                    cost = calibration.measure(cell)
+            except RuntimeError as error:
+                refused.add(kind)
+                _say(console, f"{kind} cannot be measured: {error}", "red")
+        if cost:
+            predictions[cell.key] = predict(cell, cost, statuses[cell.key].steps)
+    if calibration.is_busy:
+        _say(console, "other processes keep this machine busy: what was measured now is too slow, and not remembered")
+    return predictions
+
+
+def _told(rest: Sequence[Cell], predictions: Mapping[str, Prediction]) -> str:
+    """Return what the cells that are not over will take together."""
+    if len(predictions) < len(rest):
+        return f"{len(rest)} to run, {len(rest) - len(predictions)} of them not measured"
+    workers = min(len(usable_cores()), len(rest))
+    seconds = sum(one.seconds for one in predictions.values())
+    memory = sum(sorted((one.memory for one in predictions.values()), reverse=True)[:workers])
+    disk = sum(sorted((one.disk for one in predictions.values()), reverse=True)[:workers])
+    at_once = f", {duration(seconds / workers)} with {workers} at once" if workers > 1 else ""
+    return (
+        f"{len(rest)} to run: at most {duration(seconds)} of one core{at_once}; "
+        f"{memory / 2**30:.2g} GiB of memory, {disk / 2**30:.2g} GiB of disk for checkpoints"
+    )
+
+
+def run(options: Run) -> int:
+    """Run what is not complete and return the exit code."""
+    studies, store, console = options.studies(), Store(options.directory), make_console()
+    cells, labels = cells_of(studies), labels_of(studies)
+    engine = _engine(options)
+    if options.cell is not None:
+        if not 0 <= options.cell < len(cells):
+            raise InputError(f"--cell counts from 0 to {len(cells) - 1}, not {options.cell}")
+        cells = [cells[options.cell]]
+    statuses = {cell.key: store.status(cell) for cell in cells}
+    _say(console, _intention(studies, cells, statuses.values()), "bold")
+    jobs = [job for job in _jobs(studies, cells, store, options) if not is_over(job)]
+    by_key = {cell.key: cell for cell in cells}
+    if options.results:
+        for cell in cells:
+            collect(store, cell, options.results)
+    done = {key: status.steps for key, status in statuses.items()}
+    progress = StudyProgress([job.cell for job in jobs], labels, done, console)
+
+    def tell(message: Message) -> None:
+        progress.tell(message)
+        if options.results and isinstance(message, Ended):
+            collect(store, by_key[message.key], options.results)
+
+    try:
+        if jobs:
+            engine(jobs, tell)
+    except Stopped as stopped:
+        progress.close()
+        name = signal.Signals(stopped.signal_number).name
+        line = f"csac: stopped by {name}; every cell is saved. To go on, type the same line again: {command_line()}"
+        print(line, file=sys.stderr)
+        return 128 + stopped.signal_number
+    finally:
+        progress.close()
+    return _conclude(cells, labels, store, console)
+
+
+def report(options: Report) -> int:
+    """Write the report and print where it is."""
+    from csac.studies.report import write_report  # matplotlib is slow to import
+
+    studies, store, console = options.studies(), Store(options.directory), make_console()
+    source = Results(options.results) if options.results else Runs(store)
+    scale = f"-scale-{studies[0].scale:g}" if options.scale < 1 else ""
+    folder = options.out or options.results or Path("runs/studies/reports", f"{Path(options.name).stem}{scale}")
+    chosen = options.words()
+    results = [] if options.results is None else ["--results", str(options.results)]
+    path = write_report(
+        studies,
+        source,
+        folder,
+        [shlex.join(["csac", "study", command, *chosen, *results]) for command in ("run", "report")],
+    )
+    _say(console, str(path))
+    return 0
+
+
+COMMANDS: Mapping[str, tuple[type, Any]] = {
+    "list": (List, list_studies),
+    "show": (Show, show),
+    "run": (Run, run),
+    "report": (Report, report),
+}
+
+
+def labels_of(studies: Iterable[Study]) -> dict[str, str]:
+    """Return what each cell is called, by its key."""
+    labels = {}
+    for study in studies:
+        for method, condition, cell in study.entries():
+            words = [f"{method.label} on {cell.task}", *condition, f"seed {cell.seed}"]
+            labels.setdefault(cell.key, ", ".join(words))
+    return labels
+
+
+def command_line() -> str:
+    """Return the line that started this process."""
+    return shlex.join([program(), *sys.argv[1:]])
+
+
+def _engine(options: Run) -> Engine:
+    if options.workers is not None and options.workers < 1:
+        raise InputError(f"--workers must be at least 1, not {options.workers}")
+    if options.engine == "ray":
+        from csac.studies.cluster import Request, run_on_ray  # an optional dependency
+
+        if options.cell_cores < 1 or options.cell_gpus < 0 or options.cell_memory < 0:
+            raise InputError("--cell-cores is at least 1, --cell-gpus and --cell-memory are not below 0")
+        request = Request(options.cell_cores, options.cell_gpus, options.cell_memory)
+        return partial(run_on_ray, address=options.address, request=request)
+    if options.address:
+        raise InputError("--address is a Ray cluster's: add --engine ray")
+    several = len(usable_cores()) > 1 and options.cell is None and options.device == "cpu"
+    engine = options.engine or ("processes" if several or options.workers else "local")
+    if engine == "local" and options.workers:
+        raise InputError("--engine local runs one cell after another: leave out --workers")
+    return run_here if engine == "local" else partial(run_in_processes, workers=options.workers)
+
+
+def _jobs(studies: Sequence[Study], cells: Sequence[Cell], store: Store, options: Run) -> list[Job]:
+    """Return the jobs of these cells: a policy is tested as often as the most demanding of their studies asks for."""
+    rollouts = Counter[str]()
+    for study in studies:
+        for entry in study.entries():
+            rollouts[entry.cell.key] = max(rollouts[entry.cell.key], study.rollouts_each)
+    return [
+        Job(
+            cell,
+            store.path(cell),
+            device=options.device,
+            keep_checkpoints=options.keep_checkpoints,
+            rollouts=rollouts[cell.key],
+            command=command_line(),
+        )
+        for cell in cells
+    ]
+
+
+def _intention(studies: Sequence[Study], cells: Sequence[Cell], statuses: Iterable[Status]) -> str:
+    scale = f", at {studies[0].scale:g} of the steps" if studies[0].scale < 1 else ""
+    return f"{', '.join(study.name for study in studies)}{scale}: {len(cells)} cells, {_counted(statuses)}"
+
+
+def _conclude(cells: Sequence[Cell], labels: Mapping[str, str], store: Store, console: Console) -> int:
+    """Print what became of the cells, and return the exit code."""
+    statuses = {cell.key: store.status(cell) for cell in cells}
+    failed = {key: status.reason for key, status in statuses.items() if status.state == "failed"}
+    for key, reason in failed.items():
+        _say(console, f"failed: {labels[key]}: {reason}", "red")
+    _say(console, f"{len(cells)} cells: {_counted(statuses.values())}")
+    return 3 if failed else 0
+
+
+def _counted(statuses: Iterable[Status]) -> str:
+    states = Counter(status.state for status in statuses)
+    return ", ".join(f"{states[state]} {state}" for state in STATE_STYLES if states[state])
+
+
+def _say(console: Console, text: str, style: str = "") -> None:
+    console.print(Text(text, style), soft_wrap=True)
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=box.SIMPLE, pad_edge=False)
+    for heading in headings:
+        table.add_column(heading)
+    return table

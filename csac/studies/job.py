@@ -1,0 +1,171 @@
+"""One cell as a piece of work: what every engine does with it, wherever it runs."""
+
+from __future__ import annotations
+
+import shutil
+import time
+import traceback
+import warnings
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from csac.record.run import RunDirectory
+from csac.record.tables import COLUMNS, write_rows
+from csac.studies.cells import Cell, is_final, is_in_use, read_history, write_history
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+ROLLOUTS = "rollouts.csv"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A cell, the directory of its run, and how it is run. Nothing here changes what the cell computes but `device`."""
+
+    cell: Cell
+    path: Path
+    device: Literal["cpu", "gpu"] = "cpu"
+    checkpoint_interval: int = 50_000
+    keep_checkpoints: bool = False
+    tensorboard: bool = True
+    rollouts: int = 0
+    """Fresh episodes that the finished policy is tested on: `rollouts.csv` in its run."""
+    command: str | None = None
+
+
+@dataclass(frozen=True)
+class Started:
+    """A cell is being run."""
+
+    key: str
+    where: str = ""
+
+
+@dataclass(frozen=True)
+class Advanced:
+    """A cell was evaluated at a step."""
+
+    key: str
+    step: int
+    mean_return: float
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A cell is no longer being run. `elsewhere`: another process has it."""
+
+    key: str
+    outcome: Literal["complete", "failed", "stopped", "elsewhere"]
+    reason: str = ""
+
+
+Message = Started | Advanced | Ended
+
+
+class Stopped(Exception):
+    """A study was stopped by a signal; every cell is saved, and the next run goes on with it."""
+
+    def __init__(self, signal_number: int) -> None:
+        super().__init__(signal_number)
+        self.signal_number = signal_number
+
+
+def is_over(job: Job) -> bool:
+    """Whether there is nothing left to do: the run is final and, where it did not fail, so are its rollouts."""
+    if not is_final(job.path):
+        return False
+    failed = RunDirectory.open(job.path).manifest.state == "failed"
+    return failed or not job.rollouts or (job.path / ROLLOUTS).exists()
+
+
+def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
+    """Train a cell from where it is to its end, and say how it went; only a signal is raised.
+
+    What goes wrong with one cell is written beside it and returned, so that the others go on.
+
+    Raises:
+        Stopped: SIGINT or SIGTERM, after what was learnt was saved.
+    """
+    key = job.cell.key
+    if is_in_use(job.path):
+        return Ended(key, "elsewhere")
+    before = read_history(job.path)
+    seconds, began = float(before.get("seconds", 0.0)), time.monotonic()
+
+    def spent() -> dict[str, float]:
+        return {"seconds": round(seconds + time.monotonic() - began, 1)}
+
+    from csac.training.train import Interrupted  # JAX, which a worker imports once it has its cores
+
+    try:
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a seed that failed is told of below
+            run = _train(job, tell)
+        if run.manifest.state == "finished" and job.rollouts:
+            _roll_out(job)
+    except InputError as error:
+        return Ended(key, "elsewhere") if is_in_use(job.path) else _failed(job, spent(), str(error))
+    except Interrupted as interruption:
+        write_history(job.path, spent())
+        raise Stopped(interruption.signal_number) from None
+    except Exception as error:
+        reason = ": ".join(filter(None, (type(error).__name__, str(error))))
+        return _failed(job, spent(), reason, traceback.format_exc())
+    write_history(job.path, spent())
+    if run.manifest.state != "finished":
+        return Ended(key, "failed", "; ".join(map(str, run.manifest.failures.values())))
+    return Ended(key, "complete")
+
+
+def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
+    from csac.training.train import train
+
+    cell = job.cell
+    run = train(
+        cell.make_algorithm(),
+        cell.task,
+        steps=cell.steps,
+        seeds=1,
+        first_seed=cell.seed,
+        directory=job.path,
+        groups=1,
+        evaluation_interval=cell.evaluation_interval,
+        evaluation_episodes=cell.evaluation_episodes,
+        evaluation_processes=0,
+        environment_arguments=cell.environment_arguments,
+        perturbations=cell.perturbations,
+        events=cell.events,
+        device=job.device,
+        checkpoint_interval=job.checkpoint_interval,
+        resume=True,
+        tensorboard=job.tensorboard,
+        command=job.command,
+        on_evaluation=lambda step, returns: tell(Advanced(cell.key, step, returns.get(cell.seed, float("nan")))),
+    )
+    if run.manifest.state == "finished" and not job.keep_checkpoints:
+        # A finished cell needs them no more, and they take most of its room: the replay is in them.
+        shutil.rmtree(run.checkpoints, ignore_errors=True)
+    return run
+
+
+def _roll_out(job: Job) -> None:
+    """Test the last policy on episodes that neither training nor its evaluations have seen, and keep a row of each."""
+    from csac.evaluation.play import evaluate_run
+
+    if (job.path / ROLLOUTS).exists():
+        return
+    ((seed, episodes),) = evaluate_run(job.path, episodes=job.rollouts, processes=1)
+    rows = [episode.row(seed, job.cell.steps) for episode in episodes]
+    write_rows(job.path / ROLLOUTS, COLUMNS["evaluations"], rows)
+
+
+def _failed(job: Job, history: dict[str, Any], reason: str, trace: str = "") -> Ended:
+    """Write beside the cell why it failed."""
+    line = " ".join(reason.split())
+    with suppress(OSError):
+        write_history(job.path, {**history, "failure": line, **({"traceback": trace} if trace else {})})
+    return Ended(job.cell.key, "failed", line)

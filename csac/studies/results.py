@@ -1,0 +1,107 @@
+"""What cells leave for a report, their evaluations and a small manifest: read from runs, or from committed files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from csac.record import manifest as manifests
+from csac.record.files import write_atomically
+from csac.record.run import RunDirectory
+from csac.record.tables import read_rows
+from csac.studies.cells import Cell, Store, is_final, read_history
+from csac.studies.job import ROLLOUTS
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from csac.record.manifest import Manifest
+
+
+class Record(NamedTuple):
+    """What one cell has given: its manifest, the seconds that it took as far as they are known, and its tables."""
+
+    manifest: Manifest
+    seconds: float
+    evaluations: np.ndarray
+    rollouts: np.ndarray | None
+
+    @property
+    def failure(self) -> str:
+        """Why it failed, or nothing."""
+        return "; ".join(self.manifest.failures.values()) if self.manifest.state == "failed" else ""
+
+
+class Source(Protocol):
+    """Where records come from."""
+
+    def record(self, cell: Cell) -> Record | None:
+        """Return what a cell has given, or None where there is nothing final."""
+        ...
+
+
+class Runs:
+    """Records from the runs themselves."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+
+    def record(self, cell: Cell) -> Record | None:
+        """Return what a cell has given, or None where it is not over. Raises InputError for a damaged table."""
+        path = self.store.path(cell)
+        if not is_final(path):
+            return None
+        run, seconds = RunDirectory.open(path), read_history(path).get("seconds", 0.0)
+        return Record(run.manifest, seconds, run.evaluations, _rows(path / ROLLOUTS))
+
+
+class Results:
+    """Records from files that were collected: `cells/<task>/<arm>/seed-<k>.json` and its tables."""
+
+    def __init__(self, directory: str | Path) -> None:
+        self.directory = Path(directory)
+        self._files: dict[str, Path] = {}
+        for path in sorted(self.directory.glob("cells/*/*/seed-*.json")):
+            try:
+                self._files[Cell.of_run(manifests.read(path.read_bytes())).key] = path
+            except (InputError, OSError) as error:
+                raise InputError(f"{path} is not a cell's: {error}") from None
+        if not self._files:
+            raise InputError(
+                f"{self.directory} holds no results of a study; csac study run NAME --results DIR makes them"
+            )
+
+    def record(self, cell: Cell) -> Record | None:
+        """Return what a cell has given, or None where it was not collected."""
+        path = self._files.get(cell.key)
+        if path is None:
+            return None
+        content = path.read_bytes()
+        tables = read_rows(path.with_suffix(".csv")), _rows(_rollouts(path))
+        return Record(manifests.read(content), json.loads(content).get("seconds", 0.0), *tables)
+
+
+def collect(store: Store, cell: Cell, directory: str | Path) -> None:
+    """Copy what a cell that is over has given to files that are small enough to be kept with the code."""
+    record, source = Runs(store).record(cell), store.path(cell)
+    if record is None or not (source / "evaluations.csv").exists():
+        return
+    path = Path(directory) / "cells" / cell.name.with_suffix(".json")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path.with_suffix(".csv"), (source / "evaluations.csv").read_bytes())
+    if (source / ROLLOUTS).exists():
+        write_atomically(_rollouts(path), (source / ROLLOUTS).read_bytes())
+    manifest = dataclasses.replace(record.manifest, machine=dataclasses.replace(record.manifest.machine, host=""))
+    fields = json.loads(manifests.written(dataclasses.replace(manifest, process=None, history=())))
+    write_atomically(path, (json.dumps({**fields, "seconds": record.seconds}, indent=1) + "\n").encode())
+
+
+def _rollouts(path: Path) -> Path:
+    return path.with_name(f"{path.stem}.{ROLLOUTS}")
+
+
+def _rows(path: Path) -> np.ndarray | None:
+    return read_rows(path) if path.exists() else None

@@ -1,0 +1,285 @@
+"""A study: tasks x methods x conditions x seeds, as data; shortened, narrowed, and read from a TOML file."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tomllib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from csac.presets import hyperparameters as preset_of
+from csac.studies.cells import Cell, complete, similar
+from csac.tasks.known import check_events
+from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+ANALYSES = ("curves", "returns", "efficiency", "robustness", "cases", "success")
+FEWEST_POINTS = 20  # evaluations of a shortened run: it is evaluated more often once it would have fewer
+WARMUP_SHARE = 0.1  # of a shortened run that is warm-up at most
+
+
+@dataclass(frozen=True)
+class Method:
+    """One algorithm with its hyperparameters, and the column of the paper that it reproduces."""
+
+    label: str
+    algorithm: str
+    preset: str | None = None
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    published: str | None = None
+
+    def hyperparameters_on(self, task: str) -> dict[str, Any]:
+        """Return every hyperparameter on this task. Raises InputError for one that there is not."""
+        preset = preset_of(self.preset, self.algorithm, task) if self.preset else {}
+        return complete(self.algorithm, {**preset, **self.hyperparameters})
+
+
+class Entry(NamedTuple):
+    """A cell, and what it stands for in a study."""
+
+    method: Method
+    condition: tuple[str, ...]
+    cell: Cell
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is trained to answer a question. Steps are environment steps per seed; nothing here is shortened yet."""
+
+    name: str
+    title: str
+    tasks: tuple[str, ...]
+    methods: tuple[Method, ...]
+    seeds: int = 5
+    steps: int = 1_000_000
+    steps_on: Mapping[str, int] = field(default_factory=dict)
+    """Tasks on which it is another number of steps."""
+    evaluation_interval: int = 5_000
+    evaluation_episodes: int = 10
+    conditions: tuple[tuple[str, ...], ...] = ((),)
+    """Each a set of perturbations; the empty one changes nothing."""
+    environment_arguments: Mapping[str, Any] = field(default_factory=dict)
+    events: tuple[str, ...] = ()
+    rollouts: int = 0
+    """Fresh episodes that each finished policy is tested on."""
+    analyses: tuple[str, ...] = ("curves", "returns")
+    """What its report shows."""
+    scale: float = 1.0
+
+    def shortened(self, scale: float) -> Study:
+        """Return the study with every run shortened to this share of its steps."""
+        if not 0 < scale <= 1:
+            raise InputError(f"scale is a share of the steps, more than 0 and at most 1, not {scale:g}")
+        return replace(self, scale=self.scale * scale)
+
+    def narrowed(
+        self,
+        tasks: Sequence[str] | None = None,
+        algorithms: Sequence[str] | None = None,
+        seeds: int | None = None,
+    ) -> Study:
+        """Return the study on some of its tasks, with some of its algorithms or methods, with another number of seeds.
+
+        Raises:
+            InputError: one that the study does not have.
+        """
+        if seeds is not None and seeds < 1:
+            raise InputError(f"seeds must be at least 1, not {seeds}")
+        return replace(
+            self,
+            tasks=self.tasks if tasks is None else _some(tasks, self.tasks, f"{self.name} has no task"),
+            methods=self.methods if algorithms is None else self._some_methods(algorithms),
+            seeds=self.seeds if seeds is None else seeds,
+        )
+
+    def _some_methods(self, wanted: Sequence[str]) -> tuple[Method, ...]:
+        names = [name for method in self.methods for name in (method.algorithm, method.label)]
+        chosen = _some(wanted, dict.fromkeys(names), f"{self.name} has no algorithm or method")
+        return tuple(method for method in self.methods if {method.algorithm, method.label} & set(chosen))
+
+    def steps_for(self, task: str) -> int:
+        """Return the steps of a run on this task, shortened."""
+        return max(1, round(self.steps_on.get(task, self.steps) * self.scale))
+
+    def interval_for(self, task: str) -> int:
+        """Return the steps between two evaluations: as planned, or less where there would be too few of them."""
+        interval = self.evaluation_interval
+        return interval if self.scale == 1 else max(1, min(interval, self.steps_for(task) // FEWEST_POINTS))
+
+    @property
+    def rollouts_each(self) -> int:
+        """Fresh episodes for each policy, fewer where the runs are shorter."""
+        return math.ceil(self.rollouts * self.scale)
+
+    def conditions_for(self) -> tuple[tuple[str, ...], ...]:
+        """Return the conditions, at steps that are shortened as the runs are."""
+        return tuple(
+            tuple(str(replace(one, step=round(one.step * self.scale))) for one in perturbations_of(condition))
+            for condition in self.conditions
+        )
+
+    def entries(self) -> list[Entry]:
+        """Return every cell: seed by seed, so that an unfinished study compares all methods on fewer seeds."""
+        parts = itertools.product(range(self.seeds), self.tasks, self.conditions_for(), self.methods)
+        return [Entry(method, part, self._cell(task, method, part, seed)) for seed, task, part, method in parts]
+
+    def _cell(self, task: str, method: Method, condition: tuple[str, ...], seed: int) -> Cell:
+        steps = self.steps_for(task)
+        refuse_late(map(Perturbation.parse, condition), steps)
+        hyperparameters = method.hyperparameters_on(task)
+        if self.scale < 1 and "warmup_steps" in hyperparameters:
+            longest = max(1, round(WARMUP_SHARE * steps))
+            hyperparameters["warmup_steps"] = min(hyperparameters["warmup_steps"], longest)
+        return Cell.make(
+            task,
+            method.algorithm,
+            hyperparameters,
+            steps=steps,
+            seed=seed,
+            evaluation_interval=self.interval_for(task),
+            evaluation_episodes=self.evaluation_episodes,
+            perturbations=condition,
+            environment_arguments=self.environment_arguments,
+            events=self.events,
+        )
+
+
+def cells_of(studies: Iterable[Study]) -> list[Cell]:
+    """Return every cell of these studies, once, in an order that depends on nothing else."""
+    return list({entry.cell.key: entry.cell for study in studies for entry in study.entries()}.values())
+
+
+def read_study(path: str | Path) -> Study:
+    """Return the study that a TOML file describes; docs/studies.md says what it may hold.
+
+    Raises:
+        InputError: no such file, or anything in it that is not understood.
+    """
+    path = Path(path)
+    try:
+        told = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not TOML: {error}") from None
+    try:
+        study = _study(path.stem, told)
+        study.entries()
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return study
+
+
+def _study(name: str, told: dict[str, Any]) -> Study:
+    _refuse_unknown(told, _KEYS, "a study")
+    missing = [key for key in ("tasks", "methods") if not told.get(key)]
+    if missing:
+        raise InputError(f"{' and '.join(missing)} missing: a study names its tasks and its methods")
+    values = {key: _KEYS[key](key, value) for key, value in told.items()}
+    for key in ("seeds", "steps", "evaluation_interval", "evaluation_episodes"):
+        if key in values and values[key] < 1:
+            raise InputError(f"{key} must be at least 1, not {values[key]}")
+    check_events(values.get("events", ()))
+    for task in values.get("steps_on", {}):
+        _some([task], values["tasks"], "steps_on: the study has no task")
+    _some(values.get("analyses", ()), ANALYSES, "analyses: there is no")
+    labels = [method.label for method in values["methods"]]
+    if twice := next((label for label in labels if labels.count(label) > 1), None):
+        raise InputError(f"two methods are called {twice!r}: give each a label of its own")
+    return Study(**{"name": name, "title": name, **values})
+
+
+def _methods(key: str, told: Any) -> tuple[Method, ...]:
+    if not isinstance(told, list) or not all(isinstance(item, dict) for item in told):
+        raise InputError("methods are written as [[methods]] tables")
+    return tuple(method for item in told for method in _swept(item))
+
+
+def _swept(told: dict[str, Any]) -> list[Method]:
+    """Return the methods of one table: one, or one for each combination of what it sweeps."""
+    _refuse_unknown(told, _METHOD_KEYS, "a method")
+    if "algorithm" not in told:
+        raise InputError("a method needs an algorithm")
+    values = {key: _METHOD_KEYS[key](key, value) for key, value in told.items()}
+    sweep, given = values.pop("sweep", {}), values.get("hyperparameters", {})
+    for name, several in sweep.items():
+        if not isinstance(several, list) or not several:
+            raise InputError(f"sweep.{name} is a list of values, not {several!r}")
+    complete(values["algorithm"], {**given, **{name: several[0] for name, several in sweep.items()}})
+    methods = []
+    for combination in itertools.product(*sweep.values()):
+        chosen = dict(zip(sweep, combination, strict=True))
+        label = ", ".join([values.get("label", values["algorithm"]), *(f"{k} {v}" for k, v in chosen.items())])
+        methods.append(Method(**{**values, "label": label, "hyperparameters": {**given, **chosen}}))
+    return methods
+
+
+def _refuse_unknown(told: Mapping[str, Any], known: Mapping[str, Any], what: str) -> None:
+    for key in told:
+        if key not in known:
+            raise InputError(f"{what} has no {key!r}{similar(key, known)}")
+
+
+def _some(wanted: Iterable[str], known: Iterable[str], complaint: str) -> tuple[str, ...]:
+    known = list(known)
+    for name in wanted:
+        if name not in known:
+            raise InputError(f"{complaint} {name!r}{similar(name, known)}")
+    return tuple(name for name in known if name in set(wanted))
+
+
+def _of(kind: type, words: str) -> Callable[[str, Any], Any]:
+    def read(key: str, value: Any) -> Any:
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise InputError(f"{key} is {words}, not {value!r}")
+        return value
+
+    return read
+
+
+def _texts(key: str, value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise InputError(f"{key} is a list of texts, not {value!r}")
+    return tuple(value)
+
+
+def _conditions(key: str, value: Any) -> tuple[tuple[str, ...], ...]:
+    if not isinstance(value, list) or not value:
+        raise InputError(f'{key} is a list of lists, such as [[], ["friction=1.5@300000"]], not {value!r}')
+    return tuple(_texts(key, item) for item in value)
+
+
+def _steps_on(key: str, value: Any) -> dict[str, int]:
+    table = _of(dict, "a table of tasks and steps")(key, value)
+    return {task: _of(int, "a whole number of steps")(f"{key}.{task}", steps) for task, steps in table.items()}
+
+
+_KEYS: Mapping[str, Callable[[str, Any], Any]] = {
+    "title": _of(str, "a text"),
+    "tasks": _texts,
+    "methods": _methods,
+    "seeds": _of(int, "a whole number"),
+    "steps": _of(int, "a whole number"),
+    "steps_on": _steps_on,
+    "evaluation_interval": _of(int, "a whole number"),
+    "evaluation_episodes": _of(int, "a whole number"),
+    "conditions": _conditions,
+    "environment_arguments": _of(dict, "a table"),
+    "events": _texts,
+    "rollouts": _of(int, "a whole number"),
+    "analyses": _texts,
+}
+
+_METHOD_KEYS: Mapping[str, Callable[[str, Any], Any]] = {
+    "label": _of(str, "a text"),
+    "algorithm": _of(str, "a text"),
+    "preset": _of(str, "a text"),
+    "hyperparameters": _of(dict, "a table"),
+    "sweep": _of(dict, "a table of lists"),
+    "published": _of(str, "a text"),
+}

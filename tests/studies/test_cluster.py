@@ -1,0 +1,60 @@
+"""Cells on a real Ray cluster of several nodes on this machine."""
+
+import pytest
+from resuming import contents
+from studying import cell, jobs
+
+from csac.record.run import RunDirectory
+from csac.studies.cells import Store
+from csac.studies.cluster import Request, run_on_ray
+from csac.studies.engines import run_here
+from csac.studies.job import Advanced, Ended, Started
+from csac.types import InputError
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+
+STEPS = 3_000
+
+
+@pytest.fixture
+def cluster():
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "object_store_memory": 100 * 2**20})
+    yield cluster
+    cluster.shutdown()
+
+
+def test_a_node_that_is_lost_in_mid_run_loses_nothing(tmp_path, cluster):
+    three = jobs(tmp_path / "ray", *(cell(seed, steps=STEPS) for seed in range(3)))
+    nodes = [cluster.add_node(num_cpus=1, object_store_memory=100 * 2**20) for _ in range(2)]
+    messages, places = [], {}
+
+    def tell(message):
+        messages.append(message)
+        if isinstance(message, Started):
+            places.setdefault(message.key, []).append(message.where.split()[-1])
+        if isinstance(message, Advanced) and message.step >= 500 and len(cluster.worker_nodes) == 2 and nodes:
+            (lost,) = [node for node in nodes if node.node_id.startswith(places[message.key][-1])]
+            nodes.clear()
+            cluster.remove_node(lost, allow_graceful=False)
+
+    run_on_ray(three, tell, cluster.address, Request())
+    assert {message.key: message.outcome for message in messages if isinstance(message, Ended)} == {
+        job.cell.key: "complete" for job in three
+    }
+    resumed = [key for key, where in places.items() if len(where) == 2]
+    assert len(resumed) == 1
+    assert len({where for several in places.values() for where in several}) == 2
+    (again,) = [job for job in three if job.cell.key == resumed[0]]
+    (entry,) = RunDirectory.open(again.path).manifest.history
+    assert entry.step >= 360
+    for job, alone in zip(three, jobs(tmp_path / "alone", *(job.cell for job in three)), strict=True):
+        run_here([alone], lambda _: None)
+        assert contents(job.path) == contents(alone.path)
+    assert Store(tmp_path / "ray").status(again.cell).state == "complete"
+
+
+def test_no_cluster_at_the_address(tmp_path):
+    with pytest.raises(InputError, match=r"no Ray cluster can be reached at 127\.0\.0\.1:1"):
+        run_on_ray(jobs(tmp_path, cell()), lambda _: None, "127.0.0.1:1", Request())

@@ -1,0 +1,166 @@
+import re
+import shlex
+import signal
+
+import pytest
+from studying import TINY, cell, write
+
+from csac.cli import main
+from csac.studies import commands
+from csac.studies.calibration import Calibration, Cost, predict
+from csac.studies.cells import Store
+from csac.studies.job import Ended, Started, Stopped
+from csac.studies.results import Results, Runs
+from csac.studies.study import cells_of, read_study
+
+
+def csac(line):
+    return main(shlex.split(line))
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "tiny.toml")
+
+
+@pytest.fixture
+def engine(monkeypatch):
+    """What would be run, by the labels that are told, in place of running it."""
+    given = []
+
+    def run(jobs, tell, **_):
+        given.extend(jobs)
+        for job in jobs:
+            tell(Started(job.cell.key))
+            tell(Ended(job.cell.key, "complete"))
+
+    monkeypatch.setattr(commands, "run_here", run)
+    monkeypatch.setattr(commands, "run_in_processes", run)
+    return given
+
+
+def test_list_has_every_study(capsys):
+    assert csac("study list") == 0
+    out = capsys.readouterr().out
+    for name in ("mujoco", "ablation", "efficiency", "robustness", "quadx", "panda", "reference", "smoke"):
+        assert re.search(rf"^ {name} ", out, re.MULTILINE)
+
+
+def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
+    assert csac("study run tiny.toml --engine local --seeds 1 --results out") == 0
+    assert "1 cells: 1 complete" in capsys.readouterr().out
+    store, (one, other) = Store(), cells_of([read_study("tiny.toml")])
+    assert [store.status(each).state for each in (one, other)] == ["complete", "waiting"]
+    collected, made = Results("out").record(one), Runs(store).record(one)
+    assert collected is not None
+    assert made is not None
+    assert (collected.seconds, collected.manifest.versions) == (made.seconds, made.manifest.versions)
+    assert collected.manifest.machine.host == ""
+    assert collected.evaluations.tobytes() == made.evaluations.tobytes()
+    assert Results("out").record(other) is None
+    monkeypatch.setattr(commands, "run_here", lambda jobs, tell: pytest.fail("complete cells are skipped"))
+    assert csac("study run tiny.toml --engine local --seeds 1") == 0
+    capsys.readouterr()
+    assert csac("study show tiny.toml --no-measure") == 0
+    states = re.findall(r" (complete|waiting) ", capsys.readouterr().out)
+    assert states == ["complete", "waiting"]
+
+
+def test_one_cell_of_an_array(engine):
+    assert csac("study run tiny.toml --cell 1") == 0
+    assert [job.cell.seed for job in engine] == [1]
+
+
+def test_what_is_narrowed_is_run(engine):
+    assert csac("study run mujoco --scale 0.1 --tasks Ant-v4,Hopper-v4 --algorithms sac,TD3 --seeds 2") == 0
+    assert len(engine) == 2 * 2 * 2
+    assert {(job.cell.algorithm, job.cell.task, job.cell.steps) for job in engine} == {
+        ("sac", "Ant-v4", 100_000),
+        ("td3", "Ant-v4", 100_000),
+        ("sac", "Hopper-v4", 200_000),
+        ("td3", "Hopper-v4", 200_000),
+    }
+
+
+def test_studies_of_smoke_without_the_task_are_left_out(engine):
+    assert csac("study run smoke --tasks PandaReach-v3 --algorithms sac") == 0
+    (job,) = engine
+    assert (job.cell.task, job.cell.algorithm) == ("PandaReach-v3", "sac")
+
+
+def test_rollouts_are_asked_of_the_cells_that_need_them(engine):
+    assert csac("study run quadx --algorithms td3 --seeds 1 --scale 0.1") == 0
+    assert [job.rollouts for job in engine] == [100]
+
+
+def test_a_cell_that_fails_is_an_exit_code_and_a_reason(tmp_path, capsys):
+    write(tmp_path / "wrong.toml", TINY.replace("Hopper-v4", "Hoppper-v4").replace("seeds = 2", "seeds = 1"))
+    assert csac("study run wrong.toml --engine local") == 3
+    last = capsys.readouterr().out.splitlines()[-2:]
+    assert last[0].startswith("failed: SAC on Hoppper-v4, seed 0: no task is called Hoppper-v4")
+    assert last[1] == "1 cells: 1 failed"
+
+
+def test_a_signal_is_an_exit_code_and_the_line_to_type(monkeypatch, capsys):
+    def run(jobs, tell):
+        raise Stopped(signal.SIGINT)
+
+    monkeypatch.setattr(commands, "run_here", run)
+    monkeypatch.setattr("sys.argv", ["csac", "study", "run", "tiny.toml", "--engine", "local"])
+    assert csac("study run tiny.toml --engine local") == 130
+    assert capsys.readouterr().err.endswith("csac study run tiny.toml --engine local\n")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("study rnu mujoco", "no study command is called 'rnu'; did you mean run? (csac study --help)"),
+        ("study run mojoco", "no study is called 'mojoco'; did you mean mujoco?"),
+        ("study run tiny.toml --cell 2", "--cell counts from 0 to 1, not 2"),
+        ("study run tiny.toml --workers 0", "--workers must be at least 1, not 0"),
+        ("study run tiny.toml --engine local --workers 2", "leave out --workers"),
+        ("study run tiny.toml --address 10.0.0.1:6379", "add --engine ray"),
+        ("study run tiny.toml --engine ray --cell-cores 0", "--cell-cores is at least 1"),
+        ("study run tiny.toml --scale 2", "scale is a share of the steps"),
+        ("study run tiny.toml --tasks Ant-v4", "tiny has no task 'Ant-v4': there is Hopper-v4"),
+        ("study run smoke --tasks Swimmer-v4", "has no task 'Swimmer-v4'"),
+        ("study run tiny.toml --engine kubernetes", "'kubernetes' is not one of"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(capsys, tmp_path, line, message):
+    assert csac(line) == 2
+    (complaint,) = capsys.readouterr().err.splitlines()
+    assert message in complaint
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.toml"]
+
+
+# What a cell will take.
+
+
+def test_a_prediction_is_warm_up_learning_and_evaluation():
+    one = cell(steps=10_000, evaluation_interval=1_000, evaluation_episodes=10, hyperparameters={"warmup_steps": 2_000})
+    cost = Cost(learning=0.01, evaluating=0.001, longest_episode=100, transition_size=20)
+    # 8,000 steps that learn, 2,000 that do not, ten evaluations of ten episodes of 100 steps, and ten seconds to start.
+    assert predict(one, cost).seconds == pytest.approx(80 + 2 + 10 + 10)
+    # From step 5,000 on: half of the steps, all of them learning, and half of the evaluations.
+    assert predict(one, cost, done=5_000).seconds == pytest.approx(50 + 5 + 10)
+    assert predict(one, cost).disk == 150 * 20 * 4  # its replay
+
+
+def test_a_kind_is_measured_once_whatever_its_weights(monkeypatch):
+    monkeypatch.setattr("os.getloadavg", lambda: (0.0, 0.0, 0.0))
+    one = cell(task="Pendulum-v1")
+    assert Calibration().cost(one) is None
+    cost = Calibration().measure(one)
+    assert cost.learning > 0
+    assert cost.evaluating > 0
+    assert (cost.longest_episode, cost.transition_size) == (200, 3 + 1 + 3 + 3)
+    other = cell(task="Pendulum-v1", seed=3, steps=999, hyperparameters={"discount": 0.9})
+    assert Calibration().cost(other) == cost
+    assert Calibration().cost(cell(task="Pendulum-v1", hyperparameters={"batch_size": 16})) is None
+
+
+def test_what_cannot_be_measured_is_told():
+    with pytest.raises(RuntimeError, match="no task is called Pendulm-v1"):
+        Calibration().measure(cell(task="Pendulm-v1"))

@@ -1,0 +1,119 @@
+import os
+import signal
+
+import pytest
+from resuming import Crash, contents
+from studying import cell, jobs
+
+from csac.record.run import RunDirectory
+from csac.studies.cells import Store, is_final
+from csac.studies.engines import run_here, run_in_processes, split_cores
+from csac.studies.job import Advanced, Ended, Started, Stopped
+from csac.tasks.seeds import training_seed
+
+
+def outcomes(messages):
+    return {message.key: message.outcome for message in messages if isinstance(message, Ended)}
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """The files of a cell that nothing happened to."""
+    (job,) = jobs(tmp_path_factory.mktemp("whole"), cell())
+    run_here([job], lambda _: None)
+    return contents(job.path)
+
+
+def test_cells_are_run_to_their_end_and_told(tmp_path):
+    messages, two = [], jobs(tmp_path, cell(0), cell(1), keep_checkpoints=False)
+    run_here(two, messages.append)
+    first, second = (job.cell.key for job in two)
+    told = [(type(message), message.key) for message in messages]
+    assert told == [(kind, key) for key in (first, second) for kind in (Started, Advanced, Advanced, Advanced, Ended)]
+    assert [message.step for message in messages if isinstance(message, Advanced)] == [100, 200, 300] * 2
+    store = Store(tmp_path)
+    assert [store.status(job.cell).state for job in two] == ["complete", "complete"]
+    assert not (two[0].path / "checkpoint").exists()
+    assert RunDirectory.open(two[1].path).manifest.seeds == (1,)
+
+
+def test_a_cell_that_crashed_goes_on_and_leaves_the_same_files(tmp_path, uninterrupted):
+    (job,) = jobs(tmp_path, cell())
+
+    def crash(message):
+        if isinstance(message, Advanced) and message.step == 200:
+            raise Crash
+
+    messages = []
+    run_here([job], lambda message: (messages.append(message), crash(message)))
+    assert messages[-1] == Ended(job.cell.key, "failed", "Crash")
+    assert Store(tmp_path).status(job.cell).reason == "Crash"
+    run_here([job], lambda _: None)
+    assert contents(job.path) == uninterrupted
+    (entry,) = RunDirectory.open(job.path).manifest.history
+    assert entry.step == 120
+    assert Store(tmp_path).status(job.cell)._replace(seconds=0) == ("complete", 300, "", 0)
+
+
+def test_a_cell_that_fails_does_not_stop_the_others(tmp_path):
+    wrong = jobs(tmp_path, cell(task="Hoppper-v4"), cell(0, "probes:NonFinite-v0"), cell())
+    messages = []
+    run_here(wrong, messages.append)
+    assert list(outcomes(messages).values()) == ["failed", "failed", "complete"]
+    store = Store(tmp_path)
+    reasons = [store.status(job.cell).reason for job in wrong]
+    assert "no task is called Hoppper-v4" in reasons[0]
+    assert reasons[1].startswith("step ")
+    assert not is_final(wrong[0].path)
+    assert is_final(wrong[1].path)
+
+
+def test_a_cell_that_another_process_has_is_left_to_it(tmp_path):
+    (job,) = jobs(tmp_path, cell())
+    run_here([job], lambda _: None)
+    messages = []
+    with RunDirectory.open(job.path).locked():
+        run_here([job], messages.append)
+    assert outcomes(messages) == {job.cell.key: "elsewhere"}
+
+
+@pytest.mark.parametrize("run", [run_here, lambda jobs, tell: run_in_processes(jobs, tell, workers=1)])
+def test_a_signal_saves_the_cell_and_leaves_the_rest(tmp_path, uninterrupted, run):
+    two, messages = jobs(tmp_path, cell(0), cell(1)), []
+
+    def tell(message):
+        messages.append(message)
+        if isinstance(message, Advanced) and message.step == 100:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Stopped) as stopped:
+        run(two, tell)
+    assert stopped.value.signal_number == signal.SIGINT
+    assert outcomes(messages) == {two[0].cell.key: "stopped"}
+    store = Store(tmp_path)
+    assert [store.status(job.cell).state for job in two] == ["partial", "waiting"]
+    assert 100 <= store.status(two[0].cell).steps < 300
+    run_here(two[:1], lambda _: None)
+    assert contents(two[0].path) == uninterrupted
+
+
+def test_processes_run_cells_side_by_side_and_outlive_one_that_dies(tmp_path):
+    deadly = cell(0, "probes:Deadly-v0", environment_arguments={"seed": training_seed(0, 20)})
+    three, messages = jobs(tmp_path, cell(0), deadly, cell(1)), []
+    run_in_processes(three, messages.append, workers=2)
+    assert outcomes(messages) == {
+        three[0].cell.key: "complete",
+        deadly.key: "failed",
+        three[2].cell.key: "complete",
+    }
+    assert "killed by SIGKILL" in Store(tmp_path).status(deadly).reason
+    assert {type(message) for message in messages[:2]} == {Started}
+
+
+@pytest.mark.parametrize(
+    ("workers", "shares"),
+    [(None, [[0], [1], [2], [3]]), (1, [[0, 1, 2, 3]]), (2, [[0, 2], [1, 3]]), (3, [[0, 3], [1], [2]]), (5, 5)],
+)
+def test_workers_share_the_cores(workers, shares):
+    split = split_cores([0, 1, 2, 3], workers)
+    assert len(split) == shares if isinstance(shares, int) else split == shares

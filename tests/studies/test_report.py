@@ -1,0 +1,179 @@
+import numpy as np
+import pytest
+from made import MadeRecords
+
+from csac.studies import paper
+from csac.studies.arms import Arm, gather
+from csac.studies.claims import Comparison, comparisons, decide, interactions, lower_boundary
+from csac.studies.named import NAMED
+from csac.studies.report import write_report
+
+HEIGHTS = {"csac": 6_000, "sac": 5_000, "td3": 4_000, "sd3": 3_000, "ppo": 1_000}
+
+
+def made(cell, step):
+    """A straight line up to the algorithm's height, a little higher for each seed."""
+    return (HEIGHTS[cell.algorithm] + 10 * cell.seed) * step / cell.steps
+
+
+def mujoco(**narrow):
+    (study,) = NAMED["mujoco"]
+    return study.narrowed(["HalfCheetah-v4"], **narrow)
+
+
+def compare(ours, others, **options):
+    return decide(Comparison("ours is better", np.array(ours, float), np.array(others, float)), **options)
+
+
+# Verdicts.
+
+
+@pytest.mark.parametrize(
+    ("ours", "others", "verdict"),
+    [
+        ([6, 7, 8, 9, 10], [1, 2, 3, 4, 5], "reproduced"),
+        ([1, 2, 3, 4, 5], [6, 7, 8, 9, 10], "not reproduced"),
+        ([1, 2, 3, 4, 5], [1, 2, 3, 4, 5], "not yet decidable"),
+        ([6, 7, 8, 9], [1, 2, 3, 4], "not yet decidable"),
+        ([6, 7, 8, 9, 10], [], "not yet decidable"),
+    ],
+)
+def test_verdicts(ours, others, verdict):
+    assert compare(ours, others).verdict == verdict
+
+
+def test_a_verdict_says_why():
+    assert compare([6, 7, 8, 9, 10], [1, 2, 3, 4, 5]).why == (
+        "better in 100% of the pairs of seeds, 95 % interval 100% to 100%"
+    )
+    assert compare([2], [1, 1, 1, 1, 1]).why == "better in 100% of the pairs of seeds; 1 seed: no interval below 5"
+    assert compare([], [1]).why == "not measured"
+
+
+def test_shortened_runs_decide_nothing():
+    decision = compare([6, 7, 8, 9, 10], [1, 2, 3, 4, 5], is_whole=False)
+    assert decision.verdict == "not yet decidable"
+    assert decision.why.startswith("of the shortened runs it holds: ")
+
+
+def test_the_claims_of_the_tables():
+    """Of each variant of CSAC: four methods on three tasks, and on Hopper, where SD3 has more, three."""
+    (study,) = NAMED["mujoco"]
+    claims = comparisons("mujoco", ["returns"], gather(study, MadeRecords(made)))
+    assert len(claims) == 2 * (3 * 4 + 3)
+    assert {decide(one).verdict for one in claims} == {"reproduced"}
+    (study,) = NAMED["ablation"]
+    assert len(comparisons("ablation", ["returns"], gather(study, MadeRecords(made)))) == 2 * 4
+    (study,) = NAMED["robustness"]
+    assert len(comparisons("robustness", ["robustness"], gather(study, MadeRecords(made)))) == 2 * 3 * 3
+
+
+# Arms.
+
+
+def test_arms_merge_seeds_and_tell_what_is_missing():
+    source = MadeRecords(
+        lambda cell, step: None if cell.seed == 4 else made(cell, step),
+        lambda cell: "step 100: critic is not finite" if cell.seed == 1 else "",
+    )
+    arm = gather(mujoco(algorithms=["sac"]), source)[0]
+    assert set(arm.rows["seed"]) == {0, 2, 3}
+    assert (arm.failures, arm.missing) == ({1: "step 100: critic is not finite"}, [4])
+    over, (values, step) = arm.maximum(), arm.best()
+    assert (step, values.tolist()) == (1_000_000, [5_000, 5_020, 5_030])
+    assert over.mean == pytest.approx(np.mean([5_000, 5_020, 5_030]))
+    assert over.std == pytest.approx(np.std([5_000, 5_020, 5_030], ddof=1))
+
+
+def test_interactions_to_the_lower_boundary():
+    arms = gather(mujoco(), MadeRecords(made))
+    by_label = {arm.label: arm for arm in arms}
+    boundary = lower_boundary(arms)
+    assert boundary == 1_020  # PPO's, the mean of its five seeds
+    # 6,000 at 1M steps and an evaluation every 50,000: 1,020 is reached at 200,000 (1,200), after 150,000 (900).
+    assert interactions(by_label["CSAC (paper)"], boundary).tolist() == [200_000] * 5
+    # Of PPO, seeds 0 and 1 end below the mean of all five.
+    assert interactions(by_label["PPO"], boundary).tolist() == [np.inf, np.inf, 1e6, 1e6, 1e6]
+
+
+def test_an_arm_of_which_there_is_nothing(tmp_path):
+    study = mujoco(algorithms=["sac"])
+    source = MadeRecords(lambda *_: None)
+    assert isinstance(gather(study, source)[0], Arm)
+    text = write_report([study], source, tmp_path, []).read_text()
+    assert "0 of 5 cells are complete, 5 are not over." in text
+    assert "## Hyperparameters" in text
+
+
+# The report.
+
+
+def test_published_numbers_stand_beside_measured_ones(tmp_path):
+    text = write_report([mujoco()], MadeRecords(made), tmp_path, ["csac study run mujoco"]).read_text()
+    assert "| SAC | 11,052.89 ± 422.84 | 5,020 ± 16 | 1,000,000 | 5 |" in text
+    assert "| CSAC (default) |  | 6,020 ± 16 | 1,000,000 | 5 |" in text
+    claim = "HalfCheetah-v4: CSAC (paper) has a higher maximum average return than PPO"
+    assert f"| {claim} | reproduced |" in text
+    assert "30 of 30 cells are complete." in text
+    assert "csac train HalfCheetah-v4 --algorithm csac --steps 1000000 --seeds 5 --evaluation-interval 5000" in text
+    assert "--reference-policy algorithm1 --relative-entropy-estimator sampled" in text
+    assert "scale" not in text
+
+
+def test_a_shortened_report_says_so_everywhere(tmp_path):
+    text = write_report([mujoco().shortened(0.1)], MadeRecords(made), tmp_path, []).read_text()
+    assert "**Every run is shortened to 0.1 of its steps.**" in text
+    headings = [line for line in text.splitlines() if line.startswith("## ")]
+    assert headings[:3] == [
+        "## The paper's claims (scale 0.1)",
+        "## Learning curves (scale 0.1)",
+        "## Maximum average returns (scale 0.1)",
+    ]
+    assert "| reproduced |" not in text
+    assert (tmp_path / "mujoco-curve-halfcheetah-v4-scale-0.1.png").exists()
+
+
+@pytest.mark.parametrize("name", [name for name in NAMED if name not in ("mujoco", "reference", "smoke")])
+def test_every_study_has_its_tables_and_pictures(tmp_path, name):
+    (study,) = NAMED[name]
+    text = write_report([study.narrowed(tasks=study.tasks[:1])], MadeRecords(made), tmp_path, []).read_text()
+    pictures = {line.split("](")[1].split(")")[0] for line in text.splitlines() if line.startswith("![")}
+    assert pictures
+    assert all((tmp_path / picture).stat().st_size > 10_000 for picture in pictures | _svg(pictures))
+    wanted = {
+        "ablation": "CSAC (paper), tau 0.5 ",
+        "efficiency": "| CSAC (paper) | 105,000 | 200,000 | 5 of 5 |",
+        "robustness": "friction x 2.5 after step 300,000",
+        "quadx": "| env_complete | 352 ± 241.57 |",
+        "panda": "In the paper success is near 100 % for CSAC by 600k steps",
+    }
+    assert wanted[name] in text
+
+
+def _svg(pictures):
+    return {picture.replace(".png", ".svg") for picture in pictures}
+
+
+def test_equal_records_give_equal_reports(tmp_path):
+    study = mujoco(algorithms=["sac"])
+    files = []
+    for folder in ("one", "two"):
+        write_report([study], MadeRecords(made), tmp_path / folder, [])
+        files.append({path.name: path.read_bytes() for path in (tmp_path / folder).iterdir()})
+    assert files[0] == files[1]
+
+
+# The paper.
+
+
+def test_the_paper_s_tables_agree_with_its_text():
+    returns = paper.MAXIMUM_AVERAGE_RETURNS
+    ratios = {task: columns["CSAC"].mean / columns["SAC"].mean - 1 for task, columns in returns.items()}
+    told = {"HalfCheetah-v4": 0.056, "Walker2d-v4": 0.515, "Ant-v4": 0.059, "Hopper-v4": 0.139}
+    assert ratios == pytest.approx(told, abs=6e-4)
+    for task in returns:
+        assert min(returns[task].values()).mean == returns[task]["PPO"].mean  # the lower boundary is PPO's
+    fewer = {task: 1 - columns["CSAC"] / columns["SAC"] for task, columns in paper.INTERACTIONS.items()}
+    assert fewer == pytest.approx(
+        {"HalfCheetah-v4": 0.087, "Walker2d-v4": 0.503, "Ant-v4": 0.25, "Hopper-v4": 0.615}, abs=1e-3
+    )

@@ -1,0 +1,57 @@
+"""Records of cells that nobody has run: what a report shows of numbers that are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from csac.record.manifest import EvaluationPlan, Machine, Manifest
+from csac.record.tables import structured
+from csac.studies.cells import Cell
+from csac.studies.results import Record
+
+COLUMNS = ("seed", "step", "episode", "return", "length", "success", "out_of_bounds", "collision", "env_complete")
+
+
+def rows(cell: Cell, value: Callable[[int], float], points: int = 20, episodes: int = 2) -> np.ndarray:
+    """Evaluations of one cell: `value(step)` is the return of each episode."""
+    steps = [cell.steps * (point + 1) // points for point in range(points)]
+    return structured(
+        COLUMNS,
+        [
+            [str(cell.seed), str(step), str(episode), str(value(step)), "100", "1", "0", "0", "1"]
+            for step in steps
+            for episode in range(episodes)
+        ],
+    )
+
+
+class MadeRecords:
+    """A source of records: the return of a cell at a step is `value(cell, step)`; None is a cell that is not over."""
+
+    def __init__(
+        self, value: Callable[[Cell, int], float | None], failing: Callable[[Cell], str] = lambda _: ""
+    ) -> None:
+        self.value, self.failing = value, failing
+
+    def record(self, cell: Cell) -> Record | None:
+        if self.value(cell, 0) is None:
+            return None
+        reason = self.failing(cell)
+        manifest = Manifest(
+            task=cell.task,
+            algorithm=cell.algorithm,
+            hyperparameters=cell.hyperparameters,
+            perturbations=cell.perturbations,
+            seeds=(cell.seed,),
+            steps=cell.steps,
+            evaluation=EvaluationPlan(cell.evaluation_interval, cell.evaluation_episodes),
+            machine=Machine("a processor"),
+            versions={"csac": "0.1.0"},
+            commit="0123456",
+            state="failed" if reason else "finished",
+            failures={cell.seed: reason} if reason else {},
+        )
+        table = rows(cell, lambda step: self.value(cell, step) or 0.0)
+        return Record(manifest, 60.0, table, rows(cell, lambda _: 1.0, points=1, episodes=10))
