@@ -389,10 +389,10 @@ def second_kill(folder: Path, cache: Path) -> list[str]:
             strike("worker", process, workers[0] if target == 400 else workers[-1])
         process.wait(PATIENCE)
     manifest = json.loads((folder / "run" / "manifest.json").read_text())
-    failure = manifest.failures.get("0", "")
+    failure = manifest["failures"].get("0", "")
     wrong = [] if process.returncode == 3 else [f"exit code {process.returncode} instead of 3"]
-    if list(manifest.failures) != ["0"] or "for the second time, its process was killed by SIGKILL" not in failure:
-        wrong.append(f"failures are {manifest.failures}")
+    if list(manifest["failures"]) != ["0"] or "for the second time, its process was killed by SIGKILL" not in failure:
+        wrong.append(f"failures are {manifest['failures']}")
     return wrong
 
 

@@ -647,7 +647,7 @@ def test_a_run_is_the_same_until_it_is_perturbed(plain, perturbed):
 
 
 def test_a_run_says_what_it_was_perturbed_by(perturbed):
-    assert perturbed.manifest.perturbations == [
+    assert list(perturbed.manifest.perturbations) == [
         "friction=2@200",
         "observation_noise=0.05@200",
         "mass=1.5@250",
