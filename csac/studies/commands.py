@@ -370,7 +370,7 @@ def _jobs(studies: Sequence[Study], cells: Sequence[Cell], store: Store, options
             device=options.device,
             keep_checkpoints=options.keep_checkpoints,
             rollouts=rollouts[cell.key],
-            command=command_line(),
+            command=shlex.join(["csac", *sys.argv[1:]]),
         )
         for cell in cells
     ]

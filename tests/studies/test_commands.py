@@ -67,6 +67,12 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
     assert states == ["complete", "waiting"]
 
 
+def test_a_manifest_tells_the_command_and_not_where_csac_is(engine, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/home/me/.venv/bin/csac", "study", "run", "tiny.toml"])
+    assert csac("study run tiny.toml") == 0
+    assert {job.command for job in engine} == {"csac study run tiny.toml"}
+
+
 def test_one_cell_of_an_array(engine):
     assert csac("study run tiny.toml --cell 1") == 0
     assert [job.cell.seed for job in engine] == [1]
