@@ -20,7 +20,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from csac.console.tables import duration, make_console, program, short
 from csac.processes import usable_cores
 from csac.studies.calibration import Calibration, Prediction, predict
-from csac.studies.cells import HOME, Cell, Store, is_final
+from csac.studies.cells import HOME, Cell, Store, is_final, similar
 from csac.studies.engines import run_here, run_in_processes
 from csac.studies.job import Ended, Job, Message, Stopped, is_over
 from csac.studies.named import NAMED, find
@@ -148,19 +148,25 @@ class Report(Chosen):
 def narrowed(
     studies: Sequence[Study], tasks: Sequence[str] | None, algorithms: Sequence[str] | None, seeds: int | None
 ) -> list[Study]:
-    """Narrow each of the studies; those of several that have none of the tasks or algorithms are left out.
+    """Narrow each of the studies to what it has of these tasks and algorithms; one that has nothing is left out.
 
     Raises:
         InputError: none of them has one that is asked for.
     """
-    chosen, complaint = [], None
+    known_tasks = dict.fromkeys(task for study in studies for task in study.tasks)
+    known_algorithms = dict.fromkeys(name for study in studies for name in study.names)
+    for wanted, known, what in ((tasks, known_tasks, "task"), (algorithms, known_algorithms, "algorithm or method")):
+        for name in wanted or ():
+            if name not in known:
+                raise InputError(
+                    f"{' and '.join(study.name for study in studies)}: no {what} {name!r}{similar(name, known)}"
+                )
+    chosen = []
     for study in studies:
-        try:
-            chosen.append(study.narrowed(tasks, algorithms, seeds))
-        except InputError as error:
-            complaint = complaint or error
-    if complaint and not chosen:
-        raise complaint
+        own_tasks = [task for task in study.tasks if tasks is None or task in tasks]
+        own_names = [name for name in study.names if algorithms is None or name in algorithms]
+        if own_tasks and own_names:
+            chosen.append(study.narrowed(own_tasks, own_names, seeds))
     return chosen
 
 
@@ -364,7 +370,7 @@ def _jobs(studies: Sequence[Study], cells: Sequence[Cell], store: Store, options
             device=options.device,
             keep_checkpoints=options.keep_checkpoints,
             rollouts=rollouts[cell.key],
-            command=command_line(),
+            command=shlex.join(["csac", *sys.argv[1:]]),
         )
         for cell in cells
     ]

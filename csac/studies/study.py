@@ -97,9 +97,13 @@ class Study:
             seeds=self.seeds if seeds is None else seeds,
         )
 
+    @property
+    def names(self) -> list[str]:
+        """By which its methods may be chosen: those of their algorithms, and their labels."""
+        return list(dict.fromkeys(name for method in self.methods for name in (method.algorithm, method.label)))
+
     def _some_methods(self, wanted: Sequence[str]) -> tuple[Method, ...]:
-        names = [name for method in self.methods for name in (method.algorithm, method.label)]
-        chosen = _some(wanted, dict.fromkeys(names), f"{self.name} has no algorithm or method")
+        chosen = _some(wanted, self.names, f"{self.name} has no algorithm or method")
         return tuple(method for method in self.methods if {method.algorithm, method.label} & set(chosen))
 
     def steps_for(self, task: str) -> int:

@@ -34,7 +34,15 @@ autodoc_default_options = {"members": True}
 
 # The side of each page. What stands in docs/ and in no list comes last, so that a new page is seen at once.
 NAVIGATION = {
-    "Use": ["docs/python", "docs/tasks", "docs/perturbations", "docs/going-on", "docs/reliability"],
+    "Use": [
+        "docs/python",
+        "docs/tasks",
+        "docs/perturbations",
+        "docs/studies",
+        "docs/cluster",
+        "docs/going-on",
+        "docs/reliability",
+    ],
     "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo")],
     "Measured": ["docs/performance", "docs/gpu", "benchmarks/README", "results/*/README", "results/parity/*/README"],
     "Inside": ["docs/design", "docs/adding-an-algorithm", "CONTRIBUTING", "docs/reference/csac", "CHANGELOG"],

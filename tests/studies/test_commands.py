@@ -67,6 +67,12 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
     assert states == ["complete", "waiting"]
 
 
+def test_a_manifest_tells_the_command_and_not_where_csac_is(engine, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/home/me/.venv/bin/csac", "study", "run", "tiny.toml"])
+    assert csac("study run tiny.toml") == 0
+    assert {job.command for job in engine} == {"csac study run tiny.toml"}
+
+
 def test_one_cell_of_an_array(engine):
     assert csac("study run tiny.toml --cell 1") == 0
     assert [job.cell.seed for job in engine] == [1]
@@ -84,9 +90,10 @@ def test_what_is_narrowed_is_run(engine):
 
 
 def test_studies_of_smoke_without_the_task_are_left_out(engine):
-    assert csac("study run smoke --tasks PandaReach-v3 --algorithms sac") == 0
-    (job,) = engine
-    assert (job.cell.task, job.cell.algorithm) == ("PandaReach-v3", "sac")
+    assert csac("study run smoke --tasks PandaReach-v3,PyFlyt/QuadX-Waypoints-v1 --algorithms sac,TD3") == 0
+    assert {(job.cell.task, job.cell.algorithm) for job in engine} == {
+        (task, algorithm) for task in ("PandaReach-v3", "PyFlyt/QuadX-Waypoints-v1") for algorithm in ("sac", "td3")
+    }
 
 
 def test_rollouts_are_asked_of_the_cells_that_need_them(engine):
@@ -123,8 +130,8 @@ def test_a_signal_is_an_exit_code_and_the_line_to_type(monkeypatch, capsys):
         ("study run tiny.toml --address 10.0.0.1:6379", "add --engine ray"),
         ("study run tiny.toml --engine ray --cell-cores 0", "--cell-cores is at least 1"),
         ("study run tiny.toml --scale 2", "scale is a share of the steps"),
-        ("study run tiny.toml --tasks Ant-v4", "tiny has no task 'Ant-v4': there is Hopper-v4"),
-        ("study run smoke --tasks Swimmer-v4", "has no task 'Swimmer-v4'"),
+        ("study run tiny.toml --tasks Ant-v4", "tiny: no task 'Ant-v4': there is Hopper-v4"),
+        ("study run smoke --tasks Swimmer-v4", "no task 'Swimmer-v4'"),
         ("study run tiny.toml --engine kubernetes", "'kubernetes' is not one of"),
     ],
 )
