@@ -35,13 +35,17 @@ _COMPLAINTS = (
 )
 
 
+class HelpShown(Exception):
+    """A command's help was asked for, and is printed."""
+
+
 def parse(
     command: type[Command],
     arguments: list[str],
     program: str,
     elsewhere: Mapping[str, type[Any]] = MappingProxyType({}),
 ) -> Command:
-    """Return the parsed arguments; print the help and raise SystemExit where it is asked for.
+    """Return the parsed arguments; print the help and raise HelpShown where it is asked for.
 
     `elsewhere` are the dataclasses that other values of --algorithm would have, so that their options are known.
 
@@ -53,9 +57,9 @@ def parse(
         return tyro.cli(command, prog=program, args=arguments, registry=_numbers(), config=(DisallowNone,), **options)
 
     if {"-h", "--help"} & set(arguments):
-        with suppress(BrokenPipeError):
+        with suppress(BrokenPipeError, SystemExit):
             run()
-        raise SystemExit(0)
+        raise HelpShown
     complaint = io.StringIO()
     try:
         # With standard output elsewhere too, tyro takes it for one that cannot show boxes.

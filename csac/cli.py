@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from csac.arguments import json_object, nearest, parse, peek
+from csac.arguments import HelpShown, json_object, nearest, parse, peek
 from csac.presets import PRESETS, hyperparameters
 from csac.training.options import Options
 from csac.types import InputError
@@ -199,7 +199,7 @@ def _dispatch(arguments: list[str]) -> int:
         raise InputError(f"no command is called {arguments[0]!r}{nearest(arguments[0], commands)} (csac --help)")
     try:
         return commands[arguments[0]](arguments[1:])
-    except SystemExit:  # tyro has printed a command's help
+    except HelpShown:
         return 0
 
 
@@ -277,8 +277,8 @@ def _evaluate(arguments: list[str]) -> int:
     from csac.console.waiting import progress_shown
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.play import evaluate_run, perturbation_notes
+    from csac.record.csv_tables import COLUMNS, check_new, write_rows
     from csac.record.run import RunDirectory
-    from csac.record.tables import COLUMNS, check_new, write_rows
 
     console = make_console()
     told = perturbation_notes(options.run, options.perturb)

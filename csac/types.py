@@ -94,10 +94,10 @@ class Snapshot(NamedTuple):
 
 
 class Ring(NamedTuple):
-    """A seed's memory: transition number i lies in row i % capacity, as far as `count` of them were added."""
+    """A seed's memory: transition number i lies in row i % capacity, as far as `added` of them were."""
 
     rows: np.ndarray  # [capacity, width]
-    count: int
+    added: int
 
 
 class Cadence(NamedTuple):

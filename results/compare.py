@@ -9,11 +9,11 @@ Each argument is a label and a file in the format of evaluations.csv. The others
 import argparse
 from pathlib import Path
 
+from csac.record.csv_tables import read_rows
 from csac.record.plots import learning_curve
 from csac.record.rendering import markdown
 from csac.record.summaries import compare
 from csac.record.summary_tables import comparison_table
-from csac.record.tables import read_rows
 
 
 def main() -> None:

@@ -9,11 +9,11 @@ Each argument is a label and a file in the format of evaluations.csv. The metric
 import argparse
 from pathlib import Path
 
+from csac.record.csv_tables import read_rows
 from csac.record.plots import learning_curve
 from csac.record.rendering import markdown
 from csac.record.summaries import recoveries
 from csac.record.summary_tables import recovery_table
-from csac.record.tables import read_rows
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ EPSILON = 1e-8
 class Statistics(NamedTuple):
     """Mean and spread of everything absorbed so far; the identity, 0 and 1, before there is any."""
 
-    count: Scalar
+    total: Scalar
     mean: Float[Array, "..."]
     variance: Float[Array, "..."]
     std: Float[Array, "..."]  # sqrt(variance + epsilon), kept because it is needed at every step and changes at few
@@ -29,8 +29,8 @@ class Statistics(NamedTuple):
 
     def absorb(self, values: Float[Array, "n ..."]) -> Statistics:
         """Return the statistics of all values so far and of these (Chan, Golub, LeVeque 1979)."""
-        count = self.count + len(values)
-        shares = self.count / count, len(values) / count
+        count = self.total + len(values)
+        shares = self.total / count, len(values) / count
         # Differences to the old mean, because they are small: little is rounded away where the mean itself is large.
         differences = jax.vmap(jnp.subtract, in_axes=(0, None))(values, self.mean)
         shift = jnp.mean(differences, axis=0)

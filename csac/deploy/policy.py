@@ -10,7 +10,7 @@ import numpy as np
 from csac.deploy import tensors
 from csac.deploy.contract import Activation, Contract, read_file
 from csac.deploy.parameters import check_network, copied, from_tensors, to_tensors
-from csac.record.files import write_atomically
+from csac.record.atomic import write_atomically
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork
 
 LOG_STD_RANGE = (-20.0, 2.0)

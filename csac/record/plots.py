@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from csac.record.files import write_atomically
+from csac.record.atomic import write_atomically
 from csac.record.rendering import short
 from csac.record.statistics import evaluation_matrix, mean_and_interval
 

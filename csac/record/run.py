@@ -1,4 +1,4 @@
-"""A run directory: its manifest, its tables, its log, and what all its files are called."""
+"""A run directory: its manifest, its tables, its log, and what its files are called."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 import numpy as np
 
 from csac.record import manifest as manifests
-from csac.record.files import create_atomically, write_atomically
-from csac.record.tables import COLUMNS, append_rows, read_rows, structured
+from csac.record.atomic import create_atomically, write_atomically
+from csac.record.csv_tables import COLUMNS, append_rows, read_rows, structured
 from csac.types import InputError
 
 try:

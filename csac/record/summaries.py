@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from csac.record.curves import Recovery, recovery
+from csac.record.csv_tables import COLUMNS
+from csac.record.curve_measures import Recovery, recovery
 from csac.record.statistics import (
     FEWEST_FOR_INTERVAL,
     evaluation_matrix,
@@ -24,7 +25,6 @@ from csac.record.statistics import (
     probability_of_improvement,
     stratified_bootstrap_interval,
 )
-from csac.record.tables import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 class OverSeeds(NamedTuple):
     """A number over seeds. NaN where there are too few: `std` of one seed, the 95 % t-interval of two."""
 
-    count: int
+    seeds: int
     mean: float
     std: float
     low: float

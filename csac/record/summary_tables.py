@@ -1,11 +1,11 @@
-"""Summaries as tables of text, the same for the terminal, Markdown and HTML: see `rendering`."""
+"""Results, comparisons, recoveries and cases per 1,000 rollouts as tables of text: see `rendering`."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
-from csac.record.curves import REGAINED, Recovery
+from csac.record.curve_measures import REGAINED, Recovery
 from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric, short
 from csac.record.statistics import FEWEST_FOR_BOOTSTRAP, FEWEST_FOR_INTERVAL
 from csac.record.summaries import OverSeeds, case_names, cases
@@ -44,13 +44,13 @@ def results_table(results: RunResults) -> Table:
         for one in results.seeds
     ]
     over = (results.last, results.last_three, results.best)
-    if results.last.count > 1:
+    if results.last.seeds > 1:
         step = EMPTY if results.best_step is None else _whole(results.best_step)
         rows.append(_summary("mean", *returns(*(one.mean for one in over)), step, EMPTY))
         rows.append(_summary("± std", *returns(*(one.std for one in over)), EMPTY, EMPTY))
         rows += interval_rows(over, largest, blank=2)
     headings = ("seed", "last return", "last three", "best", "at step", "episodes")
-    return Table(headings, tuple(rows), note=few_seeds(results.last.count))
+    return Table(headings, tuple(rows), note=few_seeds(results.last.seeds))
 
 
 def comparison_table(runs: Sequence[RunSummary]) -> Table:
@@ -69,7 +69,7 @@ def comparison_table(runs: Sequence[RunSummary]) -> Table:
         ("to the first", lambda run: _ratio(run, runs[0])),
         ("maximum average return", _maximum),
     ]
-    if any(run.last.count >= FEWEST_FOR_BOOTSTRAP for run in runs):
+    if any(run.last.seeds >= FEWEST_FOR_BOOTSTRAP for run in runs):
         columns.append(("IQM, 95 % bootstrap interval", _middle))
         columns.append(("above the first, probability", _above_first))
     if any(run.success for run in runs):
@@ -163,15 +163,15 @@ def plus_minus(over: OverSeeds) -> Cell:
 
 def interval(over: OverSeeds) -> Cell:
     """Return the interval of a mean, or that there are too few seeds for one."""
-    if over.count < FEWEST_FOR_INTERVAL:
-        return Cell(f"{over.count} seed{'s' * (over.count != 1)}: no interval", math.nan)
+    if over.seeds < FEWEST_FOR_INTERVAL:
+        return Cell(f"{over.seeds} seed{'s' * (over.seeds != 1)}: no interval", math.nan)
     form = _form(over.mean)
     return Cell(f"{over.low:{form}} to {over.high:{form}}", over.mean)
 
 
 def interval_rows(over: Sequence[OverSeeds], largest: float, blank: int) -> list[Row]:
     """Return a row with the reach of these intervals and `blank` empty cells, or none where there are too few seeds."""
-    if over[0].count < FEWEST_FOR_INTERVAL:
+    if over[0].seeds < FEWEST_FOR_INTERVAL:
         return []
     reach = [numeric(one.high - one.mean, number(one.high - one.mean, largest)) for one in over]
     return [_summary("± 95 %", *reach, *[EMPTY] * blank)]
@@ -195,7 +195,7 @@ def _form(value: float) -> str:
 
 
 def _seeds(run: RunSummary) -> Cell:
-    return Cell(str(run.last.count) + (f" ({run.failed} failed)" if run.failed else ""), run.last.count)
+    return Cell(str(run.last.seeds) + (f" ({run.failed} failed)" if run.failed else ""), run.last.seeds)
 
 
 def _ratio(run: RunSummary, first: RunSummary) -> Cell:

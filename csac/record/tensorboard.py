@@ -13,8 +13,8 @@ from tensorboardX.proto.event_pb2 import Event as TensorBoardEvent  # pyright: i
 from tensorboardX.proto.event_pb2 import SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
+from csac.record.csv_tables import COLUMNS
 from csac.record.statistics import is_case, mean_over_episodes
-from csac.record.tables import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

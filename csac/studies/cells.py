@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_type_hints
 
 from csac.algorithms import ALGORITHMS
 from csac.console.tables import short
-from csac.record.files import write_atomically
+from csac.record.atomic import write_atomically
 from csac.record.run import LOCK, MANIFEST, RunDirectory, is_run
 from csac.tasks.known import events_of
 from csac.tasks.perturbations import perturbations_of

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from csac.record.curves import recovery, steps_to_reach
+from csac.record.curve_measures import recovery, steps_to_reach
 from csac.record.statistics import (
     FEWEST_FOR_BOOTSTRAP,
     evaluation_matrix,

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from csac.record.csv_tables import COLUMNS, write_rows
 from csac.record.run import RunDirectory
-from csac.record.tables import COLUMNS, write_rows
 from csac.studies.cells import Cell, is_final, is_in_use, read_history, write_history
 from csac.types import InputError
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.console.tables import duration
-from csac.record.files import write_atomically
+from csac.record.atomic import write_atomically
 from csac.record.rendering import Cell, Row, Table, markdown, number, numeric, short
 from csac.record.summaries import compare, recoveries
 from csac.record.summary_tables import case_comparison_table, comparison_table, plus_minus, recovery_table
@@ -131,7 +131,7 @@ class _Writer:
                     Cell(f"{told.mean:,.2f} ± {told.std:,.2f}", told.mean) if told else Cell("", math.nan),
                     plus_minus(over),
                     numeric(step, f"{step:,}"),
-                    Cell(str(over.count), over.count),
+                    Cell(str(over.seeds), over.seeds),
                 )
                 rows.append(Row(cells))
             headings = ("method", "the paper", "measured", "at step", "seeds")

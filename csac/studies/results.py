@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from csac.record import manifest as manifests
-from csac.record.files import write_atomically
+from csac.record.atomic import write_atomically
+from csac.record.csv_tables import read_rows
 from csac.record.run import RunDirectory
-from csac.record.tables import read_rows
 from csac.studies.cells import Cell, Store, is_final, read_history
 from csac.studies.job import ROLLOUTS
 from csac.types import InputError

@@ -26,9 +26,9 @@ def training_seed(seed: int, episode: int) -> int:
 
 
 class FinishedEpisode(NamedTuple):
-    """A training episode that ended; `index` is the seed's place in the group."""
+    """A training episode that ended; `place` is the seed's place in the group."""
 
-    index: int
+    place: int
     episode_return: float
     length: int
 
@@ -36,7 +36,7 @@ class FinishedEpisode(NamedTuple):
 class Failure(NamedTuple):
     """A seed whose environment failed: why in one line, and the traceback where something raised."""
 
-    index: int
+    place: int
     reason: str
     details: str
 
@@ -113,10 +113,10 @@ class SeedEnvironments:
                 episodes.append(FinishedEpisode(index, self._returns[index], self._lengths[index]))
         self._observation, self._reward = next_observation.copy(), reward
         for episode in episodes:
-            self._reset(episode.index)
+            self._reset(episode.place)
         failures, self._failures = self._failures, []
         for failure in failures:
-            self.alive[failure.index] = False
+            self.alive[failure.place] = False
         return Steps(next_observation, reward, terminated, truncated, self._observation, episodes, failures)
 
     def stop(self, index: int) -> None:

@@ -1,4 +1,4 @@
-"""From a task's spaces and values to flat, finite float32 arrays; what does not become one is refused here."""
+"""Which spaces are accepted, and the order of their parts in one vector, which `Environment` and `Contract` join."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import safetensors.numpy
 
-from csac.record.files import write_atomically
-from csac.record.parity import mended
+from csac.record.atomic import write_atomically
+from csac.record.redundancy import mended
 from csac.training.seed_files import content_of, is_unchanged, parity_name, sha256, shards_of
 from csac.types import InputError, Snapshot
 

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from csac.types import PolicyNetwork
 
 METRICS_INTERVAL = 1_000
-PROGRESS_INTERVAL = 250
 
 
 class Evaluation(NamedTuple):
@@ -146,7 +145,7 @@ class Group:
                 yield Rows("metrics", _metrics_rows(self.learner, environments, self.seeds, self.step))
             if self.step % METRICS_INTERVAL == 0:
                 self.learner.forget_metrics()
-            boundary = is_boundary(self.settings, self.step)
+            boundary = self.settings.ends_turn(self.step)
             if boundary:
                 yield from self._stop_diverged()
             due = self.step % plan.evaluation_interval == 0 or last
@@ -206,11 +205,11 @@ class Group:
         outcome = self.environments.step(self._actions)
         self.step += 1
         for failure in outcome.failures:
-            network = self.learner.networks()[failure.index]
+            network = self.learner.networks()[failure.place]
             policy = Policy(network, self._contract) if _is_finite(network) else None
-            yield Failed(self.seeds[failure.index], self.step, failure.reason, failure.details, policy)
+            yield Failed(self.seeds[failure.place], self.step, failure.reason, failure.details, policy)
         if outcome.episodes:
-            yield Rows("episodes", [_episode_row(self.seeds[e.index], self.step, e) for e in outcome.episodes])
+            yield Rows("episodes", [_episode_row(self.seeds[e.place], self.step, e) for e in outcome.episodes])
         self._actions = self.learner.step(self._observations, self._actions, outcome, self.step)
         self._observations = outcome.observation
         flat = self._actions.ravel()
@@ -293,12 +292,6 @@ class Group:
         self._observations, self._actions = self.environments.observations, actions
         if anew:
             self._actions[anew] = self.learner.next_actions(self._observations, self.step)[anew]
-
-
-def is_boundary(settings: Settings, step: int) -> bool:
-    """Whether a group says how far it is at this step, so that it can be saved there."""
-    interval = settings.plan.checkpoint_interval
-    return step % PROGRESS_INTERVAL == 0 or step == settings.plan.steps or bool(interval and step % interval == 0)
 
 
 def _without(message: GroupMessage, seeds: set[int]) -> GroupMessage | None:

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from csac.training.seed_files import Files
 
 
+TURN_STEPS = 250  # environment steps that a group makes before another may have its cores
+
+
 class Settings(NamedTuple):
     """What a group is told: the plan, and where it begins. Picklable, so that a group can be another process."""
 
@@ -24,6 +27,11 @@ class Settings(NamedTuple):
     """The step of the checkpoint to go on from; 0 begins anew."""
     has_other_task: bool = False
     """Whether that checkpoint is of another task, so that its episodes in progress are no use."""
+
+    def ends_turn(self, step: int) -> bool:
+        """Whether a group says how far it is at this step, so that it can be saved and give way to another."""
+        interval = self.plan.checkpoint_interval
+        return step % TURN_STEPS == 0 or step == self.plan.steps or bool(interval and step % interval == 0)
 
     @property
     def saves(self) -> bool:

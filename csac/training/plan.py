@@ -4,25 +4,31 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+from contextlib import closing
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.algorithms import ALGORITHMS
 from csac.presets import matching_preset
 from csac.record.manifest import CheckpointPlan, EvaluationPlan, Manifest
+from csac.record.run import RunDirectory, default_directory, is_run
+from csac.tasks.environment import Environment
 from csac.tasks.known import check_events, events_of
-from csac.tasks.perturbations import Perturbation, perturbations_of
-from csac.training.options import Options, check_whole
+from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
+from csac.tasks.trust import remember
+from csac.training.devices import choose_device
+from csac.training.options import Options, check_whole, checked_options
+from csac.training.resume import Source, planned_perturbations
 from csac.training.scheduler import choose_evaluation_processes, choose_groups, split_seeds
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from csac.record.run import RunDirectory
     from csac.tasks.making import Task
     from csac.training.options import PlanOptions
-    from csac.types import Algorithm
+    from csac.types import Algorithm, Spec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +72,83 @@ class Plan(Options):
         )
 
 
-def choose_events(task: Task, given: Sequence[str] | None, before: Manifest | None) -> tuple[str, ...]:
+class Before(NamedTuple):
+    """What was there before this call: the run that goes on, or the checkpoint that another run begins with."""
+
+    directory: Path | None
+    existing: RunDirectory | None
+    source: Source | None
+
+    @classmethod
+    def find(cls, directory: str | Path | None, resume: bool, start_from: str | Path | None) -> Before:
+        """Look for what is to be continued. Raises InputError where it cannot be."""
+        path = None if directory is None else Path(directory)
+        existing = RunDirectory.open(path) if path and resume and is_run(path) else None
+        return cls(path, existing, Source.find(start_from) if start_from is not None and not existing else None)
+
+    @property
+    def run(self) -> RunDirectory | None:
+        """The run that is continued, in its own directory or in another."""
+        return self.existing or (self.source.run if self.source else None)
+
+    def path(self, plan: Plan) -> Path:
+        """Return the directory of the new run."""
+        return self.directory or default_directory(plan.task_name, plan.algorithm.name)
+
+
+def make_plan(
+    algorithm: Algorithm, task: Task, given: PlanOptions, before: Before, may_evaluate_beside: bool
+) -> tuple[Plan, Spec]:
+    """Return what is to be done, with everything decided that was left open, and the sizes of the task.
+
+    Raises:
+        InputError: a mistake in the options, or a task that csac cannot learn.
+    """
+    options, others = checked_options(given)
+    choose_device(options.device)
+    if others.get("evaluation_processes") and not may_evaluate_beside:
+        raise InputError("stop_when is asked before training goes on: leave out evaluation_processes")
+    arguments = dict(others.get("environment_arguments") or {})
+    asked = others.get("perturbations")
+    continued = before.run.manifest if before.run else None
+    with closing(Environment(task, arguments)) as environment:
+        spec, task_name = environment.spec, environment.task_name
+        remember(task)
+        changes = planned_perturbations(asked, before.existing, before.source)
+        if not before.existing:  # whose number of steps has its own refusal
+            refuse_late(changes, options.steps, planned=before.source is not None and asked is None)
+        for item in changes:
+            environment.perturb({item.kind: item.value})
+    problem = _why_not_sent(algorithm, task, arguments)
+    existing = before.existing.manifest if before.existing else None
+    parts = _choose_parts(others.get("groups", 1), options, existing, not problem)
+    processes = _choose_processes(
+        others.get("evaluation_processes", 0), parts, options, may_evaluate_beside and not problem
+    )
+    if problem and (processes or len(parts) > 1):
+        wanted, without = ("evaluation_processes need", "evaluation_processes=0") if processes else _SEVERAL
+        raise InputError(
+            f"the task cannot be sent to another process, which {wanted}: "
+            f"make it a module's function, or train with {without} ({problem})"
+        )
+    plan = Plan(
+        **dataclasses.asdict(options),
+        algorithm=algorithm,
+        task=task,
+        task_name=task_name,
+        environment_arguments=arguments,
+        perturbations=changes,
+        events=_choose_events(task, others.get("events"), continued),
+        groups=parts,
+        evaluation_processes=processes,
+    )
+    return plan, spec
+
+
+_SEVERAL = ("several groups need", "groups=1")
+
+
+def _choose_events(task: Task, given: Sequence[str] | None, before: Manifest | None) -> tuple[str, ...]:
     """Return the events asked for beside the task's own; without a word those of the run that this one continues."""
     check_events(given or ())
     if given is None and before:
@@ -74,7 +156,7 @@ def choose_events(task: Task, given: Sequence[str] | None, before: Manifest | No
     return events_of(task, given or ())
 
 
-def choose_parts(
+def _choose_parts(
     groups: int | None, options: Options, existing: Manifest | None, can_be_sent: bool
 ) -> tuple[tuple[int, ...], ...]:
     """Return the seeds of each group, for as many groups as were asked for or, without a word, as pay here."""
@@ -86,7 +168,7 @@ def choose_parts(
     return tuple(tuple(part) for part in split_seeds(options.labels, groups))
 
 
-def choose_processes(given: int | None, parts: Sequence[Sequence[int]], options: Options, allowed: bool) -> int:
+def _choose_processes(given: int | None, parts: Sequence[Sequence[int]], options: Options, allowed: bool) -> int:
     """Return how many processes each group evaluates with, asked for or as pay here."""
     if given is not None:
         check_whole("evaluation_processes", given, 0, 1_000)
@@ -143,7 +225,7 @@ def check_algorithm(algorithm: object) -> None:
     raise InputError(f"{given:.60} is no algorithm with hyperparameters: give {names.get(given.lower(), 'CSAC')}()")
 
 
-def why_not_sent(*things: object) -> Exception | None:
+def _why_not_sent(*things: object) -> Exception | None:
     """Return what keeps things from being sent to another process, or None."""
     try:
         pickle.dumps(things)

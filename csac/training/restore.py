@@ -1,4 +1,4 @@
-"""What a checkpoint keeps of a run's other files, tables and best policies, and how it gives them back."""
+"""Copies a run's tables and best policies into a checkpoint, and puts them and the length of its log back."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from contextlib import suppress
 from typing import TYPE_CHECKING, get_args
 
-from csac.record.files import write_atomically
+from csac.record.atomic import write_atomically
 from csac.record.run import Table
 from csac.training.checkpoint import BEST, FOLDER, Damaged, original_of
 from csac.training.seed_files import write_file

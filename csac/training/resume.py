@@ -1,4 +1,4 @@
-"""Going on with a run, or beginning another from its checkpoint: what fits, what has changed, what is undone."""
+"""Resuming a run or forking another from its checkpoint: what is refused, what may change, what is rolled back."""
 
 from __future__ import annotations
 
@@ -179,6 +179,9 @@ class Source(NamedTuple):
                 problem = misfit(self.checkpoint.seed(wanted.seeds[0]).part("learner"))
                 tasks = f" ({before.task}, and {wanted.task} now)" if before.task != wanted.task else ""
                 found += [problem + tasks] if problem else []
+        kept, size = (m.hyperparameters.get("replay_size", 0) for m in (before, wanted))
+        if kept < self.checkpoint.step and kept < size:
+            found.append(f"its replay kept {kept:,} transitions and no others, so replay_size cannot be {size:,}")
         if found:
             raise InputError(f"{self.run.path} does not fit: {'; '.join(found)}")
         if wanted.steps <= self.checkpoint.step:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from csac.evaluation.evaluator import EPISODES_AT_ONCE
 from csac.processes import Child, die_with_parent, move_to, usable_cores
 from csac.training.checkpoint import remove_unfinished
-from csac.training.group import Group, is_boundary
+from csac.training.group import Group
 from csac.training.messages import (
     Boundary,
     Ended,
@@ -255,7 +255,7 @@ class _Scheduler:
     def _end_of_turn(self, worker: _Worker) -> int:
         if worker.cores is None:
             return worker.step
-        return next(step for step in count(worker.step + 1) if is_boundary(self.settings, step))
+        return next(step for step in count(worker.step + 1) if self.settings.ends_turn(step))
 
     def _take_cores(self, worker: _Worker) -> None:
         if worker.cores is not None:

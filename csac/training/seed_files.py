@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import safetensors.numpy
 
-from csac.record.files import write_atomically
-from csac.record.parity import parity_of
+from csac.record.atomic import write_atomically
+from csac.record.redundancy import parity_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -48,22 +48,22 @@ class SeedFiles:
         """
         for folder in (self.folder, self.folder / "replay"):  # not their parents: a run that was deleted stays so
             folder.mkdir(exist_ok=True)
-        oldest = max(memory.count - len(memory.rows), 0)
+        oldest = max(memory.added - len(memory.rows), 0)
         self._write_new_rows(memory, oldest)
         name = f"step_{step}.seed_{self.seed}.safetensors"
         content = safetensors.numpy.save(
             {key: np.asarray(array, order="C") for key, array in saved.arrays.items()},
-            metadata={"values": json.dumps(saved.values), "transitions": json.dumps([oldest, memory.count])},
+            metadata={"values": json.dumps(saved.values), "transitions": json.dumps([oldest, memory.added])},
         )
         return {name: write_file(self.folder, name, content), **self._shards}
 
     def _write_new_rows(self, memory: Ring, oldest: int) -> None:
         last = max((last for _, last, _ in shards_of(self._shards, self.seed)), default=0)
         first = max(last, oldest)
-        if first < memory.count:
-            rows = memory.rows[np.arange(first, memory.count) % len(memory.rows)]
+        if first < memory.added:
+            rows = memory.rows[np.arange(first, memory.added) % len(memory.rows)]
             content = safetensors.numpy.save({"rows": rows})
-            name = f"replay/seed_{self.seed}.{first}-{memory.count}.safetensors"
+            name = f"replay/seed_{self.seed}.{first}-{memory.added}.safetensors"
             self._shards[name] = write_file(self.folder, name, content)
             self._shards[parity_name(name)] = write_file(self.folder, parity_name(name), parity_of(content))
         for _, last, name in shards_of(self._shards, self.seed):

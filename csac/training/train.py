@@ -10,35 +10,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.processes import end_if_unguarded
-from csac.record.run import RunDirectory, default_directory, is_run
-from csac.tasks.environment import Environment
-from csac.tasks.perturbations import by_step, perturbations_of, refuse_late
-from csac.tasks.trust import refuse_untrusted, remember
+from csac.record.run import RunDirectory
+from csac.tasks.perturbations import by_step, perturbations_of
+from csac.tasks.trust import refuse_untrusted
 from csac.training.checkpoint import Checkpoints
 from csac.training.compilation import tidy_programs
-from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
 from csac.training.interruptions import Interrupted, caught_signals, storage_failures_told
 from csac.training.learner import misfit
 from csac.training.messages import Settings
-from csac.training.options import checked_options
-from csac.training.plan import (
-    Plan,
-    algorithm_of,
-    check_algorithm,
-    choose_events,
-    choose_parts,
-    choose_processes,
-    options_of,
-    why_not_sent,
-)
+from csac.training.plan import Before, Plan, algorithm_of, check_algorithm, make_plan, options_of
+from csac.training.provenance import provenance
 from csac.training.recorder import Recorder
-from csac.training.resume import BEGINNING, Restart, Source, planned_perturbations, refuse_differences, roll_back
+from csac.training.resume import BEGINNING, Restart, refuse_differences, roll_back
 from csac.training.scheduler import run_groups
-from csac.training.surroundings import surroundings
-from csac.types import InputError
 
 if TYPE_CHECKING:
+    import threading
     from collections.abc import Callable
 
     from typing_extensions import Unpack
@@ -48,7 +36,7 @@ if TYPE_CHECKING:
     from csac.record.tensorboard import TensorBoardLog
     from csac.tasks.making import Task
     from csac.training.options import PlanOptions
-    from csac.types import Algorithm, Spec
+    from csac.types import Algorithm
 
     OnEvaluation = Callable[[int, dict[int, float]], Any]
     StopWhen = Callable[[int, dict[int, float]], bool]
@@ -109,7 +97,7 @@ def train(
     before = Before.find(directory, resume, start_from)
     plan, spec = make_plan(algorithm, task, options, before, may_evaluate_beside=stop_when is None)
     notes = [memory_needed(plan, spec), *_warmup_note(plan)]
-    wanted = plan.manifest(**surroundings(task, command))
+    wanted = plan.manifest(**provenance(task, command))
     has_schedule, defaults = algorithm.cadence.has_schedule, _defaults(algorithm)
     if before.existing:
         run = before.existing
@@ -171,82 +159,6 @@ def resume(
     )
 
 
-class Before(NamedTuple):
-    """What was there before this call: the run that goes on, or the checkpoint that another run begins with."""
-
-    directory: Path | None
-    existing: RunDirectory | None
-    source: Source | None
-
-    @classmethod
-    def find(cls, directory: str | Path | None, resume: bool, start_from: str | Path | None) -> Before:
-        """Look for what is to be continued. Raises InputError where it cannot be."""
-        path = None if directory is None else Path(directory)
-        existing = RunDirectory.open(path) if path and resume and is_run(path) else None
-        return cls(path, existing, Source.find(start_from) if start_from is not None and not existing else None)
-
-    @property
-    def run(self) -> RunDirectory | None:
-        """The run that is continued, in its own directory or in another."""
-        return self.existing or (self.source.run if self.source else None)
-
-    def path(self, plan: Plan) -> Path:
-        """Return the directory of the new run."""
-        return self.directory or default_directory(plan.task_name, plan.algorithm.name)
-
-
-def make_plan(
-    algorithm: Algorithm, task: Task, given: PlanOptions, before: Before, may_evaluate_beside: bool
-) -> tuple[Plan, Spec]:
-    """Return what is to be done, with everything decided that was left open, and the sizes of the task.
-
-    Raises:
-        InputError: a mistake in the options, or a task that csac cannot learn.
-    """
-    options, others = checked_options(given)
-    choose_device(options.device)
-    if others.get("evaluation_processes") and not may_evaluate_beside:
-        raise InputError("stop_when is asked before training goes on: leave out evaluation_processes")
-    arguments = dict(others.get("environment_arguments") or {})
-    asked = others.get("perturbations")
-    continued = before.run.manifest if before.run else None
-    with closing(Environment(task, arguments)) as environment:
-        spec, task_name = environment.spec, environment.task_name
-        remember(task)
-        changes = planned_perturbations(asked, before.existing, before.source)
-        if not before.existing:  # whose number of steps has its own refusal
-            refuse_late(changes, options.steps, planned=before.source is not None and asked is None)
-        for item in changes:
-            environment.perturb({item.kind: item.value})
-    problem = why_not_sent(algorithm, task, arguments)
-    existing = before.existing.manifest if before.existing else None
-    parts = choose_parts(others.get("groups", 1), options, existing, not problem)
-    processes = choose_processes(
-        others.get("evaluation_processes", 0), parts, options, may_evaluate_beside and not problem
-    )
-    if problem and (processes or len(parts) > 1):
-        wanted, without = ("evaluation_processes need", "evaluation_processes=0") if processes else _SEVERAL
-        raise InputError(
-            f"the task cannot be sent to another process, which {wanted}: "
-            f"make it a module's function, or train with {without} ({problem})"
-        )
-    plan = Plan(
-        **dataclasses.asdict(options),
-        algorithm=algorithm,
-        task=task,
-        task_name=task_name,
-        environment_arguments=arguments,
-        perturbations=changes,
-        events=choose_events(task, others.get("events"), continued),
-        groups=parts,
-        evaluation_processes=processes,
-    )
-    return plan, spec
-
-
-_SEVERAL = ("several groups need", "groups=1")
-
-
 class Watchers(NamedTuple):
     """Who is told what happens, beside the run directory."""
 
@@ -286,7 +198,25 @@ def _go_on(run: RunDirectory, plan: Plan, wanted: Any, notes: list[str], watcher
 
 
 def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, restart: Restart) -> RunDirectory:
-    """Train until the last step, a signal or a failure, and write down what happens."""
+    """Train until the last step or a signal, from the first preparation to the last picture."""
+    with caught_signals() as (stop, received):
+        recorder = _follow(run, plan, notes, watchers, restart, stop, received)
+    if run.manifest.state == "interrupted":
+        is_saved = recorder.checkpoints is not None and recorder.checkpoints.newest is not None
+        raise Interrupted(run, received[0], is_saved)
+    return run
+
+
+def _follow(
+    run: RunDirectory,
+    plan: Plan,
+    notes: list[str],
+    watchers: Watchers,
+    restart: Restart,
+    stop: threading.Event,
+    received: list[int],
+) -> Recorder:
+    """Train until the last step, a request to stop or a failure, and write down what happens."""
     reporter, begin, failures = watchers.reporter, restart.step, restart.failures
     groups = [list(group) for group in plan.groups if not set(group) <= set(failures)]
     notes = [*notes, *filter(None, [tidy_programs()])]
@@ -299,10 +229,7 @@ def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, re
     checkpoints = Checkpoints(folder, plan.keep_checkpoints, restart.pinned) if folder else None
     recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures, by_step(plan.perturbations))
     try:
-        with (
-            caught_signals() as (stop, received),
-            closing(run_groups(settings, groups, stop.is_set, checkpoints)) as told,
-        ):
+        with closing(run_groups(settings, groups, stop.is_set, checkpoints)) as told:
             is_told = False
             for group, message in told:
                 if received and reporter and not is_told:
@@ -322,9 +249,7 @@ def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, re
             log.close()
         if reporter:
             reporter.close()
-    if stopped:
-        raise Interrupted(run, received[0], is_saved=checkpoints is not None and checkpoints.newest is not None)
-    return run
+    return recorder
 
 
 def _begins_on_another_task(run: RunDirectory, begin: int) -> bool:

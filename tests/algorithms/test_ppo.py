@@ -150,7 +150,7 @@ def test_statistics_are_those_of_everything_absorbed():
     statistics = Statistics.create((3,))
     for part in np.split(values, [7, 8, 150]):
         statistics = statistics.absorb(jnp.array(part))
-    assert float(statistics.count) == 300
+    assert float(statistics.total) == 300
     np.testing.assert_allclose(statistics.mean, values.astype(float).mean(0), rtol=1e-5)
     np.testing.assert_allclose(statistics.variance, values.astype(float).var(0), rtol=1e-4)
     np.testing.assert_allclose(statistics.std**2, statistics.variance + 1e-8, rtol=1e-5)

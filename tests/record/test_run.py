@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from csac.record import run as record
-from csac.record.files import write_atomically
+from csac.record.atomic import write_atomically
+from csac.record.csv_tables import read_rows
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory, default_directory, find_runs
-from csac.record.tables import read_rows
 from csac.types import InputError
 
 MANIFEST = Manifest(

@@ -70,7 +70,7 @@ def test_the_last_of_all_is_where_all_are():
 @pytest.mark.parametrize("rows", [rows_of([NAN, NAN]), rows_of([1.0])[:0]])
 def test_a_run_without_returns_has_no_results(rows):
     results = run_results(rows)
-    assert (results.seeds, results.last.count, results.best_step) == ((), 0, None)
+    assert (results.seeds, results.last.seeds, results.best_step) == ((), 0, None)
     assert results_table(results).rows == ()
 
 
@@ -85,7 +85,7 @@ def test_a_run_beside_the_first():
 
 def test_a_failed_seed_is_counted_and_left_out():
     (one,) = compare([("a", rows_of([1.0, 3.0], [500.0]))], failed={"a": [1]})
-    assert (one.failed, one.last.count, one.last.mean, one.best) == (1, 1, 2.0, 3.0)
+    assert (one.failed, one.last.seeds, one.last.mean, one.best) == (1, 1, 2.0, 3.0)
     assert lines(comparison_table([one]))[1][:4] == ["a", "1 (1 failed)", "20", "2.00"]
 
 
@@ -116,7 +116,7 @@ def test_what_a_perturbation_cost_several_runs():
     a = recoveries("a", rows_of([100.0, 40.0, 95.0], [200.0, 100.0, 150.0]), 10)
     b = recoveries("b", rows_of([10.0, 11.0]), 10)
     assert (a.regained, a.known, a.metrics["drop"].mean, b.regained, b.known) == (1, 2, 80.0, 1, 1)
-    assert a.metrics["steps_to_regain"].count == 0
+    assert a.metrics["steps_to_regain"].seeds == 0
     assert lines(recovery_table([a, b])) == [
         ["run", "seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "drawdown"],
         ["a", "0", "100.0", "60.0", "60%", "20", "625", "67.5", "60.0"],

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from csac.record.csv_tables import structured
 from csac.record.manifest import EvaluationPlan, Machine, Manifest
-from csac.record.tables import structured
 from csac.studies.cells import Cell
 from csac.studies.results import Record
 

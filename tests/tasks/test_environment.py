@@ -407,7 +407,7 @@ def test_a_seed_that_breaks_fails_alone_and_is_not_stepped_again():
     assert environments.alive.tolist() == [True, False, True]
     raws = [environment.raw.unwrapped for environment in environments.environments]
     assert [raw.count["step"] for raw in raws] == [4, 3, 4]  # pyright: ignore
-    assert [episode.index for episode in broken.episodes] == [0, 2]
+    assert [episode.place for episode in broken.episodes] == [0, 2]
 
 
 @pytest.mark.parametrize(
@@ -431,7 +431,7 @@ def test_a_seed_that_fails_in_its_first_reset_is_reported_by_the_first_step():
     environments.reset()
     assert environments.alive.all()
     first, second = steps_of(environments, 2)
-    assert [(failure.index, failure.reason) for failure in first.failures] == [
+    assert [(failure.place, failure.reason) for failure in first.failures] == [
         (0, "reset raised RuntimeError: the simulator broke"),
         (1, "reset raised RuntimeError: the simulator broke"),
     ]
@@ -454,7 +454,7 @@ def test_a_stopped_seed_steps_no_more():
     environments.stop(0)
     assert environments.alive.tolist() == [False, True]
     _, second = steps_of(environments, 2)
-    assert [failure.index for failure in second.failures] == [1]
+    assert [failure.place for failure in second.failures] == [1]
 
 
 @pytest.mark.parametrize("wrapper", ["NormalizeObservation", "NormalizeReward"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import runpy
 import shlex
@@ -29,9 +30,9 @@ from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import EPISODES_AT_ONCE, EvaluationFailure, Evaluator, _number
 from csac.evaluation.play import evaluate_run
 from csac.evaluation.pool import EvaluationPool, choose_processes
+from csac.record.csv_tables import read_rows
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
-from csac.record.tables import read_rows
 from csac.tasks import known
 from csac.tasks.environment import Environment
 from csac.tasks.seeds import EVALUATION_SEED
@@ -150,7 +151,7 @@ def test_the_arm_has_its_parts_in_the_order_of_their_names_and_says_whether_it_i
     assert environment.contract_parts.observation_parts == parts
     raw = environment.raw_observation
     np.testing.assert_array_equal(first, np.concatenate([raw[key] for key, _ in parts]))
-    steps, terminated = 0, False
+    reward, info, steps, terminated = math.nan, {}, 0, False
     while not terminated and steps < 20:
         raw, steps = environment.raw_observation, steps + 1
         towards = np.clip(10 * (raw["desired_goal"] - raw["achieved_goal"]), -1, 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -110,7 +110,7 @@ class Watcher:
     def cadence(self):
         return Cadence(self.warmup_steps, self.update_interval, self.updates_per_interval, self.batch_size)
 
-    def memory(self, spec, steps):
+    def memory(self, spec, steps) -> Any:
         return Replay.create(steps, spec, self.update_interval)
 
     def init(self, key, spec, steps):

@@ -449,6 +449,29 @@ def test_a_fork_that_does_not_fit_is_refused(tmp_path, short_run, where, change,
     assert not (tmp_path / "second").exists()
 
 
+def test_a_replay_that_has_forgotten_transitions_cannot_become_larger(tmp_path):
+    """It has no rows to put where the larger one would draw from: they were drawn as zeros."""
+    run(tmp_path / "first", steps=200)
+    with pytest.raises(InputError, match="its replay kept 150 transitions and no others, so replay_size cannot be 300"):
+        run(tmp_path / "second", replace(LEARNERS[0], replay_size=300), steps=400, start_from=tmp_path / "first")
+    assert not (tmp_path / "second").exists()
+
+
+def test_a_fork_to_another_task_begins_its_episode_anew(tmp_path):
+    """Of as many observations and actions, but another body: what was learnt goes on, the episode cannot."""
+    run(tmp_path / "first", steps=130, task="HalfCheetah-v4")
+    forked = run(tmp_path / "second", steps=200, task="Walker2d-v4", start_from=tmp_path / "first")
+    assert (forked.manifest.state, forked.manifest.steps_done) == ("finished", 200)
+    changes = ("task is 'HalfCheetah-v4', not 'Walker2d-v4'",)
+    assert forked.manifest.forked_from == Origin(str(tmp_path / "first"), 130, changes)
+
+
+def test_where_no_checkpoints_are_wanted_none_is_made_after_one_either(tmp_path, short_run):
+    forked = run(tmp_path / "second", steps=200, start_from=short_run, checkpoint_interval=0)
+    assert forked.manifest.state == "finished"
+    assert steps_in(forked.checkpoints) == [130]
+
+
 def test_a_run_of_a_function_goes_on_through_train(tmp_path):
     with pytest.raises(Crash):
         run(tmp_path / "run", task=probes.Endless, on_evaluation=crash_at(200))

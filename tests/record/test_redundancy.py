@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from csac.record.parity import PIECES, SMALLEST, mended, parity_of
+from csac.record.redundancy import PIECES, SMALLEST, mended, parity_of
 
 
 def random_bytes(size: int, seed: int = 0) -> bytes:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from csac.tasks.making import Task
 
 
-def surroundings(task: Task, command: str | None) -> dict[str, Any]:
+def provenance(task: Task, command: str | None) -> dict[str, Any]:
     """Return these fields of a manifest."""
     return {
         "machine": Machine(_processor(), len(usable_cores()), platform.node()),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from csac.record.curves import area_under_curve, dispersion_within, drawdown, recovery, steps_to_reach
+from csac.record.curve_measures import area_under_curve, dispersion_within, drawdown, recovery, steps_to_reach
 
 
 def rows_of(*evaluations):
