@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
-import json
 import os
 import shlex
 import sys
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING
 
-from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, UseAppendAction, arg
-
-from csac.arguments import HelpShown, json_object, nearest, parse, peek
-from csac.presets import PRESETS, hyperparameters
-from csac.training.options import Options
+from csac.arguments import HelpShown, nearest, parse
+from csac.commands import Chosen, Evaluate, Play, Resume, Runs
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from csac.record.manifest import Manifest
     from csac.record.run import RunDirectory
-    from csac.training.options import PlanOptions
 
 HELP = """\
 usage: csac COMMAND ...
@@ -44,114 +36,6 @@ Train controllers for continuous-control tasks with Conservative Soft Actor-Crit
 
 To begin: csac train HalfCheetah-v4 --seeds 2 --steps 60_000
 """
-
-
-@dataclass(frozen=True, kw_only=True)
-class Train(Options):
-    """Train controllers for a task: independent seeds, each evaluated as it learns.
-
-    Exit codes: 0 done, 2 wrong arguments, 3 a seed failed, 130 or 143 stopped by a signal (what was learnt is saved).
-    """
-
-    task: Annotated[Positional[str], arg(metavar="TASK")]
-    """A Gymnasium id such as HalfCheetah-v4, or module:Id for an environment that a module registers."""
-    algorithm: str = "csac"
-    """What learns; its own options are listed below."""
-    preset: str | None = None
-    """Hyperparameters to start from: paper is the paper's tables. Options given here win over it."""
-    directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/TASK/ALGORITHM/DATE-TIME)")] = None
-    """The run's own directory, new or empty."""
-    resume: FlagCreatePairsOff[bool] = False
-    """Go on with the run in --directory, if there is one already."""
-    start_from: Annotated[str | None, arg(name="from", metavar="DIR[@STEP]", help_behavior_hint="(default: none)")] = (
-        None
-    )
-    """Begin with a copy of that run's checkpoint; what is not given here is as it was there."""
-    events: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: the task's own)")] = None
-    """More names in the info of an evaluation episode's last step: each becomes a column and a curve of its own."""
-    env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
-    """Keyword arguments for the environment, as a JSON object."""
-    perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE[@STEP]")] = ()
-    """Change the task after STEP environment steps, as friction=1.5@300000 does: factors on friction, gravity, mass or
-    gain of a MuJoCo task, standard deviations of observation_noise or action_noise. With --from, none leaves out what
-    that run had planned."""
-    groups: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
-    """Processes to split the seeds over."""
-    evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
-    """Processes in which each group evaluates while it trains on; 0 evaluates in line. The results are the same."""
-
-    def plan_options(self) -> PlanOptions:
-        """Return the options of `train` that are given here."""
-        same = {item.name: getattr(self, item.name) for item in dataclasses.fields(Options)}
-        options: Any = {
-            **same,
-            "environment_arguments": json_object("--env-kwargs", self.env_kwargs),
-            "perturbations": _perturbations(self.perturb),
-            "events": None if self.events is None else self.events.split(","),
-            "groups": self.groups,
-            "evaluation_processes": self.evaluation_processes,
-        }
-        return options
-
-
-@dataclass(frozen=True)
-class Resume:
-    """Go on with a run from its newest checkpoint, as if it had never stopped."""
-
-    run: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The directory of a run."""
-    steps: Annotated[int | None, arg(help_behavior_hint="(default: as many as it was started for)")] = None
-    """Environment steps per seed in all, counted from the run's beginning; may be more than it was started for."""
-    trust_task: FlagCreatePairsOff[bool] = False
-    """Run the code of the module that the task names, though you have never named it here; look at it first."""
-
-
-@dataclass(frozen=True)
-class Evaluate:
-    """Test the last policies of a run on fresh episodes, which neither training nor its evaluations have seen."""
-
-    run: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The directory of a run."""
-    seed: Annotated[int | None, arg(help_behavior_hint="(default: every seed)")] = None
-    """Label of the seed to test."""
-    episodes: int = 10
-    """Episodes per seed, the same for each."""
-    processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
-    """Processes that share the episodes; the numbers are the same with any number of them."""
-    stochastic: FlagCreatePairsOff[bool] = False
-    """Draw actions from the policy instead of taking its most likely one."""
-    perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
-    """Change the task, as friction=2 does; the kinds are those of csac train."""
-    csv: Annotated[Path | None, arg(metavar="FILE.csv")] = None
-    """Write a row for each episode there as well, as in evaluations.csv."""
-    trust_task: FlagCreatePairsOff[bool] = False
-    """Run the code of the module that the task names, though you have never named it here; look at it first."""
-
-
-@dataclass(frozen=True)
-class Play:
-    """Watch the policy of a run in a window, or write a video of it."""
-
-    run: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The directory of a run."""
-    seed: Annotated[int | None, arg(help_behavior_hint="(default: the one with the best last evaluations)")] = None
-    """Label of the seed to watch."""
-    episodes: int = 1
-    """How many episodes."""
-    video: Annotated[Path | None, arg(metavar="OUT.mp4", help_behavior_hint="(default: a window)")] = None
-    """Write this file instead of opening a window; needs no display."""
-    perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
-    """Change the task, as friction=2 does; the kinds are those of csac train."""
-    trust_task: FlagCreatePairsOff[bool] = False
-    """Run the code of the module that the task names, though you have never named it here; look at it first."""
-
-
-@dataclass(frozen=True)
-class Runs:
-    """List the runs below a directory."""
-
-    directory: Annotated[Positional[Path], arg(metavar="DIR")] = Path("runs")
-    """Where to look."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -262,15 +146,6 @@ def _exit_code(training: Callable[[], RunDirectory]) -> int:
     return 3 if run.manifest.state == "failed" else 0
 
 
-def _perturbations(given: tuple[str, ...]) -> tuple[str, ...] | None:
-    """Return what a run is to be perturbed by; without a word of it None, as planned in the run that it begins with."""
-    if "none" in given:
-        if len(given) > 1:
-            raise InputError("--perturb none leaves everything out: give it alone")
-        return ()
-    return given or None
-
-
 def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
     from csac.console.tables import case_table, evaluation_table, make_console, silent_events
@@ -371,75 +246,6 @@ def _study(arguments: list[str]) -> int:
         raise InputError(f"no study command is called {arguments[0]!r}{hint} (csac study --help)")
     kind, run = COMMANDS[arguments[0]]
     return run(parse(kind, arguments[1:], f"csac study {arguments[0]}"))
-
-
-class Chosen(NamedTuple):
-    """What is known of a `csac train` before its options can be: they and their defaults depend on it."""
-
-    algorithm: str
-    preset: str | None
-    source: Manifest | None
-    """Of the run to begin with."""
-
-    @classmethod
-    def among(cls, arguments: list[str]) -> Chosen:
-        """Look for what was chosen. Raises InputError for an algorithm, or a run to begin with, that is not there."""
-        from csac.algorithms import ALGORITHMS
-
-        source = None
-        if (where := peek(arguments, "--from", None)) is not None:
-            from csac.training.resume import Source
-
-            source = Source.find(where).run.manifest
-        name = peek(arguments, "--algorithm", source.algorithm if source else "csac")
-        if name not in ALGORITHMS:
-            raise InputError(f"no algorithm is called {name!r}: choose {' or '.join(ALGORITHMS)}")
-        return cls(name, peek(arguments, "--preset", None), source)
-
-    def command(self, task: str) -> type[Any]:
-        """Return `Train` with the hyperparameters of the algorithm beside its own options.
-
-        Their defaults are those of the preset for this task, or of the run to begin with.
-        """
-        from csac.algorithms import ALGORITHMS
-
-        presets: Any = Literal[PRESETS]
-        hint = arg(help_behavior_hint=f"(default: {self.preset or 'none'})")
-        values = hyperparameters(self.preset, self.algorithm, task) if self.preset else {}
-        algorithm, fields = ALGORITHMS[self.algorithm](**values), []
-        if self.source:
-            from csac.training.plan import algorithm_of
-
-            is_same = self.source.algorithm == self.algorithm and not self.preset
-            algorithm = algorithm_of(self.source) if is_same else algorithm
-            fields += [(name, kind, field(default=value)) for name, kind, value in _inherited(self.source)]
-        fields += [
-            ("algorithm", Literal[tuple(ALGORITHMS)], field(default=self.algorithm)),
-            ("preset", Annotated[presets | None, hint], field(default=self.preset)),
-            (self.algorithm, OmitArgPrefixes[type(algorithm)], field(default=algorithm)),
-        ]
-        documented = {"__doc__": Train.__doc__}
-        return dataclasses.make_dataclass(
-            "Train", fields, bases=(Train,), frozen=True, kw_only=True, namespace=documented
-        )
-
-    def others(self) -> dict[str, type[Any]]:
-        """Return the algorithms that were not chosen, by name."""
-        from csac.algorithms import ALGORITHMS
-
-        return {name: kind for name, kind in ALGORITHMS.items() if name != self.algorithm}
-
-
-def _inherited(source: Manifest) -> list[tuple[str, Any, Any]]:
-    """Return the options of `Train`, with their types, that a run takes from the one it begins with."""
-    return [
-        ("steps", int, source.steps),
-        ("seeds", int, len(source.seeds)),
-        ("first_seed", int, source.seeds[0]),
-        ("evaluation_interval", int, source.evaluation.interval),
-        ("evaluation_episodes", int, source.evaluation.episodes),
-        ("env_kwargs", Annotated[str, arg(metavar="JSON")], json.dumps(source.environment_arguments)),
-    ]
 
 
 def _say(text: str) -> None:
