@@ -150,8 +150,9 @@ class Checkpoint:
         try:
             # The header: eight bytes of length, then JSON. The library gives the metadata of files alone.
             metadata = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
-            first, last = json.loads(metadata["transitions"])
-            return Snapshot(safetensors.numpy.load(content), json.loads(metadata["values"])), (int(first), int(last))
+            saved = json.loads(metadata["saved"])
+            first, last = saved["transitions"]
+            return Snapshot(safetensors.numpy.load(content), saved["values"]), (int(first), int(last))
         except (safetensors.SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise Damaged(f"{self.folder / name} is not what csac writes ({error})") from error
 

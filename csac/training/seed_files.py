@@ -53,7 +53,8 @@ class SeedFiles:
         name = f"step_{step}.seed_{self.seed}.safetensors"
         content = safetensors.numpy.save(
             {key: np.asarray(array, order="C") for key, array in saved.arrays.items()},
-            metadata={"values": json.dumps(saved.values), "transitions": json.dumps([oldest, memory.added])},
+            # One entry: of several the library chooses the order anew each time, and equal runs have equal files.
+            metadata={"saved": json.dumps({"values": saved.values, "transitions": [oldest, memory.added]})},
         )
         return {name: write_file(self.folder, name, content), **self._shards}
 

@@ -273,9 +273,9 @@ def facts_of(content: bytes) -> dict[str, Any]:
 def forge_transitions(place: Path, content: bytes, first: int, last: int) -> None:
     """Write a checkpoint of seed 0 that has this file of transitions alone."""
     (place / "replay").mkdir()
-    name, held = f"replay/seed_0.{first}-{last}.safetensors", json.dumps([first, last])
+    name, held = f"replay/seed_0.{first}-{last}.safetensors", [first, last]
     (place / name).write_bytes(content)
-    learnt = safetensors.numpy.save({}, metadata={"values": "{}", "transitions": held})
+    learnt = safetensors.numpy.save({}, metadata={"saved": json.dumps({"values": {}, "transitions": held})})
     (place / "step_5.seed_0.safetensors").write_bytes(learnt)
     fields = forged(content, name)
     fields["files"]["step_5.seed_0.safetensors"] = facts_of(learnt)

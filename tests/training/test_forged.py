@@ -59,9 +59,8 @@ def trained(tmp_path_factory):
 @pytest.fixture(scope="module")
 def group(trained):
     """One group for all: what it takes back is tried in place of what it holds."""
-    settings = plans.settings(LEARNER, "Hopper-v4", 400, trained / FOLDER, STEP, evaluation_interval=1000)
-    settings = settings._replace(perturbations=perturbations_of(NOISE))
-    return Group(settings, [0, 1])
+    options = {"evaluation_interval": 1000, "perturbations": perturbations_of(NOISE)}
+    return Group(plans.settings(LEARNER, "Hopper-v4", 400, trained / FOLDER, STEP, **options), [0, 1])
 
 
 def places(value: Any, path: Path_ = ()) -> Iterator[Path_]:
@@ -130,7 +129,7 @@ def test_a_forged_seed_is_refused_or_goes_on(tmp_path, trained, group):
 
 
 def write_seed(folder: Path, fields: dict[str, Any], name: str, arrays: dict[str, np.ndarray], values: Any) -> None:
-    metadata = {"values": json.dumps(values), "transitions": json.dumps([0, STEP])}
+    metadata = {"saved": json.dumps({"values": values, "transitions": [0, STEP]})}
     content = safetensors.numpy.save(arrays, metadata=metadata)
     (folder / name).write_bytes(content)
     facts = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
