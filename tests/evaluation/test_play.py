@@ -16,6 +16,11 @@ from csac.evaluation.play import evaluate_run, play
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 
+# JAX may be loaded here; where csac plays, it is not.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:os.fork:RuntimeWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
 
 class Stripes(gymnasium.Env):
     """It never ends by itself, and can be drawn."""

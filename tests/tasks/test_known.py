@@ -290,8 +290,8 @@ def test_silence_is_not_asked_of_other_tasks():
 @pytest.mark.parametrize(("task", "inputs"), [(QUAD, 27), (REACH, 12)])
 def test_a_robots_run_is_stopped_and_goes_on(tmp_path, task, inputs):
     run = train(TINY, task, steps=40, directory=tmp_path / "run", **SHORT)
-    assert run.manifest.events == list(known.events_of(task))
-    assert run.manifest.inexact_seeds == [0]
+    assert run.manifest.events == tuple(known.events_of(task))
+    assert run.manifest.inexact_seeds == (0,)
     assert {"pybullet"} <= run.manifest.versions.keys()
     before = run.evaluations
 
@@ -707,7 +707,7 @@ def test_the_example_of_the_documentation_runs(tmp_path, capsys, monkeypatch):
     example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "own_task.py"))
     example["main"](tmp_path / "run", 600)
     run = RunDirectory.open(tmp_path / "run")
-    assert run.manifest.events == ["off_the_rail", "reversals"]
+    assert run.manifest.events == ("off_the_rail", "reversals")
     assert (run.evaluations.dtype.names or ())[-3:] == ("success", "off_the_rail", "reversals")
-    assert run.manifest.inexact_seeds == []
+    assert run.manifest.inexact_seeds == ()
     assert capsys.readouterr().out.startswith("success ")
