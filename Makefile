@@ -78,7 +78,7 @@ gpu: $(SETUP) $(if $(shell command -v nvidia-smi),$(CUDA))  ## Measure training 
 	.venv/bin/python -m benchmarks gpu --write $(ARGS)
 
 lock: $(UV)  ## Compile requirements.lock anew from pyproject.toml, for Python 3.11 and newer
-	$(UV) pip compile pyproject.toml --extra robots --extra cluster --group dev --universal \
+	$(UV) pip compile pyproject.toml --extra cluster --extra onnx --extra robots --extra tune --extra wandb --group dev --universal \
 		--python-version 3.11 --upgrade --generate-hashes \
 		--no-emit-index-url --no-annotate --no-header --quiet --output-file requirements.lock
 

@@ -13,7 +13,7 @@ from csac.types import InputError
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
-STEPS = 3_000
+STEPS = 6_000
 
 
 @pytest.fixture
@@ -25,7 +25,9 @@ def cluster():
     cluster.shutdown()
 
 
-def test_a_node_that_is_lost_in_mid_run_loses_nothing(tmp_path, cluster):
+def test_a_node_that_is_lost_in_mid_run_loses_nothing(tmp_path, cluster, monkeypatch):
+    # Messages are looked at often, so that the node is lost while its cell runs, however fast the machine is.
+    monkeypatch.setattr("csac.studies.cluster.SECONDS_BETWEEN_LOOKS", 0.05)
     three = jobs(tmp_path / "ray", *(cell(seed, steps=STEPS) for seed in range(3)))
     nodes = [cluster.add_node(num_cpus=1, object_store_memory=100 * 2**20) for _ in range(2)]
     messages, places = [], {}
@@ -43,10 +45,8 @@ def test_a_node_that_is_lost_in_mid_run_loses_nothing(tmp_path, cluster):
     assert {message.key: message.outcome for message in messages if isinstance(message, Ended)} == {
         job.cell.key: "complete" for job in three
     }
-    resumed = [key for key, where in places.items() if len(where) == 2]
-    assert len(resumed) == 1
-    assert len({where for several in places.values() for where in several}) == 2
-    (again,) = [job for job in three if job.cell.key == resumed[0]]
+    (again,) = [job for job in three if RunDirectory.open(job.path).manifest.history]
+    assert len(set(places[again.cell.key])) == 2
     (entry,) = RunDirectory.open(again.path).manifest.history
     assert entry.step >= 360
     for job, alone in zip(three, jobs(tmp_path / "alone", *(job.cell for job in three)), strict=True):
