@@ -14,6 +14,7 @@ from csac.deploy import tensors
 from csac.deploy.artefact_contract import CONTRACT, POLICY_FILES, sha256_of
 from csac.deploy.parameters import to_tensors
 from csac.deploy.templates import LOADER
+from csac.record.atomic import write_atomically
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -37,16 +38,16 @@ def write_artefact(folder: Path, network: PolicyNetwork, contract: ArtefactContr
     path = folder / contract.file
     match contract.format:
         case "numpy":
-            path.write_bytes(tensors.encode(to_tensors(network.parameters)))
-            shutil.copyfile(LOADER, folder / LOADER.name)
+            write_atomically(path, tensors.encode(to_tensors(network.parameters)))
+            write_atomically(folder / LOADER.name, LOADER.read_bytes())
         case "onnx":
             from csac.deploy.onnx_graph import onnx_model
 
-            path.write_bytes(onnx_model(network, contract))
+            write_atomically(path, onnx_model(network, contract))
         case "c":
             from csac.deploy.c_source import c_header
 
-            path.write_text(c_header(network, contract), encoding="utf-8")
+            write_atomically(path, c_header(network, contract).encode())
     contract = dataclasses.replace(contract, sha256=sha256_of(path))
     write_contract(folder, contract)
     return contract
@@ -54,14 +55,15 @@ def write_artefact(folder: Path, network: PolicyNetwork, contract: ArtefactContr
 
 def write_contract(folder: Path, contract: ArtefactContract) -> None:
     """Write contract.json into the folder of an artefact."""
-    (folder / CONTRACT).write_text(contract.text(), encoding="utf-8")
+    write_atomically(folder / CONTRACT, contract.text().encode())
 
 
 def check_place(place: Path) -> None:
     """Raise InputError where an artefact cannot be put: over anything but an artefact."""
     if place.exists() and not place.is_dir():
         raise InputError(f"{place} is a file: choose a folder for the artefact")
-    if place.is_dir() and not {entry.name for entry in place.iterdir()} <= _OURS:
+    names = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
+    if names and not (CONTRACT in names and names <= _OURS):
         raise InputError(f"{place} holds more than an artefact: choose a new or an empty folder")
 
 
@@ -84,6 +86,10 @@ def placed(place: Path) -> Iterator[Path]:
         yield folder
         with suppress(FileNotFoundError):
             os.rename(place, aside / "old")
-        os.rename(folder, place)
+        try:
+            os.rename(folder, place)
+        except OSError:
+            os.rename(aside / "old", place)
+            raise
     finally:
         shutil.rmtree(aside, ignore_errors=True)

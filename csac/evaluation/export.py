@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -20,6 +19,7 @@ from csac.deploy.guards import Guards, make_guards
 from csac.deploy.policy import Policy
 from csac.deploy.writing import CARD, CURVE, check_place, placed, write_artefact, write_contract
 from csac.evaluation.verify import Compared, Returns, compare_actions, compare_returns, record, returns_as_fields
+from csac.record.atomic import write_atomically
 from csac.record.run import RunDirectory, Which
 from csac.record.statistics import evaluation_matrix
 from csac.tasks.environment import Environment
@@ -319,5 +319,5 @@ def _verification(compared: list[Compared], returns: Returns | None, measured: l
 def _write_card(folder: Path, exported: Exported, run: RunDirectory) -> None:
     has_curve = run.curve.exists()
     if has_curve:
-        shutil.copyfile(run.curve, folder / CURVE)
-    (folder / CARD).write_text(model_card(exported.contract, CURVE if has_curve else None), encoding="utf-8")
+        write_atomically(folder / CURVE, run.curve.read_bytes())
+    write_atomically(folder / CARD, model_card(exported.contract, CURVE if has_curve else None).encode())

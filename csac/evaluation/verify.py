@@ -25,11 +25,12 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-5  # of an action's range
 ROUNDING = 10.0  # times what float32 does to the policy itself on such observations: an artefact may be no worse
 ABSURD = 0.1  # of the range, on average: whole numbers for weights cost a hundredth of it
-IMPLAUSIBLE = 5.0  # standard errors between two mean returns
+IMPLAUSIBLE = 1e-4  # a chance so small is none
 
 MOST_RECORDED = 2_000  # observations of the episodes that are compared
 RANDOM = 1_000  # observations in each random group
-BLOCK = 50  # observations from one reset to the next
+BLOCK = 50  # broken observations from one reset to the next: guards have something to remember
+BROKEN = "broken"
 LARGEST_BOUND = 1e6  # a bound beyond it says nothing of what is to be expected
 
 
@@ -64,14 +65,20 @@ class Returns:
     artefact: np.ndarray
 
     @property
-    def standard_errors(self) -> float:
-        """How many standard errors lie between the two means (Welch); 0 where there are too few episodes to tell."""
+    def chance(self) -> float:
+        """The probability that equal policies have means so far apart (Welch's t-test); 1 below two episodes."""
+        from scipy import special  # slow to import
+
         if len(self.policy) < 2:
-            return 0.0
+            return 1.0
         difference = abs(self.policy.mean() - self.artefact.mean())
-        spread = np.sqrt((self.policy.var(ddof=1) + self.artefact.var(ddof=1)) / len(self.policy))
         # Where all episodes are alike, returns differ by rounding alone.
-        return float(difference / (spread + 1e-4 * np.abs(self.policy).max() + 1e-9))
+        difference = max(0.0, difference - 1e-4 * np.abs(self.policy).max())
+        variances = np.array([values.var(ddof=1) / len(values) for values in (self.policy, self.artefact)])
+        if variances.sum() == 0.0:
+            return 1.0 if difference == 0.0 else 0.0
+        freedom = variances.sum() ** 2 / (variances**2 / (len(self.policy) - 1)).sum()
+        return float(2.0 * special.stdtr(freedom, -difference / np.sqrt(variances.sum())))
 
 
 def record(
@@ -147,14 +154,14 @@ def compare_returns(
     Tasks are chaotic: from the last bit on, episodes go their own way, and only their statistics can agree.
 
     Raises:
-        InputError: the mean return is more than five standard errors off, of an artefact without guards and with the
-            policy's own numbers: the others may be worse, and say so.
+        InputError: the mean return is so far off that chance does not explain it, of an artefact without guards and
+            with the policy's own numbers: the others may be worse, and say so.
         EvaluationFailure: as `evaluate_episodes`.
     """
     played = evaluate_episodes(artefact, task, len(reference.returns), environment_arguments=environment_arguments)
     returns = Returns(reference.returns, np.array([episode.episode_return for episode in played]))
     is_same = artefact.contract.weights == "float32" and not artefact.contract.guards.is_any
-    if is_same and returns.standard_errors > IMPLAUSIBLE:
+    if is_same and returns.chance < IMPLAUSIBLE:
         raise InputError(
             f"in closed loop the {artefact.format} artefact is not the policy of the run: {_told(returns.artefact)} "
             f"where the policy has {_told(returns.policy)}; nothing was written"
@@ -185,7 +192,7 @@ def _observations(
         groups["recorded"] = recorded[chosen]
     groups |= {"random": random(1.0), "10 times as far": random(10.0), "1,000 times as far": random(1000.0)}
     if artefact.contract.guards.fallback is not None:
-        groups["broken"] = _broken(groups.get("recorded", groups["random"])[:RANDOM], artefact, generator)
+        groups[BROKEN] = _broken(groups.get("recorded", groups["random"])[:RANDOM], artefact, generator)
     return groups
 
 
@@ -202,7 +209,10 @@ def _broken(observations: np.ndarray, artefact: Artefact, generator: np.random.G
 
 
 def _expected(artefact: Artefact, policy: Policy, recorded: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return between which bounds observations are to be expected: the task's, else those seen, else a guess."""
+    """Return between which bounds observations are to be expected: the task's, else those seen, else a guess.
+
+    What guards refuse is not among them.
+    """
     normaliser, size = policy.network.parameters.normaliser, policy.contract.spec.observation_size
     low, high = np.full(size, -3.0), np.full(size, 3.0)
     if normaliser is not None:
@@ -213,14 +223,16 @@ def _expected(artefact: Artefact, policy: Policy, recorded: np.ndarray | None) -
     if contract.observation_low is not None and contract.observation_high is not None:
         low = np.where(np.abs(contract.observation_low) < LARGEST_BOUND, contract.observation_low, low)
         high = np.where(np.abs(contract.observation_high) < LARGEST_BOUND, contract.observation_high, high)
+    if contract.guards.observation_low is not None and contract.guards.observation_high is not None:
+        low, high = np.maximum(low, contract.guards.observation_low), np.minimum(high, contract.guards.observation_high)
     return low.astype(np.float64), high.astype(np.float64)
 
 
 def _compare(
     name: str, artefact: Artefact, policy: Policy, observations: np.ndarray, generator: np.random.Generator
 ) -> Compared:
-    """Run both, with a reset every few observations, so that guards that have given up are tried again."""
-    contract, noise = policy.contract, None
+    """Run both, with a reset before each observation: what guards remember is tried on the broken ones alone."""
+    contract, noise, block = policy.contract, None, BLOCK if name == BROKEN else 1
     if artefact.contract.noise_seed is not None:
         noise = generator.standard_normal((len(observations), contract.spec.action_size)).astype(np.float32)
     actions, rounding, is_candidate = _candidates(policy, observations, noise)
@@ -228,7 +240,7 @@ def _compare(
     span[span == 0.0] = 1.0
     differences, state = [], GuardState()
     for row, observation in enumerate(observations):
-        if row % BLOCK == 0:
+        if row % block == 0:
             artefact.reset()
             state = GuardState()
         answer = artefact.act(observation, None if noise is None else noise[row])

@@ -103,10 +103,11 @@ def artefact_of(folder: Path, policy: Policy, network: PolicyNetwork | None = No
     return open_artefact(folder)
 
 
-def nudged(policy: Policy, by: float) -> PolicyNetwork:
-    """The network with the bias of its first action moved."""
+def nudged(policy: Policy, by: float, actions: int = 1) -> PolicyNetwork:
+    """The network with the biases of its first actions moved."""
     layers = policy.network.parameters.actors[0]
-    last = Layer(layers[-1].weight, layers[-1].bias + np.array([by, *np.zeros(layers[-1].bias.size - 1)], np.float32))
+    moved = np.where(np.arange(layers[-1].bias.size) < actions, np.float32(by), np.float32(0.0))
+    last = Layer(layers[-1].weight, layers[-1].bias + moved)
     return policy.network._replace(parameters=policy.network.parameters._replace(actors=((*layers[:-1], last),)))
 
 
@@ -158,6 +159,7 @@ def test_guards_that_differ_are_found(tmp_path):
     artefact = artefact_of(tmp_path / "a", policy, guards=chosen)
     results = verify.compare_actions(artefact, policy)
     assert results[-1].name == "broken"
+    assert 0.0 < results[0].largest < 1e-5  # the policy's own actions pass, and differ by rounding
     artefact.contract = dataclasses.replace(artefact.contract, guards=dataclasses.replace(chosen, watchdog=4))
     with pytest.raises(InputError, match="is not the policy of the run"):
         verify.compare_actions(artefact, policy)
@@ -176,18 +178,21 @@ def test_in_closed_loop_the_episodes_are_those_of_csac_evaluate(tmp_path):
 
 def test_returns_that_chance_does_not_explain_are_refused(tmp_path):
     policy = algorithm_policy("csac")
-    recording = verify.record(policy, "Follow-v0", episodes=5)
-    worse = artefact_of(tmp_path / "a", policy, nudged(policy, 50.0))
+    recording = verify.record(policy, "Follow-v0", episodes=10)
+    worse = artefact_of(tmp_path / "a", policy, nudged(policy, 50.0, actions=3))  # always the highest action
     with pytest.raises(InputError, match="in closed loop the numpy artefact is not the policy of the run"):
         verify.compare_returns(worse, recording, "Follow-v0")
 
 
-def test_standard_errors_are_welchs():
-    # Means 2 and 5, variances 1 and 4, three each: 3 / sqrt(5/3).
-    returns = verify.Returns(np.array([1.0, 2.0, 3.0]), np.array([3.0, 5.0, 7.0]))
-    assert returns.standard_errors == pytest.approx(3.0 / np.sqrt(5 / 3), rel=1e-3)
-    assert verify.Returns(np.full(3, 100.0), np.full(3, 100.001)).standard_errors < 1.0
-    assert verify.Returns(np.array([1.0]), np.array([9.0])).standard_errors == 0.0
+def test_chance_is_welchs():
+    from scipy import stats
+
+    first, second = np.array([1.0, 2.0, 3.0]), np.array([3.0, 5.0, 7.5])
+    expected = stats.ttest_ind(first, second, equal_var=False).pvalue
+    assert verify.Returns(first, second).chance == pytest.approx(expected, rel=1e-3)
+    assert verify.Returns(np.full(3, 100.0), np.full(3, 100.001)).chance == 1.0
+    assert verify.Returns(np.full(3, 100.0), np.full(3, 101.0)).chance == 0.0
+    assert verify.Returns(np.array([1.0]), np.array([9.0])).chance == 1.0
 
 
 def export(*arguments, **options):
