@@ -157,7 +157,8 @@ class Export:
     watchdog: Annotated[int | None, arg(help_behavior_hint="(default: never)")] = None
     """Keep to the fallback after so many bad observations in a row, until a reset."""
     rate_limit: Annotated[float | None, arg(help_behavior_hint="(default: no limit)")] = None
-    """The most that an action may change from one step to the next, as a share of its range."""
+    """The most that an action may change from one step to the next, as a share of its range; the fallback is then the
+    last action, unless another is given."""
     episodes: int = 10
     """Episodes to verify with, those of csac evaluate."""
     no_rollouts: FlagCreatePairsOff[bool] = False

@@ -175,10 +175,10 @@ class _ONNX:
         if self._generator:
             drawn = self._generator.standard_normal(self._action_size, np.float32) if noise is None else noise
             self._inputs["noise"] = drawn[None]
-        action, *state = self._session.run(None, self._inputs)
-        if state:
-            self._inputs["state"] = state[0]
-        return action[0]
+        outputs: Any = self._session.run(None, self._inputs)
+        if self._has_state:
+            self._inputs["state"] = outputs[1]
+        return outputs[0][0]
 
     def reset(self) -> None:
         if self._has_state:
@@ -186,21 +186,20 @@ class _ONNX:
 
 
 class _C:
-    """Runs the header, compiled into a shared library that lives as long as this."""
+    """Runs the header, compiled into a shared library of its own."""
 
     def __init__(self, folder: Path, contract: ArtefactContract) -> None:
         compiler()
         path = folder / contract.file
         if not is_header(read_file(path).decode(errors="replace"), contract):
             raise InputError(f"{path} is not a header of this csac, which compiles no other code: export it again")
-        self._folder = tempfile.TemporaryDirectory(prefix="csac-")
-        source, library = Path(self._folder.name, "artefact.c"), Path(self._folder.name, "artefact.so")
         guard = "csac_guard(&state, observation, action);" if contract.guards.is_any else ""
         noisy_entry = _NOISY_ENTRY.format(guard=guard) if contract.noise_seed is not None else ""
-        source.write_text(_ENTRIES + noisy_entry)
-        warnings = ("-I", folder, "-fPIC", "-shared", "-O3")
-        compile_c(*C_STANDARD, *warnings, source, "-o", library, "-lm")
-        self._library = ctypes.CDLL(str(library))
+        with tempfile.TemporaryDirectory(prefix="csac-") as name:
+            source, library = Path(name, "artefact.c"), Path(name, "artefact.so")
+            source.write_text(_ENTRIES + noisy_entry)
+            compile_c(*C_STANDARD, "-I", folder, "-fPIC", "-shared", "-O3", source, "-o", library, "-lm")
+            self._library = ctypes.CDLL(str(library))  # stays in memory without its file
         self._action_size = contract.policy.spec.action_size
         self._step, self._reset = self._library.artefact_step, self._library.artefact_reset
         self._sample = getattr(self._library, "artefact_sample", None)

@@ -5,7 +5,7 @@ This is the definition. An artefact of every format has the same in its own lang
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -23,7 +23,7 @@ Fallback = Literal["zero", "middle", "last", "given"]
 class Guards:
     """What an artefact checks and limits; everything float32.
 
-    Without a `fallback` observations are not looked at. With one, a step is bad where a number of the observation is
+    Without a `fallback` there are none. With one, a step is bad where a number of the observation is
     not within `observation_low` and `observation_high` [observation] (which no NaN is), or where the policy's own
     action is not finite. Then the fallback stands in for the policy's action: `fallback_action` [action], or for
     "last" the action before, and `fallback_action` where there was none. After `watchdog` bad steps one after another
@@ -43,7 +43,7 @@ class Guards:
     @property
     def is_any(self) -> bool:
         """Whether anything is checked or limited."""
-        return self.fallback is not None or self.largest_change is not None
+        return self.fallback is not None
 
     @property
     def has_state(self) -> bool:
@@ -80,6 +80,8 @@ class Guards:
         belongs = (guards.observation_low, guards.observation_high, guards.fallback_action)
         if any((array is None) != (guards.fallback is None) for array in belongs):
             raise ValueError("fallback and observation bounds disagree")
+        if guards.fallback is None and (guards.watchdog or guards.largest_change is not None):
+            raise ValueError("there is a watchdog or a limit without a fallback")
         return guards
 
 
@@ -92,25 +94,22 @@ class GuardState:
 
     last: np.ndarray | None = None  # [action], the action that was returned last
     bad: int = 0  # steps one after another that were bad, no more than the watchdog waits for
-    fallbacks: int = field(default=0, compare=False)  # since the reset, for whoever watches
 
 
 def guarded(
     guards: Guards, state: GuardState, contract: Contract, observation: np.ndarray, action: np.ndarray
 ) -> np.ndarray:
     """Return what leaves instead of the policy's `action` [action] at `observation` [observation]; changes `state`."""
-    if guards.fallback is not None:
-        is_inside = (observation >= guards.observation_low) & (observation <= guards.observation_high)
-        is_bad = not (is_inside.all() and np.isfinite(action).all())
-        has_tripped = 0 < guards.watchdog <= state.bad
-        if not has_tripped:
-            state.bad = state.bad + 1 if is_bad and guards.watchdog else 0
-            has_tripped = 0 < guards.watchdog <= state.bad
-        if is_bad or has_tripped:
-            last = state.last if guards.fallback == "last" else None
-            assert guards.fallback_action is not None
-            action = guards.fallback_action if last is None else last
-            state.fallbacks += 1
+    if not guards.is_any:
+        return action
+    is_inside = (observation >= guards.observation_low) & (observation <= guards.observation_high)
+    is_bad = not (is_inside.all() and np.isfinite(action).all())
+    if state.bad < guards.watchdog:
+        state.bad = state.bad + 1 if is_bad else 0
+    if is_bad or 0 < guards.watchdog <= state.bad:
+        last = state.last if guards.fallback == "last" else None
+        assert guards.fallback_action is not None
+        action = guards.fallback_action if last is None else last
     if guards.largest_change is not None and state.last is not None:
         action = np.clip(action, state.last - guards.largest_change, state.last + guards.largest_change)
         action = np.clip(action, contract.action_low, contract.action_high)
@@ -135,7 +134,8 @@ def make_guards(
         observation_low: [observation], the least that is taken for good; infinite, or None, where anything finite is.
         observation_high: [observation], the most.
         watchdog: after so many bad observations in a row only the fallback is left, until a reset.
-        rate_limit: how much an action may change in a step, as a share of its range.
+        rate_limit: how much an action may change in a step, as a share of its range. It needs a fallback, since an
+            action that is not a number cannot be limited; without one it is `last`.
 
     Raises:
         InputError: numbers or combinations that cannot be meant.
@@ -154,8 +154,9 @@ def make_guards(
             )
         half = 0.5 * contract.action_high - 0.5 * contract.action_low  # a wide range may not overflow
         change = np.minimum(np.float32(2.0 * rate_limit) * half, np.float32(FLOAT32_MAX))
+        fallback = fallback or "last"
     if fallback is None:
-        return Guards(largest_change=change)
+        return NO_GUARDS
     size = contract.spec.observation_size
     low, high = (
         np.full(size, end) if given is None else np.clip(given, -FLOAT32_MAX, FLOAT32_MAX).astype(np.float32)

@@ -12,6 +12,8 @@ from csac.deploy.policy import LOG_STD_RANGE
 from csac.types import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from csac.deploy.artefact_contract import ArtefactContract
     from csac.deploy.guards import Guards
     from csac.types import Layer, PolicyNetwork
@@ -68,7 +70,7 @@ class _Graph:
         self.nodes: list[tuple[str, list[str], str, dict[str, Any]]] = []
         self.constants: dict[str, np.ndarray] = {}
 
-    def add(self, kind: str, inputs: list[str | np.ndarray], output: str = "", **options: Any) -> str:
+    def add(self, kind: str, inputs: Sequence[str | np.ndarray | np.floating], output: str = "", **options: Any) -> str:
         """Add a node; return the name of its output. An array among the inputs becomes a constant."""
         output = output or f"{kind.lower()}_{len(self.nodes)}"
         names = [item if isinstance(item, str) else self.constant(item) for item in inputs]
@@ -159,27 +161,25 @@ def _guarded(graph: _Graph, guards: Guards, contract: ArtefactContract, action: 
         has_last = graph.add("Slice", ["state", *map(np.array, ([size], [size + 1], [1]))])
         has_last = graph.add("Greater", [has_last, np.float32(0.5)])  # [n, 1]
         bad_before = graph.add("Slice", ["state", *map(np.array, ([size + 1], [size + 2], [1]))])
-    bad_steps = bad_before
-    if guards.fallback is not None:
-        is_good = graph.add(
-            "And",
-            [
-                _all_within(graph, "observation", guards.observation_low, guards.observation_high),
-                _all_within(graph, action, np.float32(-FLOAT32_MAX), np.float32(FLOAT32_MAX)),
-            ],
-        )
-        takes_policy = is_good
-        if guards.watchdog:
-            waits_for = np.float32(guards.watchdog)
-            more = graph.add("Add", [bad_before, np.float32(1.0)])
-            counted = graph.add("Where", [is_good, np.float32(0.0), more])
-            has_tripped = graph.add("GreaterOrEqual", [bad_before, waits_for])
-            bad_steps = graph.add("Where", [has_tripped, bad_before, counted])
-            takes_policy = graph.add("And", [is_good, graph.add("Less", [bad_steps, waits_for])])
-        fallback = graph.constant(guards.fallback_action)
-        if guards.fallback == "last":
-            fallback = graph.add("Where", [has_last, last, fallback])
-        action = graph.add("Where", [takes_policy, action, fallback])
+    is_good = graph.add(
+        "And",
+        [
+            _all_within(graph, "observation", guards.observation_low, guards.observation_high),
+            _all_within(graph, action, np.float32(-FLOAT32_MAX), np.float32(FLOAT32_MAX)),
+        ],
+    )
+    takes_policy, bad_steps = is_good, bad_before
+    if guards.watchdog:
+        waits_for = np.float32(guards.watchdog)
+        more = graph.add("Add", [bad_before, np.float32(1.0)])
+        counted = graph.add("Where", [is_good, np.float32(0.0), more])
+        has_tripped = graph.add("GreaterOrEqual", [bad_before, waits_for])
+        bad_steps = graph.add("Where", [has_tripped, bad_before, counted])
+        takes_policy = graph.add("And", [is_good, graph.add("Less", [bad_steps, waits_for])])
+    fallback = graph.constant(guards.fallback_action)
+    if guards.fallback == "last":
+        fallback = graph.add("Where", [has_last, last, fallback])
+    action = graph.add("Where", [takes_policy, action, fallback])
     if guards.largest_change is not None:
         least, most = (graph.add(kind, [last, guards.largest_change]) for kind in ("Sub", "Add"))
         limited = graph.clip(action, least, most)

@@ -52,7 +52,7 @@ class ExportOptions:
     watchdog: int | None = None
     """Bad observations in a row after which only the fallback is left."""
     rate_limit: float | None = None
-    """The most that an action may change in a step, as a share of its range."""
+    """The most that an action may change in a step, as a share of its range; then there is a fallback too, `last`."""
     episodes: int = 10
     """Episodes to verify with, as in `csac evaluate`; 0 plays none, and then the task is not made."""
     card: bool = False

@@ -203,7 +203,8 @@ def _broken(observations: np.ndarray, artefact: Artefact, generator: np.random.G
     places = generator.integers(broken.shape[1], size=len(rows))
     wrong = np.tile(np.array([np.nan, np.inf, -np.inf, np.nan], np.float32), (len(rows), 1))
     if most is not None:
-        wrong[:, 3] = np.nextafter(most[places], np.float32(np.inf))
+        with np.errstate(over="ignore"):  # above the largest of all numbers is infinity
+            wrong[:, 3] = np.nextafter(most[places], np.float32(np.inf))
     broken[rows, places] = wrong[np.arange(len(rows)), generator.integers(4, size=len(rows))]
     return broken
 

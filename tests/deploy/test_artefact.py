@@ -386,7 +386,7 @@ def test_the_graph_takes_batches_and_carries_its_contract(tmp_path):
     assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", 17)]
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
     given = observations(5)
-    (actions,) = session.run(["action"], {"observation": given})
+    actions = np.asarray(session.run(["action"], {"observation": given})[0])
     np.testing.assert_allclose(actions, policy.predict(given)[0], atol=2e-5)
     told = json.loads(session.get_modelmeta().custom_metadata_map["contract"])
     assert told["control_rate_hz"] == 20.0

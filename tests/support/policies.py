@@ -52,7 +52,8 @@ ALGORITHMS = ("csac", "sac", "td3", "sd3", "ppo")
 
 def algorithm_policy(algorithm: str, parts: Parts = ((None, (5,)),), action_shape: tuple[int, ...] = (3,)) -> Policy:
     """A random policy in the form that an algorithm gives its own, on a task with bounds that are not symmetric."""
-    head: Head = {"csac": "tanh_gaussian", "sac": "tanh_gaussian", "ppo": "clipped_gaussian"}.get(algorithm, "tanh")
+    heads: dict[str, Head] = {"csac": "tanh_gaussian", "sac": "tanh_gaussian", "ppo": "clipped_gaussian"}
+    head = heads.get(algorithm, "tanh")
     agreement = contract(parts, action_shape, -0.5, 2.0, "tanh" if algorithm == "ppo" else "relu", head)
     observation_size, action_size = agreement.spec
     outputs = 2 * action_size if head == "tanh_gaussian" else action_size

@@ -70,20 +70,22 @@ class Policy:
 
     def _guarded(self, observation, action):
         """Return what leaves instead of the policy's action."""
-        if self.guards["fallback"]:
-            inside = (observation >= self.guards["observation_low"]) & (observation <= self.guards["observation_high"])
-            bad, watchdog = not (inside.all() and np.isfinite(action).all()), self.guards["watchdog"]
-            if self.bad < watchdog:
-                self.bad = self.bad + 1 if bad else 0
-            if bad or 0 < watchdog <= self.bad:
-                repeats = self.guards["fallback"] == "last" and self.last is not None
-                action = self.last if repeats else self.guards["fallback_action"]
-        change = self.guards["largest_change"]
-        if change is not None and self.last is not None:
-            action = np.minimum(np.maximum(action, self.last - change), self.last + change)
+        guards = self.guards
+        if not guards["fallback"]:
+            return action
+        inside = (observation >= guards["observation_low"]) & (observation <= guards["observation_high"])
+        bad = not (inside.all() and np.isfinite(action).all())
+        if self.bad < guards["watchdog"]:
+            self.bad = self.bad + 1 if bad else 0
+        if bad or 0 < guards["watchdog"] <= self.bad:
+            repeats = guards["fallback"] == "last" and self.last is not None
+            action = self.last if repeats else guards["fallback_action"]
+        if guards["largest_change"] is not None and self.last is not None:
+            low, high = self.last - guards["largest_change"], self.last + guards["largest_change"]
+            action = np.minimum(np.maximum(action, low), high)
             action = np.minimum(np.maximum(action, self.low), self.high)
-        self.last = action
-        return action.copy()
+        self.last = np.array(action)
+        return action
 
     def _networks(self, kind):
         """Return the layers of each actor or critic, in order: weight [in, out] and bias [out]."""
