@@ -70,7 +70,9 @@ def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, s
         raise InputError(f"seconds must be 0 or more, not {seconds:g}")
     artefact = open_artefact(path)
     rate = rate or artefact.contract.control_rate or USUAL_RATE
-    make_calls = _measure_c(artefact) if artefact.format == "c" else measure_python(artefact.act, _observations(artefact))
+    make_calls = (
+        _measure_c(artefact) if artefact.format == "c" else measure_python(artefact.act, _observations(artefact))
+    )
     _in_parts(make_calls, WARM_UP, WARM_UP, 0)
     durations, _ = _in_parts(make_calls, calls, WARM_UP, 0)
     several = [Latency(durations)]
@@ -116,7 +118,19 @@ def _measure_c(artefact: Artefact) -> Measure:
     """Return what makes calls inside of a compiled program, so that none of Python's time is in them."""
     with tempfile.TemporaryDirectory(prefix="csac-") as name:
         library = Path(name, "latency.so")
-        compile_c(*C_STANDARD, "-I", artefact.folder, "-fPIC", "-shared", "-O3", "-march=native", LATENCY, "-o", library, "-lm")
+        compile_c(
+            *C_STANDARD,
+            "-I",
+            artefact.folder,
+            "-fPIC",
+            "-shared",
+            "-O3",
+            "-march=native",
+            LATENCY,
+            "-o",
+            library,
+            "-lm",
+        )
         function = ctypes.CDLL(str(library)).latency_measure  # stays in memory without its file
     function.restype = None
     observations = _observations(artefact)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from csac.record.plots import COLOURS, STYLE, save
+from csac.record.rendering import short
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,12 +35,13 @@ def jitter(several: Sequence[Calls], path: Path) -> None:
     labels = list(dict.fromkeys(calls.label for calls in several))
     colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(labels)}
     with matplotlib.style.context(["default", STYLE]):
-        figure = Figure(figsize=(7.5, 3.6 if timed else 3.2), layout="constrained")
+        figure = Figure(figsize=(7.5, 4.4), layout="constrained")
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, 1 + bool(timed), squeeze=False)[0]
         _draw_tails(panels[0], several, colours)
         if timed:
             _draw_lateness(panels[1], timed, colours)
+        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
         save(figure, path, ("png",))
 
 
@@ -53,10 +55,9 @@ def _draw_tails(axes: Axes, several: Sequence[Calls], colours: dict[str, str]) -
         style = "-" if calls.rate is None else "--"
         axes.plot(durations[keep], share[keep], style, color=colours[calls.label], linewidth=1.8, label=name)
     axes.set(xscale="log", yscale="log", xlabel="μs for one action", ylabel="share of calls that took longer")
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.10g} %"))
     axes.set_title("How long", fontsize=11)
-    axes.legend(frameon=False, fontsize=8)
 
 
 def _draw_lateness(axes: Axes, timed: Sequence[Calls], colours: dict[str, str]) -> None:
@@ -66,5 +67,5 @@ def _draw_lateness(axes: Axes, timed: Sequence[Calls], colours: dict[str, str]) 
         seconds = np.arange(len(calls.lateness)) / calls.rate
         axes.plot(seconds, calls.lateness / 1e3, ".", color=colours[calls.label], markersize=2.5, alpha=0.6)
     axes.set(xlabel="seconds", ylabel="μs late", yscale="log")
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
     axes.set_title("How late each begins", fontsize=11)

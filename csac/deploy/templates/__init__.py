@@ -1,4 +1,4 @@
-"""What artefacts are made of: the C header, the model card, the loader that leaves as it is; and what times a header."""
+"""What artefacts are made of: the C header, the model card, the loader that leaves as it is, what times a header."""
 
 from __future__ import annotations
 
