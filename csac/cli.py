@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import faulthandler
 import io
 import os
 import shlex
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from contextlib import AbstractContextManager
 
     from csac.record.run import RunDirectory
 
@@ -46,6 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     _open_standard_streams()
+    if not faulthandler.is_enabled():
+        faulthandler.enable()  # a fault in a simulator's native code ends one seed's process, which is this one
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -82,9 +86,16 @@ def _dispatch(arguments: list[str]) -> int:
     if arguments[0] not in commands:
         raise InputError(f"no command is called {arguments[0]!r}{nearest(arguments[0], commands)} (csac --help)")
     try:
-        return commands[arguments[0]](arguments[1:])
+        with _signals_before_training() if arguments[0] in ("train", "resume") else nullcontext():
+            return commands[arguments[0]](arguments[1:])
     except HelpShown:
         return 0
+
+
+def _signals_before_training() -> AbstractContextManager[None]:
+    from csac.training.interruptions import leaving_at_once  # NumPy comes with it
+
+    return leaving_at_once()
 
 
 def _train(arguments: list[str]) -> int:

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     OnEvaluation = Callable[[int, dict[int, float]], Any]
     StopWhen = Callable[[int, dict[int, float]], bool]
 
+_STOPPING = "stopping at the next step where all can be saved; once more to leave at once"
+
 
 def train(
     algorithm: Algorithm,
@@ -199,7 +201,9 @@ def _go_on(run: RunDirectory, plan: Plan, wanted: Any, notes: list[str], watcher
 
 def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, restart: Restart) -> RunDirectory:
     """Train until the last step or a signal, from the first preparation to the last picture."""
-    with caught_signals() as (stop, received):
+    reporter = watchers.reporter
+    told = functools.partial(reporter.note, _STOPPING) if reporter else None
+    with caught_signals(told) as (stop, received):
         recorder = _follow(run, plan, notes, watchers, restart, stop, received)
     if run.manifest.state == "interrupted":
         is_saved = recorder.checkpoints is not None and recorder.checkpoints.newest is not None
@@ -230,11 +234,7 @@ def _follow(
     recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures, by_step(plan.perturbations))
     try:
         with closing(run_groups(settings, groups, stop.is_set, checkpoints)) as told:
-            is_told = False
             for group, message in told:
-                if received and reporter and not is_told:
-                    is_told = True
-                    reporter.note("stopping at the next step where all can be saved; once more to leave at once")
                 recorder.handle(group, message)
                 if watchers.tell(recorder.evaluated):
                     stop.set()
