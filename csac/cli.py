@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from csac.arguments import HelpShown, nearest, parse
-from csac.commands import Chosen, Evaluate, Play, Resume, Runs
+from csac.commands import Chosen, Evaluate, Export, Play, Resume, Runs
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ Train controllers for continuous-control tasks with Conservative Soft Actor-Crit
   csac resume DIR      go on with a run that was stopped or killed
   csac evaluate DIR    test the policies of a run on fresh episodes
   csac play DIR        watch the policy of a run, or write a video of it
+  csac export DIR      take a policy out of a run: NumPy, ONNX or C, verified
   csac runs [DIR]      list the runs below a directory
   csac study COMMAND   run the paper's experiments, or your own
 
@@ -80,6 +81,7 @@ def _dispatch(arguments: list[str]) -> int:
         "resume": _resume,
         "evaluate": _evaluate,
         "play": _play,
+        "export": _export,
         "runs": _runs,
         "study": _study,
     }
@@ -229,6 +231,37 @@ def _play(arguments: list[str]) -> int:
         return _complain(error, 1)
     if options.video:
         console.print(str(options.video), soft_wrap=True)
+    return 0
+
+
+def _export(arguments: list[str]) -> int:
+    options = parse(Export, arguments, "csac export")
+    from csac.console.exports import export_lines, size_table
+    from csac.console.tables import make_console
+    from csac.console.waiting import progress_shown
+    from csac.evaluation.evaluator import EvaluationFailure
+    from csac.evaluation.export import export_run
+
+    console, exported = make_console(), []
+    try:
+        with progress_shown(console, "verifying", "episodes") as on_progress:
+            for one in export_run(
+                options.run,
+                tuple(options.format.split(",")),  # pyright: ignore[reportArgumentType] (others are refused by name)
+                options.seed_label(),
+                options.checkpoint,
+                options.out,
+                options.options(),
+                trust_task=options.trust_task,
+                on_progress=on_progress,
+            ):
+                exported.append(one)
+                for line in export_lines(one):
+                    console.print(line, soft_wrap=True)
+    except EvaluationFailure as error:
+        return _complain(error, 1)
+    if (sizes := size_table(exported)) is not None:
+        console.print(sizes)
     return 0
 
 

@@ -16,6 +16,7 @@ from csac.training.options import Options
 from csac.types import InputError
 
 if TYPE_CHECKING:
+    from csac.evaluation.export import ExportOptions
     from csac.record.manifest import Manifest
     from csac.training.options import PlanOptions
 
@@ -118,6 +119,80 @@ class Play:
     """Change the task, as friction=2 does; the kinds are those of csac train."""
     trust_task: FlagCreatePairsOff[bool] = False
     """Run the code of the module that the task names, though you have never named it here; look at it first."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Take a policy out of a run: from the raw observation to the environment's action, verified.
+
+    Each artefact is a folder with the policy and contract.json, which says what goes in and what comes out.
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The directory of a run."""
+    seed: Annotated[str, arg(metavar="best|K")] = "best"
+    """Label of the seed; best is the one with the best last evaluations."""
+    checkpoint: Literal["last", "best"] = "last"
+    """The seed's last policy, or the one of its best evaluation."""
+    format: Annotated[str, arg(metavar="numpy|onnx|c,...")] = "numpy"
+    """numpy: NumPy alone, with a loader beside it. onnx: a graph. c: a header in C99. Several with commas between."""
+    out: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="(default: DIR/export/FORMAT)")] = None
+    """The artefact's folder; with several formats, the folder of their folders."""
+    weights: Literal["float32", "float16", "int8"] = "float32"
+    """Numbers that the weights of a C artefact are kept in; the error that smaller ones make is stated."""
+    stochastic: FlagCreatePairsOff[bool] = False
+    """Sample actions as in training. In ONNX the noise becomes a second input: a graph cannot be seeded."""
+    noise_seed: int = 0
+    """Seed of the noise that actions are sampled with."""
+    fallback: Annotated[str | None, arg(metavar="zero|middle|last|X,...", help_behavior_hint="(default: no guard)")] = (
+        None
+    )
+    """Guard against NaN and infinity in observations: the action to take instead."""
+    observation_range: Annotated[
+        Literal["bounds", "recorded"] | None, arg(help_behavior_hint="(default: anything finite is good)")
+    ] = None
+    """Guard as well against what is out of the task's bounds, or of what the episodes of the export have shown."""
+    range_margin: float = 0.5
+    """How far beyond what was recorded is still good, as a share of its width."""
+    watchdog: Annotated[int | None, arg(help_behavior_hint="(default: never)")] = None
+    """Keep to the fallback after so many bad observations in a row, until a reset."""
+    rate_limit: Annotated[float | None, arg(help_behavior_hint="(default: no limit)")] = None
+    """The most that an action may change from one step to the next, as a share of its range; the fallback is then the
+    last action, unless another is given."""
+    episodes: int = 10
+    """Episodes to verify with, those of csac evaluate."""
+    no_rollouts: FlagCreatePairsOff[bool] = False
+    """Play no episodes, where the task cannot be made here."""
+    card: FlagCreatePairsOff[bool] = False
+    """Write a model card beside it, README.md."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
+
+    def options(self) -> ExportOptions:
+        """Return how the policy is to leave its run."""
+        from csac.evaluation.export import ExportOptions
+
+        if self.episodes < 1:
+            raise InputError(f"--episodes {self.episodes}: give at least 1, or --no-rollouts")
+        return ExportOptions(
+            self.noise_seed if self.stochastic else None,
+            self.weights,
+            self.fallback,
+            self.observation_range,
+            self.range_margin,
+            self.watchdog,
+            self.rate_limit,
+            0 if self.no_rollouts else self.episodes,
+            self.card,
+        )
+
+    def seed_label(self) -> int | None:
+        """Return the seed that was asked for, or None for the best. Raises InputError for neither."""
+        if self.seed == "best":
+            return None
+        if not self.seed.isdecimal():
+            raise InputError(f"--seed {self.seed}: give best, or the label of a seed")
+        return int(self.seed)
 
 
 @dataclass(frozen=True)

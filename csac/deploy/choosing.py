@@ -34,14 +34,19 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
     if which not in get_args(Which):
         raise InputError(f"which={which!r}: choose 'last' or 'best'")
     run = RunDirectory.open(directory)
+    return Policy.load(run.policy(choose_seed(run, seed), which), Contract.load(run.contract))
+
+
+def choose_seed(run: RunDirectory, seed: int | None = None) -> int:
+    """Return the label of the seed that `load` takes. Raises InputError as `load` does."""
     seeds = run.seeds_with_policies()
     if not seeds:
-        raise InputError(f"{directory} holds no policies yet: its first evaluation writes them")
+        raise InputError(f"{run.path} holds no policies yet: its first evaluation writes them")
     if seed is None:
-        seed = _best_seed(run, _without_failed(run, seeds))
-    elif seed not in seeds:
-        raise InputError(f"{directory} has no policy of seed {seed}; it has those of {_listed(seeds)}")
-    return Policy.load(run.policy(seed, which), Contract.load(run.contract))
+        return _best_seed(run, _without_failed(run, seeds))
+    if seed not in seeds:
+        raise InputError(f"{run.path} has no policy of seed {seed}; it has those of {_listed(seeds)}")
+    return seed
 
 
 def _without_failed(run: RunDirectory, seeds: list[int]) -> list[int]:
