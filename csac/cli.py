@@ -105,6 +105,7 @@ def _train(arguments: list[str]) -> int:
             directory=options.directory,
             resume=options.resume,
             start_from=options.start_from,
+            wandb=options.wandb,
             reporter=Reporter(),
             command=shlex.join(["csac", "train", *arguments]),
             **options.plan_options(),

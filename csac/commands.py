@@ -53,6 +53,8 @@ class Train(Options):
     """Processes to split the seeds over."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
     """Processes in which each group evaluates while it trains on; 0 evaluates in line. The results are the same."""
+    wandb: FlagCreatePairsOff[bool] = False
+    """Log to Weights & Biases too: a run for each seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
 
     def plan_options(self) -> PlanOptions:
         """Return the options of `train` that are given here."""
