@@ -124,21 +124,21 @@ class WandbLog:
             "reinit": "create_new",
         }
         if self._is_online:
-            try:
-                return wandb.init(**options, resume="allow", settings=wandb.Settings(**_SETTINGS))
-            except Exception as error:
-                self._go_offline(_line(error))
+            return wandb.init(**options, resume="allow", settings=wandb.Settings(**_SETTINGS))
         mode = wandb.setup().settings.mode
         return wandb.init(**options, mode="offline" if mode == "online" else mode, settings=wandb.Settings(**_SETTINGS))
 
     def _go_online(self) -> None:
-        """Find out whether numbers are to be sent, without asking anybody: W&B itself would ask for a key."""
+        """Find out whether numbers are to be sent, and can be: W&B itself would ask the user for a key.
+
+        Not by trying to begin a run: where that fails, W&B keeps its id from being used again.
+        """
         wandb = self._wandb
         if wandb.setup(settings=wandb.Settings(silent=True)).settings.mode != "online":
             return
         self._is_online = True
         try:
-            if not wandb.login(prompt=False, verify=False):
+            if not wandb.login(prompt=False, verify=True):
                 self._go_offline("there is no key; wandb login asks for one")
         except Exception as error:
             self._go_offline(_line(error))

@@ -59,9 +59,8 @@ def fake(monkeypatch):
         init=init,
         runs=runs,
         mode="online",
-        has_key=True,
         Settings=lambda **options: SimpleNamespace(**options),
-        login=lambda **_: module.has_key,
+        login=lambda **_: True,
         setup=lambda **_: SimpleNamespace(settings=SimpleNamespace(mode=module.mode)),
     )
     monkeypatch.setattr(ours, "import_wandb", lambda: module)
@@ -176,18 +175,17 @@ def test_training_does_not_fail_with_wandb(fake, tmp_path):
 
 @pytest.mark.parametrize("failing", ["there is no key; wandb login asks for one", "ConnectionError: nobody answers"])
 def test_what_cannot_be_sent_goes_to_files(fake, tmp_path, failing):
-    begin = fake.init
+    def login(**_):
+        if failing.startswith("there"):
+            return False
+        raise ConnectionError("nobody answers")
 
-    def init(**options):
-        if options.get("mode") != "offline":
-            raise ConnectionError("nobody answers")
-        return begin(**options)
-
-    fake.init, fake.has_key = init, not failing.startswith("there")
+    fake.login = login
     run = run_directory(tmp_path / "run")
     log = WandbLog(run, [0, 7])
     told = [*log.write({"metrics": [{"seed": 7, "step": 1_000, "critic_loss": 0.5}]}), *log.close()]
     assert [len(one.rows) for one in fake.runs] == [0, 1]
+    assert {one.options["mode"] for one in fake.runs} == {"offline"}
     (line,) = [line for line in told if "later" in line]
     assert line == f"W&B is sent nothing: {failing}. To send it later: wandb sync {run.wandb}/offline-*"
 
