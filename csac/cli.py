@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import faulthandler
 import io
 import os
@@ -11,8 +12,8 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from csac.arguments import HelpShown, nearest, parse
-from csac.commands import Chosen, Evaluate, Export, Play, Resume, Runs
+from csac.arguments import HelpShown, json_object, nearest, options_in, parse
+from csac.commands import Chosen, Evaluate, Export, Play, Resume, Runs, Tune
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ Train controllers for continuous-control tasks with Conservative Soft Actor-Crit
   csac export DIR      take a policy out of a run: NumPy, ONNX or C, verified
   csac runs [DIR]      list the runs below a directory
   csac study COMMAND   run the paper's experiments, or your own
+  csac tune TASK       search for good hyperparameters
 
   csac COMMAND --help  explain a command and its options
   csac --version       print the version
@@ -84,6 +86,7 @@ def _dispatch(arguments: list[str]) -> int:
         "export": _export,
         "runs": _runs,
         "study": _study,
+        "tune": _tune,
     }
     if arguments[0] not in commands:
         raise InputError(f"no command is called {arguments[0]!r}{nearest(arguments[0], commands)} (csac --help)")
@@ -118,6 +121,7 @@ def _train(arguments: list[str]) -> int:
             directory=options.directory,
             resume=options.resume,
             start_from=options.start_from,
+            wandb=options.wandb,
             reporter=Reporter(),
             command=shlex.join(["csac", "train", *arguments]),
             **options.plan_options(),
@@ -290,6 +294,32 @@ def _study(arguments: list[str]) -> int:
         raise InputError(f"no study command is called {arguments[0]!r}{hint} (csac study --help)")
     kind, run = COMMANDS[arguments[0]]
     return run(parse(kind, arguments[1:], f"csac study {arguments[0]}"))
+
+
+def _tune(arguments: list[str]) -> int:
+    chosen = Chosen.among(arguments)
+    options = parse(chosen.command("", Tune), arguments, "csac tune", chosen.others())
+    if chosen.preset:  # what it gives can depend on the task, which is known by now
+        options = parse(chosen.command(options.task, Tune), arguments, "csac tune", chosen.others())
+    algorithm = getattr(options, chosen.algorithm)
+    from csac.record.run import StorageFailure
+    from csac.studies.search_space import searched
+    from csac.studies.tune import Question
+    from csac.studies.tune_command import run_tune
+    from csac.training.options import Options
+
+    wanted = None if options.search is None else options.search.replace("-", "_").split(",")
+    question = Question(
+        **{item.name: getattr(options, item.name) for item in dataclasses.fields(Options)},
+        task=options.task,
+        algorithm=algorithm,
+        space=searched(chosen.algorithm, dataclasses.asdict(algorithm), wanted, options_in(arguments)),
+        environment_arguments=json_object("--env-kwargs", options.env_kwargs),
+    )
+    try:
+        return run_tune(question, options.home(), options.trials, options.groups, arguments)
+    except StorageFailure as failure:
+        return _complain(f"{failure}; the same line goes on once that is mended", 1)
 
 
 def _say(text: str) -> None:

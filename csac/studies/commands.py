@@ -19,6 +19,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from csac.console.tables import duration, make_console, program, short
 from csac.processes import usable_cores
+from csac.record.wandb import import_wandb
 from csac.studies.calibration import Calibration, Prediction, predict
 from csac.studies.cells import HOME, Cell, Store, is_final, similar
 from csac.studies.engines import run_here, run_in_processes
@@ -134,6 +135,8 @@ class Run(Chosen):
     results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
     """Copy the evaluations and a small manifest of each cell that is over there: what a report needs. What was copied
     there before, on this machine or another, is not run again."""
+    wandb: FlagCreatePairsOff[bool] = False
+    """Log to Weights & Biases too: a run for each cell, in the project WANDB_PROJECT or else csac (docs/python.md)."""
     keep_checkpoints: FlagCreatePairsOff[bool] = False
     """Keep the checkpoints of finished cells too: they hold the replay, and take most of the room."""
 
@@ -266,6 +269,8 @@ def run(options: Run) -> int:
     studies, store, console = options.studies(), Store(options.directory), make_console()
     cells, labels = cells_of(studies), labels_of(studies)
     engine = _engine(options)
+    if options.wandb:
+        import_wandb()
     if options.cell is not None:
         if not 0 <= options.cell < len(cells):
             raise InputError(f"--cell counts from 0 to {len(cells) - 1}, not {options.cell}")
@@ -388,6 +393,7 @@ def _jobs(studies: Sequence[Study], cells: Sequence[Cell], store: Store, options
             store.path(cell),
             device=options.device,
             keep_checkpoints=options.keep_checkpoints,
+            wandb=options.wandb,
             rollouts=rollouts[cell.key],
             command=shlex.join(["csac", *sys.argv[1:]]),
         )
