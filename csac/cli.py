@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+import faulthandler
 import io
 import os
 import shlex
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from csac.arguments import HelpShown, nearest, parse
-from csac.commands import Chosen, Evaluate, Export, Latency, Play, Resume, Runs
+from csac.arguments import HelpShown, json_object, nearest, options_in, parse
+from csac.commands import Chosen, Evaluate, Export, Latency, Play, Resume, Runs, Tune
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from contextlib import AbstractContextManager
 
     from csac.record.run import RunDirectory
 
@@ -32,6 +35,7 @@ Train controllers for continuous-control tasks with Conservative Soft Actor-Crit
   csac latency PATH    measure how long an exported policy takes for an action
   csac runs [DIR]      list the runs below a directory
   csac study COMMAND   run the paper's experiments, or your own
+  csac tune TASK       search for good hyperparameters
 
   csac COMMAND --help  explain a command and its options
   csac --version       print the version
@@ -48,6 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     _open_standard_streams()
+    if not faulthandler.is_enabled():
+        faulthandler.enable()  # a fault in a simulator's native code ends one seed's process, which is this one
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -82,13 +88,21 @@ def _dispatch(arguments: list[str]) -> int:
         "latency": _latency,
         "runs": _runs,
         "study": _study,
+        "tune": _tune,
     }
     if arguments[0] not in commands:
         raise InputError(f"no command is called {arguments[0]!r}{nearest(arguments[0], commands)} (csac --help)")
     try:
-        return commands[arguments[0]](arguments[1:])
+        with _signals_before_training() if arguments[0] in ("train", "resume") else nullcontext():
+            return commands[arguments[0]](arguments[1:])
     except HelpShown:
         return 0
+
+
+def _signals_before_training() -> AbstractContextManager[None]:
+    from csac.training.interruptions import leaving_at_once  # NumPy comes with it
+
+    return leaving_at_once()
 
 
 def _train(arguments: list[str]) -> int:
@@ -109,6 +123,7 @@ def _train(arguments: list[str]) -> int:
             directory=options.directory,
             resume=options.resume,
             start_from=options.start_from,
+            wandb=options.wandb,
             reporter=Reporter(),
             command=shlex.join(["csac", "train", *arguments]),
             **options.plan_options(),
@@ -305,6 +320,32 @@ def _study(arguments: list[str]) -> int:
         raise InputError(f"no study command is called {arguments[0]!r}{hint} (csac study --help)")
     kind, run = COMMANDS[arguments[0]]
     return run(parse(kind, arguments[1:], f"csac study {arguments[0]}"))
+
+
+def _tune(arguments: list[str]) -> int:
+    chosen = Chosen.among(arguments)
+    options = parse(chosen.command("", Tune), arguments, "csac tune", chosen.others())
+    if chosen.preset:  # what it gives can depend on the task, which is known by now
+        options = parse(chosen.command(options.task, Tune), arguments, "csac tune", chosen.others())
+    algorithm = getattr(options, chosen.algorithm)
+    from csac.record.run import StorageFailure
+    from csac.studies.search_space import searched
+    from csac.studies.tune import Question
+    from csac.studies.tune_command import run_tune
+    from csac.training.options import Options
+
+    wanted = None if options.search is None else options.search.replace("-", "_").split(",")
+    question = Question(
+        **{item.name: getattr(options, item.name) for item in dataclasses.fields(Options)},
+        task=options.task,
+        algorithm=algorithm,
+        space=searched(chosen.algorithm, dataclasses.asdict(algorithm), wanted, options_in(arguments)),
+        environment_arguments=json_object("--env-kwargs", options.env_kwargs),
+    )
+    try:
+        return run_tune(question, options.home(), options.trials, options.groups, arguments)
+    except StorageFailure as failure:
+        return _complain(f"{failure}; the same line goes on once that is mended", 1)
 
 
 def _say(text: str) -> None:

@@ -54,6 +54,8 @@ class Train(Options):
     """Processes to split the seeds over."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
     """Processes in which each group evaluates while it trains on; 0 evaluates in line. The results are the same."""
+    wandb: FlagCreatePairsOff[bool] = False
+    """Log to Weights & Biases too: a run for each seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
 
     def plan_options(self) -> PlanOptions:
         """Return the options of `train` that are given here."""
@@ -67,6 +69,48 @@ class Train(Options):
             "evaluation_processes": self.evaluation_processes,
         }
         return options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tune(Options):
+    """Search for good hyperparameters: trials of short runs, chosen by TPE, hopeless ones stopped early (Optuna).
+
+    A trial is judged by the mean over its seeds of each seed's mean return in its last three evaluations, on episodes
+    that no other run and no report uses. Hyperparameters that are given below stay as given; the others of the search
+    space are searched (docs/tuning.md). Any number of processes and machines that type the same line share the trials;
+    after Ctrl-C or a crash the same line goes on.
+
+    Exit codes: 0 done, 2 wrong arguments, 3 no trial is complete, 130 or 143 stopped by a signal.
+    """
+
+    task: Annotated[Positional[str], arg(metavar="TASK")]
+    """A Gymnasium id such as HalfCheetah-v4, or module:Id for an environment that a module registers."""
+    algorithm: str = "csac"
+    """What learns; its own options are listed below: each that is given is not searched."""
+    preset: str | None = None
+    """Hyperparameters to begin the search with: paper is the paper's tables."""
+    trials: int = 50
+    """How many trials the study is to have, those of other processes and of earlier calls included."""
+    search: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: the whole search space)")] = (
+        None
+    )
+    """Search only these hyperparameters."""
+    steps: int = 100_000
+    """Environment steps per seed of each trial, warm-up included."""
+    seeds: int = 2
+    """How many independent seeds each trial has, the same for all."""
+    first_seed: int = 1_000
+    """Label of the first seed; the others follow. Report the result on other seeds."""
+    directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/tune/TASK/ALGORITHM)")] = None
+    """The study's own directory: new, empty, or that of the same search."""
+    env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
+    """Keyword arguments for the environment, as a JSON object."""
+    groups: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
+    """Processes to split the seeds of a trial over."""
+
+    def home(self) -> Path:
+        """Return the study's directory."""
+        return self.directory or Path("runs", "tune", self.task.replace("/", "-").replace(":", "-"), self.algorithm)
 
 
 @dataclass(frozen=True)
@@ -245,8 +289,8 @@ class Chosen(NamedTuple):
             raise InputError(f"no algorithm is called {name!r}: choose {' or '.join(ALGORITHMS)}")
         return cls(name, peek(arguments, "--preset", None), source)
 
-    def command(self, task: str) -> type[Any]:
-        """Return `Train` with the hyperparameters of the algorithm beside its own options.
+    def command(self, task: str, base: type[Any] = Train) -> type[Any]:
+        """Return `Train` (or `Tune`) with the hyperparameters of the algorithm beside its own options.
 
         Their defaults are those of the preset for this task, or of the run to begin with.
         """
@@ -267,9 +311,9 @@ class Chosen(NamedTuple):
             ("preset", Annotated[presets | None, hint], field(default=self.preset)),
             (self.algorithm, OmitArgPrefixes[type(algorithm)], field(default=algorithm)),
         ]
-        documented = {"__doc__": Train.__doc__}
+        documented = {"__doc__": base.__doc__}
         return dataclasses.make_dataclass(
-            "Train", fields, bases=(Train,), frozen=True, kw_only=True, namespace=documented
+            base.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace=documented
         )
 
     def others(self) -> dict[str, type[Any]]:

@@ -40,7 +40,7 @@ def take_hyperparameters(algorithm: Any) -> None:
     NumPy's scalars become Python's, and lists tuples, so that what is recorded does not depend on how it was given.
 
     Raises:
-        InputError: the first such field, its value and what it may be.
+        InputError: the first such field, its value and what it may be; or a replay that holds less than a batch.
     """
     hints = get_type_hints(type(algorithm), include_extras=True)
     for field in dataclasses.fields(algorithm):
@@ -48,6 +48,10 @@ def take_hyperparameters(algorithm: Any) -> None:
         if words := _what_it_must_be(value, hints[field.name]):
             raise InputError(f"{field.name} must be {words}, not {value!r}")
         object.__setattr__(algorithm, field.name, value)
+    if hasattr(algorithm, "replay_size") and algorithm.replay_size < algorithm.batch_size:
+        raise InputError(
+            f"replay_size must be at least batch_size, {algorithm.batch_size:,}, not {algorithm.replay_size:,}"
+        )
 
 
 def _what_it_must_be(value: Any, hint: Any) -> str | None:

@@ -35,7 +35,7 @@ def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
     if not rows:
         return
     with open(path, "ab+") as file:
-        _drop_torn_line(file)
+        drop_torn_line(file)
         file.seek(0)
         header = _header(path, file.readline())
         text = io.StringIO()
@@ -154,7 +154,7 @@ def _cell(path: Path, column: str, value: Any) -> str:
     return str(int(number)) if number.dtype.kind in "bui" else str(number[()])
 
 
-def _drop_torn_line(file: BinaryIO) -> None:
+def drop_torn_line(file: BinaryIO) -> None:
     """Cut off what follows the last newline: a line that a crash interrupted."""
     end = file.seek(0, os.SEEK_END)
     if not end:
