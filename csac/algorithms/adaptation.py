@@ -44,7 +44,7 @@ class LearntWeights(NamedTuple):
 def weight_loss(log_weight: Scalar, slack: Scalar) -> tuple[Scalar, Metrics]:
     """Return log w · slack: w falls while the constraint holds with slack to spare, and rises while it does not.
 
-    With the slack entropy - target this is SAC's Eq. 18 with log α for α, the form that everyone runs.
+    With the slack entropy - target this is SAC's temperature loss.
     """
     return log_weight * slack, {}
 
@@ -64,10 +64,10 @@ def begin_weights(
 def weights_now(given: tuple[Weight, Weight], learnt: LearntWeights | None) -> Weights:
     """Return the weights as they are given or, where they are `auto`, as they are learnt."""
 
-    def now(weight: Weight, one: LearntWeight | None) -> Any:
+    def now(weight: Any, one: LearntWeight | None) -> Any:
         return weight if one is None else jnp.exp(one.log_weight)
 
-    return Weights(*given) if learnt is None else Weights(*map(now, given, learnt))
+    return Weights(*map(now, given, learnt or LearntWeights(None, None)))
 
 
 def adapted(

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from csac.algorithms.adaptation import weight_loss
 from csac.algorithms.critics import Critics, critic_loss, least_q_value, make_critics
 from csac.algorithms.distributions import policy_at
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
@@ -95,6 +94,12 @@ class SAC:
         loss = temperature * log_prob - q_value
         return loss, {"actor_loss": loss, "entropy": -log_prob}
 
+    def temperature_loss(
+        self, log_temperature: Scalar, entropy: Scalar, *, target_entropy: float
+    ) -> tuple[Scalar, Metrics]:
+        """Return log α (entropy - target): SAC's Eq. 18 with log α for α, the form that everyone runs."""
+        return log_temperature * (entropy - target_entropy), {}
+
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Take one gradient step on the critics, the actor and the temperature, then move the target critics."""
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
@@ -118,10 +123,11 @@ class SAC:
         log_temperature, temperature_optimiser = state.log_temperature, state.temperature_optimiser
         if self.temperature == "automatic":
             target_entropy = self.target_entropy if self.target_entropy is not None else -float(batch.action.shape[-1])
-            slack = (actor_metrics["entropy"] - target_entropy)[None]  # the loss is linear in it: one stands for all
+            temperature_loss = partial(self.temperature_loss, target_entropy=target_entropy)
+            mean_entropy = actor_metrics["entropy"][None]  # the loss is linear in it: one example stands for all
             optimiser = self._optimiser(self.temperature_learning_rate)
             log_temperature, temperature_optimiser, _ = descend(
-                optimiser, weight_loss, log_temperature, temperature_optimiser, slack
+                optimiser, temperature_loss, log_temperature, temperature_optimiser, mean_entropy
             )
 
         new_state = State(

@@ -89,6 +89,12 @@ def test_critic_loss_sums_both_critics():
     assert float(critic_loss(CRITICS, transition(), jnp.float32(3.0))[0]) == pytest.approx(1.25)
 
 
+def test_temperature_rises_where_the_entropy_is_below_its_target():
+    # d/d(log α) [log α (entropy - target)] = entropy - target = -2 - (-1) = -1, and descent goes against it.
+    slope = jax.grad(SAC().temperature_loss, has_aux=True)
+    assert float(slope(0.3, -2.0, target_entropy=-1.0)[0]) == -1.0
+
+
 def test_polyak():
     # 1 + 0.25 (5 - 1) = 2 and 2 + 0.25 (-2 - 2) = 1
     assert polyak({"a": 1.0, "b": 2.0}, {"a": 5.0, "b": -2.0}, 0.25) == {"a": 2.0, "b": 1.0}
