@@ -30,25 +30,25 @@ class Choice(NamedTuple):
 
 
 def conservative_value_iteration(alpha: float, beta: float, discount: float, iterations: int) -> np.ndarray:
-    """Return the soft values [iteration, state] of P ← r + γ E[m P] + α (P - m P), with m P = log Σ exp(βP) / β."""
+    """Return each P [iteration, state, action] of P ← r + γ E[m P] + α (P - m P), with m P = log Σ exp(βP) / β."""
     generator = np.random.default_rng(0)
     reward = generator.normal(size=(STATES, ACTIONS))
     dynamics = generator.dirichlet(np.ones(STATES), size=(STATES, ACTIONS))
-    preference, values = np.zeros((STATES, ACTIONS)), []
+    preference, found = np.zeros((STATES, ACTIONS)), []
     for _ in range(iterations):
         largest = preference.max(axis=1)
         value = largest + np.log(np.exp(beta * (preference - largest[:, None])).sum(axis=1)) / beta
-        values.append(value)
         preference = reward + discount * dynamics @ value + alpha * (preference - value[:, None])
-    return np.array(values)
+        found.append(preference)
+    return np.array(found)
 
 
 def contraction(sigma: float, tau: float, discount: float) -> float:
     """Return the factor by which an iteration shrinks the distance to the end, once the first ones are over."""
     alpha, beta = tau / (tau + sigma), 1.0 / (tau + sigma)
     iterations = int(12 / -np.log(max(alpha, discount)))  # until e⁻¹² of it is left
-    values = conservative_value_iteration(alpha, beta, discount, 3 * iterations)
-    distance = np.abs(values[:iterations] - values[-1]).max(axis=1)
+    preferences = conservative_value_iteration(alpha, beta, discount, 3 * iterations)
+    distance = np.abs(preferences[:iterations] - preferences[-1]).max(axis=(1, 2))
     middle = iterations // 2
     return float((distance[-1] / distance[middle]) ** (1.0 / (iterations - 1 - middle)))
 
