@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,13 +18,13 @@ EVIDENCE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "res
 STUDY = Study("s", "S", ("Hopper-v4",), (Method("SAC, 0.2", "sac", "paper"), Method("CSAC", "csac")), steps=50)
 
 
-def rows(curves: dict[int, list[float]]) -> np.ndarray:
+def rows(curves: Mapping[int, Sequence[float]]) -> np.ndarray:
     """Evaluations of one episode each at steps 10, 20, ... for each seed's curve."""
     told = [(seed, 10 * (i + 1), value) for seed, curve in curves.items() for i, value in enumerate(curve)]
     return np.array(told, [("seed", int), ("step", int), ("return", float)])
 
 
-def arm(method: Method, curves: dict[int, list[float]], failed: tuple[int, ...] = (), condition=()) -> Arm:
+def arm(method: Method, curves: Mapping[int, Sequence[float]], failed: tuple[int, ...] = (), condition=()) -> Arm:
     records: list[Any] = [
         SimpleNamespace(manifest=SimpleNamespace(seeds=[seed]), evaluations=rows({seed: curve}), rollouts=None)
         for seed, curve in curves.items()

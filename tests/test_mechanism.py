@@ -52,7 +52,9 @@ def test_the_parts_are_those_of_the_actor_s_gradient(estimator):
     )
     order = [0.5 * -0.25, 0.5 * -0.75]  # of the bias; the weights' gradient is the same, as the observation is 1
     np.testing.assert_allclose(relative_entropy.mean(axis=0), order * 2, atol=0.01)
-    # Q₁ = s + 2 tanh u is the smaller one: -dQ/dμ = -2 E[1 - tanh²u], and 0.2 d(log π)/dlog s = -0.2 + ...
+    # At s = 1 Q₁ = 1 + 2a is the smaller one where a < 2/3, and Q₂ = 3 - a above; da/dμ = 1 - a² and
+    # dlog π/dlog s = -1 + 2ua.
     u = np.asarray(noises, np.float64)
-    assert float(q.mean(axis=0)[2]) == pytest.approx(-2 * np.mean(1 - np.tanh(u) ** 2), abs=0.05)
+    slopes = np.where(np.tanh(u) < 2 / 3, -2.0, 1.0) * (1 - np.tanh(u) ** 2)
+    assert float(q.mean(axis=0)[2]) == pytest.approx(np.mean(slopes), abs=1e-3)
     assert float(entropy.mean(axis=0)[3]) == pytest.approx(0.2 * np.mean(-1 + 2 * u * np.tanh(u)), abs=1e-3)

@@ -155,15 +155,19 @@ def look(
         policies, jax.random.normal(key, policies.mean.shape)
     )
     return Look(
-        divergence(state.actor, reference, batches.reshape(-1, batches.shape[-1])),
-        *norms,
-        *noise,
-        jnp.vdot(means[2], update) / jnp.maximum(norms[2] * jnp.linalg.norm(update), 1e-30),
-        jnp.linalg.norm(update),
-        divergence(state.actor, before, held_out),
-        divergence(state.actor, at_last_look, held_out),
-        jnp.mean(jnp.exp(policies.log_std)),
-        -jnp.mean(log_probs),
+        relative_entropy=divergence(state.actor, reference, batches.reshape(-1, batches.shape[-1])),
+        q_gradient=norms[0],
+        entropy_gradient=norms[1],
+        kl_gradient=norms[2],
+        q_noise=noise[0],
+        entropy_noise=noise[1],
+        kl_noise=noise[2],
+        cosine=jnp.vdot(means[2], update) / jnp.maximum(norms[2] * jnp.linalg.norm(update), 1e-30),
+        update=jnp.linalg.norm(update),
+        churn=divergence(state.actor, before, held_out),
+        churn_since_last_look=divergence(state.actor, at_last_look, held_out),
+        std=jnp.mean(jnp.exp(policies.log_std)),
+        entropy=-jnp.mean(log_probs),
     )
 
 
@@ -230,9 +234,9 @@ def critic_error(rollout: Rollout, discount: float) -> dict[str, float]:
     }
 
 
-def run(name: str, task: str, steps: int, seed: int) -> None:
+def run(name: str, task: str, steps: int, warmup_steps: int, seed: int) -> None:
     """Train one arm, look at it as it goes, and write its file."""
-    algorithm = CSAC(**ARMS[name])
+    algorithm = CSAC(warmup_steps=warmup_steps, **ARMS[name])
     environments, aside = (SeedEnvironments(task, None, [label]) for label in (seed, 10_000 + seed))
     learner = Learner(algorithm, environments.spec, [seed], steps)
     observations = environments.reset()
@@ -281,11 +285,7 @@ def show() -> None:
     from matplotlib.figure import Figure
 
     tables = {name: np.genfromtxt(_file(name), delimiter=",", names=True) for name in ARMS if _file(name).exists()}
-    colours = dict(
-        zip(
-            ("algorithm1", "previous", "periodic", "average"), ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), strict=True
-        )
-    )
+    colours = {"algorithm1": "#0072B2", "previous": "#D55E00", "periodic": "#009E73", "average": "#CC79A7"}
     figure = Figure(figsize=(16, 7.5), layout="constrained")
     for axes, (column, title, is_log) in zip(figure.subplots(2, 4).flat, FIGURES, strict=True):
         for name, rows in tables.items():
@@ -328,13 +328,14 @@ def main() -> None:
     parser.add_argument("arm", nargs="?", choices=tuple(ARMS))
     parser.add_argument("--task", default="Walker2d-v4")
     parser.add_argument("--steps", type=int, default=30_000)
+    parser.add_argument("--warmup-steps", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.command == "draw":
         show()
     else:
         for name in [arguments.arm] if arguments.arm else [name for name in ARMS if not _file(name).exists()]:
-            run(name, arguments.task, arguments.steps, arguments.seed)
+            run(name, arguments.task, arguments.steps, arguments.warmup_steps, arguments.seed)
 
 
 if __name__ == "__main__":

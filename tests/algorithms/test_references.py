@@ -1,5 +1,7 @@
 """Which policies an update takes as references: actors are numbers here, actor k the one before update k."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import pytest
 
@@ -7,11 +9,13 @@ from csac.algorithms.references import reference_after, references_before
 
 
 def references(choice, keeps_earlier, updates=8, period=3, rate=0.5):
-    kept = earlier = jnp.zeros(())  # copies of actor 0
+    kept: Any = jnp.zeros(())  # copies of actor 0
+    earlier: Any = kept
     found = []
     for k in range(updates):
-        actor, renews = jnp.float32(k), jnp.asarray(k % period == 0)
-        used = references_before(choice, kept, earlier if keeps_earlier else None, actor, renews)
+        actor: Any = jnp.float32(k)
+        renews = jnp.asarray(k % period == 0)
+        used: Any = references_before(choice, kept, earlier if keeps_earlier else None, actor, renews)
         found.append((float(used.actor), float(used.critic)))
         kept, earlier = reference_after(choice, used.actor, actor, rate), used.critic
     return found
@@ -43,6 +47,7 @@ def test_the_critic_has_the_reference_that_the_actor_s_replaced(choice, expected
 
 
 def test_without_a_reference_none_is_kept():
-    used = references_before("average", None, None, jnp.ones(()), jnp.asarray(True))
+    actor: Any = jnp.ones(())
+    used = references_before("average", None, None, actor, jnp.asarray(True))
     assert used == (None, None)
-    assert reference_after("average", used.actor, jnp.ones(()), 0.5) is None
+    assert reference_after("average", used.actor, actor, 0.5) is None
