@@ -83,6 +83,11 @@ def peek(arguments: list[str], option: str, default: Any) -> Any:
     return value
 
 
+def options_in(arguments: list[str]) -> list[str]:
+    """Return the names of the options that are given, as fields are called: `--target-rate=1` is target_rate."""
+    return [word.partition("=")[0][2:].replace("-", "_") for word in arguments if word.startswith("--")]
+
+
 def json_object(option: str, text: str) -> dict[str, Any]:
     """Return the JSON object that an option was given. Raises InputError where it is none."""
     try:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+import faulthandler
 import io
 import os
 import shlex
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from csac.arguments import HelpShown, nearest, parse
-from csac.commands import Chosen, Evaluate, Play, Resume, Runs
+from csac.arguments import HelpShown, json_object, nearest, options_in, parse
+from csac.commands import Chosen, Evaluate, Export, Latency, Play, Resume, Runs, Tune
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from contextlib import AbstractContextManager
 
     from csac.record.run import RunDirectory
 
@@ -28,8 +31,11 @@ Train controllers for continuous-control tasks with Conservative Soft Actor-Crit
   csac resume DIR      go on with a run that was stopped or killed
   csac evaluate DIR    test the policies of a run on fresh episodes
   csac play DIR        watch the policy of a run, or write a video of it
+  csac export DIR      take a policy out of a run: NumPy, ONNX or C, verified
+  csac latency PATH    measure how long an exported policy takes for an action
   csac runs [DIR]      list the runs below a directory
   csac study COMMAND   run the paper's experiments, or your own
+  csac tune TASK       search for good hyperparameters
 
   csac COMMAND --help  explain a command and its options
   csac --version       print the version
@@ -46,6 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     _open_standard_streams()
+    if not faulthandler.is_enabled():
+        faulthandler.enable()  # a fault in a simulator's native code ends one seed's process, which is this one
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -76,15 +84,25 @@ def _dispatch(arguments: list[str]) -> int:
         "resume": _resume,
         "evaluate": _evaluate,
         "play": _play,
+        "export": _export,
+        "latency": _latency,
         "runs": _runs,
         "study": _study,
+        "tune": _tune,
     }
     if arguments[0] not in commands:
         raise InputError(f"no command is called {arguments[0]!r}{nearest(arguments[0], commands)} (csac --help)")
     try:
-        return commands[arguments[0]](arguments[1:])
+        with _signals_before_training() if arguments[0] in ("train", "resume") else nullcontext():
+            return commands[arguments[0]](arguments[1:])
     except HelpShown:
         return 0
+
+
+def _signals_before_training() -> AbstractContextManager[None]:
+    from csac.training.interruptions import leaving_at_once  # NumPy comes with it
+
+    return leaving_at_once()
 
 
 def _train(arguments: list[str]) -> int:
@@ -105,6 +123,7 @@ def _train(arguments: list[str]) -> int:
             directory=options.directory,
             resume=options.resume,
             start_from=options.start_from,
+            wandb=options.wandb,
             reporter=Reporter(),
             command=shlex.join(["csac", "train", *arguments]),
             **options.plan_options(),
@@ -221,6 +240,61 @@ def _play(arguments: list[str]) -> int:
     return 0
 
 
+def _export(arguments: list[str]) -> int:
+    options = parse(Export, arguments, "csac export")
+    from csac.console.exports import export_lines, size_table
+    from csac.console.tables import make_console
+    from csac.console.waiting import progress_shown
+    from csac.evaluation.evaluator import EvaluationFailure
+    from csac.evaluation.export import export_run
+
+    console, exported = make_console(), []
+    try:
+        with progress_shown(console, "verifying", "episodes") as on_progress:
+            for one in export_run(
+                options.run,
+                tuple(options.format.split(",")),  # pyright: ignore[reportArgumentType] (others are refused by name)
+                options.seed_label(),
+                options.checkpoint,
+                options.out,
+                options.options(),
+                trust_task=options.trust_task,
+                on_progress=on_progress,
+            ):
+                exported.append(one)
+                for line in export_lines(one):
+                    console.print(line, soft_wrap=True)
+    except EvaluationFailure as error:
+        return _complain(error, 1)
+    if (sizes := size_table(exported)) is not None:
+        console.print(sizes)
+    return 0
+
+
+def _latency(arguments: list[str]) -> int:
+    options = parse(Latency, arguments, "csac latency")
+    if not options.artefacts:
+        raise InputError("give the folder of an artefact (csac export writes one)")
+    from csac.console.latencies import latency_table
+    from csac.console.tables import make_console
+    from csac.evaluation.latency import measure
+    from csac.record.csv_tables import check_new
+
+    console, measured = make_console(), {}
+    if options.plot:
+        check_new(options.plot, "picture", ".png")
+    for path in options.artefacts:
+        console.print(f"measuring {path}", soft_wrap=True)  # once: what moves on a terminal takes time from a core
+        measured[str(path)] = measure(path, options.calls, options.rate, options.seconds)
+    console.print(latency_table(measured))
+    if options.plot:
+        from csac.record.jitter import Calls, jitter  # matplotlib is slow to import
+
+        jitter([Calls(name, *latency) for name, several in measured.items() for latency in several], options.plot)
+        console.print(str(options.plot), soft_wrap=True)
+    return 0
+
+
 def _runs(arguments: list[str]) -> int:
     options = parse(Runs, arguments, "csac runs")
     from csac.console.tables import make_console, print_runs
@@ -246,6 +320,32 @@ def _study(arguments: list[str]) -> int:
         raise InputError(f"no study command is called {arguments[0]!r}{hint} (csac study --help)")
     kind, run = COMMANDS[arguments[0]]
     return run(parse(kind, arguments[1:], f"csac study {arguments[0]}"))
+
+
+def _tune(arguments: list[str]) -> int:
+    chosen = Chosen.among(arguments)
+    options = parse(chosen.command("", Tune), arguments, "csac tune", chosen.others())
+    if chosen.preset:  # what it gives can depend on the task, which is known by now
+        options = parse(chosen.command(options.task, Tune), arguments, "csac tune", chosen.others())
+    algorithm = getattr(options, chosen.algorithm)
+    from csac.record.run import StorageFailure
+    from csac.studies.search_space import searched
+    from csac.studies.tune import Question
+    from csac.studies.tune_command import run_tune
+    from csac.training.options import Options
+
+    wanted = None if options.search is None else options.search.replace("-", "_").split(",")
+    question = Question(
+        **{item.name: getattr(options, item.name) for item in dataclasses.fields(Options)},
+        task=options.task,
+        algorithm=algorithm,
+        space=searched(chosen.algorithm, dataclasses.asdict(algorithm), wanted, options_in(arguments)),
+        environment_arguments=json_object("--env-kwargs", options.env_kwargs),
+    )
+    try:
+        return run_tune(question, options.home(), options.trials, options.groups, arguments)
+    except StorageFailure as failure:
+        return _complain(f"{failure}; the same line goes on once that is mended", 1)
 
 
 def _say(text: str) -> None:

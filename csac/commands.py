@@ -16,6 +16,7 @@ from csac.training.options import Options
 from csac.types import InputError
 
 if TYPE_CHECKING:
+    from csac.evaluation.export import ExportOptions
     from csac.record.manifest import Manifest
     from csac.training.options import PlanOptions
 
@@ -53,6 +54,8 @@ class Train(Options):
     """Processes to split the seeds over."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
     """Processes in which each group evaluates while it trains on; 0 evaluates in line. The results are the same."""
+    wandb: FlagCreatePairsOff[bool] = False
+    """Log to Weights & Biases too: a run for each seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
 
     def plan_options(self) -> PlanOptions:
         """Return the options of `train` that are given here."""
@@ -66,6 +69,48 @@ class Train(Options):
             "evaluation_processes": self.evaluation_processes,
         }
         return options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tune(Options):
+    """Search for good hyperparameters: trials of short runs, chosen by TPE, hopeless ones stopped early (Optuna).
+
+    A trial is judged by the mean over its seeds of each seed's mean return in its last three evaluations, on episodes
+    that no other run and no report uses. Hyperparameters that are given below stay as given; the others of the search
+    space are searched (docs/tuning.md). Any number of processes and machines that type the same line share the trials;
+    after Ctrl-C or a crash the same line goes on.
+
+    Exit codes: 0 done, 2 wrong arguments, 3 no trial is complete, 130 or 143 stopped by a signal.
+    """
+
+    task: Annotated[Positional[str], arg(metavar="TASK")]
+    """A Gymnasium id such as HalfCheetah-v4, or module:Id for an environment that a module registers."""
+    algorithm: str = "csac"
+    """What learns; its own options are listed below: each that is given is not searched."""
+    preset: str | None = None
+    """Hyperparameters to begin the search with: paper is the paper's tables."""
+    trials: int = 50
+    """How many trials the study is to have, those of other processes and of earlier calls included."""
+    search: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: the whole search space)")] = (
+        None
+    )
+    """Search only these hyperparameters."""
+    steps: int = 100_000
+    """Environment steps per seed of each trial, warm-up included."""
+    seeds: int = 2
+    """How many independent seeds each trial has, the same for all."""
+    first_seed: int = 1_000
+    """Label of the first seed; the others follow. Report the result on other seeds."""
+    directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/tune/TASK/ALGORITHM)")] = None
+    """The study's own directory: new, empty, or that of the same search."""
+    env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
+    """Keyword arguments for the environment, as a JSON object."""
+    groups: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
+    """Processes to split the seeds of a trial over."""
+
+    def home(self) -> Path:
+        """Return the study's directory."""
+        return self.directory or Path("runs", "tune", self.task.replace("/", "-").replace(":", "-"), self.algorithm)
 
 
 @dataclass(frozen=True)
@@ -121,6 +166,99 @@ class Play:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Take a policy out of a run: from the raw observation to the environment's action, verified.
+
+    Each artefact is a folder with the policy and contract.json, which says what goes in and what comes out.
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The directory of a run."""
+    seed: Annotated[str, arg(metavar="best|K")] = "best"
+    """Label of the seed; best is the one with the best last evaluations."""
+    checkpoint: Literal["last", "best"] = "last"
+    """The seed's last policy, or the one of its best evaluation."""
+    format: Annotated[str, arg(metavar="numpy|onnx|c,...")] = "numpy"
+    """numpy: NumPy alone, with a loader beside it. onnx: a graph. c: a header in C99. Several with commas between."""
+    out: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="(default: DIR/export/FORMAT)")] = None
+    """The artefact's folder; with several formats, the folder of their folders."""
+    weights: Literal["float32", "float16", "int8"] = "float32"
+    """Numbers that the weights of a C artefact are kept in; the error that smaller ones make is stated."""
+    stochastic: FlagCreatePairsOff[bool] = False
+    """Sample actions as in training. In ONNX the noise becomes a second input: a graph cannot be seeded."""
+    noise_seed: int = 0
+    """Seed of the noise that actions are sampled with."""
+    fallback: Annotated[str | None, arg(metavar="zero|middle|last|X,...", help_behavior_hint="(default: no guard)")] = (
+        None
+    )
+    """Guard against NaN and infinity in observations: the action to take instead."""
+    observation_range: Annotated[
+        Literal["bounds", "recorded"] | None, arg(help_behavior_hint="(default: anything finite is good)")
+    ] = None
+    """Guard as well against what is out of the task's bounds, or of what the episodes of the export have shown."""
+    range_margin: float = 0.5
+    """How far beyond what was recorded is still good, as a share of its width."""
+    watchdog: Annotated[int | None, arg(help_behavior_hint="(default: never)")] = None
+    """Keep to the fallback after so many bad observations in a row, until a reset."""
+    rate_limit: Annotated[float | None, arg(help_behavior_hint="(default: no limit)")] = None
+    """The most that an action may change from one step to the next, as a share of its range; the fallback is then the
+    last action, unless another is given."""
+    episodes: int = 10
+    """Episodes to verify with, those of csac evaluate."""
+    no_rollouts: FlagCreatePairsOff[bool] = False
+    """Play no episodes, where the task cannot be made here."""
+    card: FlagCreatePairsOff[bool] = False
+    """Write a model card beside it, README.md."""
+    trust_task: FlagCreatePairsOff[bool] = False
+    """Run the code of the module that the task names, though you have never named it here; look at it first."""
+
+    def options(self) -> ExportOptions:
+        """Return how the policy is to leave its run."""
+        from csac.evaluation.export import ExportOptions
+
+        if self.episodes < 1:
+            raise InputError(f"--episodes {self.episodes}: give at least 1, or --no-rollouts")
+        return ExportOptions(
+            self.noise_seed if self.stochastic else None,
+            self.weights,
+            self.fallback,
+            self.observation_range,
+            self.range_margin,
+            self.watchdog,
+            self.rate_limit,
+            0 if self.no_rollouts else self.episodes,
+            self.card,
+        )
+
+    def seed_label(self) -> int | None:
+        """Return the seed that was asked for, or None for the best. Raises InputError for neither."""
+        if self.seed == "best":
+            return None
+        if not self.seed.isdecimal():
+            raise InputError(f"--seed {self.seed}: give best, or the label of a seed")
+        return int(self.seed)
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Measure how long artefacts take for one action, flat out and at a fixed rate, call by call.
+
+    An artefact in C is timed inside of a compiled program, the others around their call in Python.
+    """
+
+    artefacts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ARTEFACT")]
+    """Folders that csac export has written."""
+    calls: int = 100_000
+    """Calls one after the other."""
+    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: the task's, or 100)")] = None
+    """Calls a second, when they are made at a rate."""
+    seconds: float = 10.0
+    """How long they are made at the rate; 0 leaves that out."""
+    plot: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="(default: none)")] = None
+    """Draw how many calls take how long, and how late they begin."""
+
+
+@dataclass(frozen=True)
 class Runs:
     """List the runs below a directory."""
 
@@ -151,8 +289,8 @@ class Chosen(NamedTuple):
             raise InputError(f"no algorithm is called {name!r}: choose {' or '.join(ALGORITHMS)}")
         return cls(name, peek(arguments, "--preset", None), source)
 
-    def command(self, task: str) -> type[Any]:
-        """Return `Train` with the hyperparameters of the algorithm beside its own options.
+    def command(self, task: str, base: type[Any] = Train) -> type[Any]:
+        """Return `Train` (or `Tune`) with the hyperparameters of the algorithm beside its own options.
 
         Their defaults are those of the preset for this task, or of the run to begin with.
         """
@@ -173,9 +311,9 @@ class Chosen(NamedTuple):
             ("preset", Annotated[presets | None, hint], field(default=self.preset)),
             (self.algorithm, OmitArgPrefixes[type(algorithm)], field(default=algorithm)),
         ]
-        documented = {"__doc__": Train.__doc__}
+        documented = {"__doc__": base.__doc__}
         return dataclasses.make_dataclass(
-            "Train", fields, bases=(Train,), frozen=True, kw_only=True, namespace=documented
+            base.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace=documented
         )
 
     def others(self) -> dict[str, type[Any]]:

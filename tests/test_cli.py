@@ -109,7 +109,7 @@ def make_run(path, task, observation_size, low, high, seeds=(0, 1)):
     for seed in seeds:
         weight = generator.normal(size=(observation_size, 2 * len(low))).astype(np.float32)
         network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * len(low), np.float32)),),)))
-        Policy(network, contract).save(path / "policy" / f"seed_{seed}.safetensors")
+        Policy(network, contract).save_layers(path / "policy" / f"seed_{seed}.safetensors")
         rows = {"seed": seed, "step": 100, "episode": 0, "return": float(seed), "length": 5, "success": None}
         run.append("evaluations", [rows])
     run.update_manifest(state="finished")
@@ -552,6 +552,20 @@ def test_a_signal_saves_what_was_learnt(tmp_path, number, groups):
     assert run.manifest.steps_done >= 250
     assert (run.path / "checkpoint" / f"step_{run.manifest.steps_done}.json").exists()
     assert csac(f"evaluate {run.path} --episodes 1") == 0
+
+
+def test_too_few_file_handles_are_told_and_the_run_goes_on_with_enough(tmp_path):
+    line = f"train Pendulum-v1 --directory run --steps 120 --evaluation-interval 60 --evaluation-episodes 1 {TINY}"
+    limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_NOFILE, (14, 14)); from csac.cli import main; "
+    command = [sys.executable, "-c", limited + f"sys.exit(main({shlex.split(line)!r}))"]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert ended.returncode == 1
+    assert ended.stderr == (
+        "csac: run cannot be written: Too many open files; the run can go on from its last checkpoint (csac resume) "
+        "once that is mended\n"
+    )
+    assert csac(f"resume {tmp_path / 'run'}") == 0
+    assert RunDirectory.open(tmp_path / "run").manifest.steps_done == 120
 
 
 def test_nobody_reading_is_no_error():

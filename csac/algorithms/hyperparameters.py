@@ -42,7 +42,8 @@ def take_hyperparameters(algorithm: Any, not_together: Iterable[tuple[Mapping[st
     `not_together` are values of fields that make no sense together, and why.
 
     Raises:
-        InputError: the first such field, its value and what it may be; or fields that make no sense together.
+        InputError: the first such field, its value and what it may be; fields that make no sense together; or a replay
+            that holds less than a batch.
     """
     hints = get_type_hints(type(algorithm), include_extras=True)
     for field in dataclasses.fields(algorithm):
@@ -54,6 +55,10 @@ def take_hyperparameters(algorithm: Any, not_together: Iterable[tuple[Mapping[st
         if all(getattr(algorithm, name) in refused for name, refused in values.items()):
             told = " with ".join(f"{name} {getattr(algorithm, name)}" for name in values)
             raise InputError(f"{told} makes no sense: {why}")
+    if hasattr(algorithm, "replay_size") and algorithm.replay_size < algorithm.batch_size:
+        raise InputError(
+            f"replay_size must be at least batch_size, {algorithm.batch_size:,}, not {algorithm.replay_size:,}"
+        )
 
 
 def _what_it_must_be(value: Any, hint: Any) -> str | None:

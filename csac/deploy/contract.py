@@ -92,9 +92,9 @@ class Contract:
         """Return actions of [-1, 1], [..., action], on the environment's scale: float32 [..., *action_shape]."""
         return self._bounds.scale(action).reshape(action.shape[:-1] + self.action_shape)
 
-    def save(self, path: str | Path) -> None:
-        """Write the contract as JSON, whole or not at all."""
-        fields = {
+    def fields(self) -> dict[str, Any]:
+        """Return what its JSON holds."""
+        return {
             "schema_version": SCHEMA_VERSION,
             "task": self.task,
             "algorithm": self.algorithm,
@@ -105,7 +105,10 @@ class Contract:
             "action_low": self.action_low.tolist(),
             "action_high": self.action_high.tolist(),
         }
-        write_atomically(Path(path), (json.dumps(fields, indent=2) + "\n").encode())
+
+    def save(self, path: str | Path) -> None:
+        """Write the contract as JSON, whole or not at all."""
+        write_atomically(Path(path), (json.dumps(self.fields(), indent=2) + "\n").encode())
 
     @staticmethod
     def load(path: str | Path) -> Contract:
@@ -114,10 +117,11 @@ class Contract:
         Raises:
             InputError: no such file, or one that is not a contract of this schema.
         """
-        try:
-            fields = json.loads(read_file(Path(path)).decode())
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is not valid JSON ({error}): restore it from a copy") from error
+        return Contract.of_fields(read_json(Path(path)), path)
+
+    @staticmethod
+    def of_fields(fields: Any, path: str | Path) -> Contract:
+        """Return the contract that `fields` made these of, whatever else there is. Raises InputError for others."""
         try:
             return _contract(fields)
         except (KeyError, TypeError, ValueError) as error:
@@ -202,3 +206,11 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def read_json(path: Path) -> Any:
+    """Return what a JSON file holds. Raises InputError where it cannot be read, or is none."""
+    try:
+        return json.loads(read_file(path).decode())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not valid JSON ({error}): restore it from a copy") from error

@@ -13,6 +13,7 @@ from csac.deploy.parameters import check_network, copied, from_tensors, to_tenso
 from csac.record.atomic import write_atomically
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork
 
+CONTRACT, SAVED = "contract.json", "policy.safetensors"  # in the folder of a policy that was saved by itself
 LOG_STD_RANGE = (-20.0, 2.0)
 
 _STREAM = 0x706F6C69  # far from what a task that spawns generators of its own would use: 0, 1, 2, ...
@@ -67,13 +68,32 @@ class Policy:
         A stochastic action adds std * noise to the mean before the head's tanh or clip; `noise`, standard normal
         [n, action], is drawn where not given. The head `tanh` has no spread: it gives the same action either way.
         """
+        if not deterministic and noise is None:
+            noise = self._generator.standard_normal(
+                (len(observations), self.contract.spec.action_size), dtype=np.float32
+            )
+        actions, values = self.candidates(observations, None if deterministic else noise)
+        if values is None:
+            return actions[0]
+        return actions[np.argmax(values, axis=0), np.arange(len(observations))]
+
+    def candidates(self, observations: np.ndarray, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return each actor's actions in [-1, 1], [actor, n, action], and what its own critic values them, [actor, n].
+
+        A single actor's action is valued by nobody. `act` takes row by row the one that is valued most, the first of
+        equals. Observations in float64 are computed on in float64.
+        """
         normaliser = self.network.parameters.normaliser
         inputs = observations if normaliser is None else _normalised(observations, normaliser)
-        if not deterministic and noise is None:
-            noise = self._generator.standard_normal((len(inputs), self.contract.spec.action_size), dtype=np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # an action that is not a number is refused by its name
-            actions = [self._action(actor, inputs, None if deterministic else noise) for actor in self._actors]
-            return actions[0] if len(actions) == 1 else self._most_valued(inputs, actions)
+            if len(self._actors) == 1:
+                return self._action(self._actors[0], inputs, noise)[None], None
+            actions = [self._action(actor, inputs, noise) for actor in self._actors]
+            values = [
+                _outputs(critic, np.concatenate([inputs, action], axis=1))[:, 0]
+                for critic, action in zip(self.network.parameters.critics, actions, strict=True)
+            ]
+            return np.stack(actions), np.stack(values)
 
     def _action(self, actor: _Actor, inputs: np.ndarray, noise: np.ndarray | None) -> np.ndarray:
         hidden = _hidden(actor.hidden, inputs, self.network.activation)
@@ -87,16 +107,25 @@ class Policy:
             return np.clip(action, -1.0, 1.0, out=action)
         return np.tanh(action, out=action)
 
-    def _most_valued(self, inputs: np.ndarray, actions: list[np.ndarray]) -> np.ndarray:
-        """Return row by row the action that its own actor's critic values most, the first of equals."""
-        values = [
-            _outputs(critic, np.concatenate([inputs, action], axis=1))[:, 0]
-            for critic, action in zip(self.network.parameters.critics, actions, strict=True)
-        ]
-        return np.stack(actions)[np.argmax(values, axis=0), np.arange(len(inputs))]
+    def save(self, directory: str | Path) -> None:
+        """Write the policy and its contract into a folder, made where it is not there; `csac.load` reads it.
 
-    def save(self, path: str | Path) -> None:
-        """Write the layers as safetensors, whole or not at all."""
+        Raises:
+            InputError: the folder holds a run or an artefact, or cannot be written.
+        """
+        folder = Path(directory)
+        strangers = {"manifest.json", "policy.py", "policy.onnx", "policy.h"}
+        if folder.is_dir() and strangers & {path.name for path in folder.iterdir()}:
+            raise InputError(f"{folder} holds a run or an artefact: choose another folder for the policy")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self.contract.save(folder / CONTRACT)
+            self.save_layers(folder / SAVED)
+        except OSError as error:
+            raise InputError(f"{folder} cannot be written: {error.strerror}") from error
+
+    def save_layers(self, path: str | Path) -> None:
+        """Write the layers alone as safetensors, whole or not at all; a contract belongs to them."""
         write_atomically(Path(path), tensors.encode(to_tensors(self.network.parameters)))
 
     @staticmethod

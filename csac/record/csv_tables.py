@@ -35,7 +35,7 @@ def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
     if not rows:
         return
     with open(path, "ab+") as file:
-        _drop_torn_line(file)
+        drop_torn_line(file)
         file.seek(0)
         header = _header(path, file.readline())
         text = io.StringIO()
@@ -54,10 +54,10 @@ def _header(path: Path, line: bytes) -> list[str]:
         raise InputError(f"{path} is not a table of a run: its first line is no header; restore it") from None
 
 
-def check_new(path: Path) -> None:
+def check_new(path: Path, what: str = "table", suffix: str = ".csv") -> None:
     """Raise InputError where there is a file already or none can be, before anything has been computed for it."""
-    if path.suffix.lower() != ".csv":
-        raise InputError(f"the table is a .csv file: name it {path.with_suffix('.csv')}")
+    if path.suffix.lower() != suffix:
+        raise InputError(f"the {what} is a {suffix} file: name it {path.with_suffix(suffix)}")
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
     folder = path.parent
@@ -154,7 +154,7 @@ def _cell(path: Path, column: str, value: Any) -> str:
     return str(int(number)) if number.dtype.kind in "bui" else str(number[()])
 
 
-def _drop_torn_line(file: BinaryIO) -> None:
+def drop_torn_line(file: BinaryIO) -> None:
     """Cut off what follows the last newline: a line that a crash interrupted."""
     end = file.seek(0, os.SEEK_END)
     if not end:

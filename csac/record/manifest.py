@@ -31,6 +31,8 @@ class EvaluationPlan:
     """Environment steps between evaluations."""
     episodes: int = 10
     """Episodes of each evaluation."""
+    first_seed: int = 1_000_000
+    """What the first of them is reset with; the next ones with the numbers after it."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,8 @@ class Manifest:
             raise InputError(f"steps are {self.steps} with {self.steps_done} done, and lie between 1 and 10^15")
         if self.evaluation.interval < 1 or self.evaluation.episodes < 1:
             raise InputError("evaluation has an interval or episodes below 1")
+        if not 0 <= self.evaluation.first_seed < SEED_LIMIT:
+            raise InputError(f"evaluation has the first seed {self.evaluation.first_seed}, which no episode can have")
         if self.checkpoints.interval < 0 or self.checkpoints.keep < 0:
             raise InputError("checkpoints have an interval or a number to keep below 0")
 

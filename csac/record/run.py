@@ -94,6 +94,11 @@ class RunDirectory:
         return self.path / "tensorboard"
 
     @property
+    def wandb(self) -> Path:
+        """The folder of what W&B keeps of it."""
+        return self.path / "wandb"
+
+    @property
     def curve(self) -> Path:
         """The picture of its evaluations."""
         return self.path / "curve.png"

@@ -19,6 +19,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from csac.console.tables import duration, make_console, program, short
 from csac.processes import usable_cores
+from csac.record.wandb import import_wandb
 from csac.studies.calibration import Calibration, Prediction, predict
 from csac.studies.cells import HOME, Cell, Store, is_final, similar
 from csac.studies.engines import run_here, run_in_processes
@@ -100,6 +101,8 @@ class Show(Chosen):
 
     measure: FlagCreatePairsOff[bool] = True
     """Measure how fast this machine is; without it, only what was measured before is told."""
+    results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
+    """Count as over what csac study run --results has collected there."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,10 @@ class Run(Chosen):
     device: Literal["cpu", "gpu"] = "cpu"
     """Where the networks learn."""
     results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
-    """Copy the evaluations and a small manifest of each cell that is over there: what a report needs."""
+    """Copy the evaluations and a small manifest of each cell that is over there: what a report needs. What was copied
+    there before, on this machine or another, is not run again."""
+    wandb: FlagCreatePairsOff[bool] = False
+    """Log to Weights & Biases too: a run for each cell, in the project WANDB_PROJECT or else csac (docs/python.md)."""
     keep_checkpoints: FlagCreatePairsOff[bool] = False
     """Keep the checkpoints of finished cells too: they hold the replay, and take most of the room."""
 
@@ -193,8 +199,9 @@ def show(options: Show) -> int:
     """Print the cells of a study, one row for each."""
     studies, store, console = options.studies(), Store(options.directory), make_console()
     cells, labels = cells_of(studies), labels_of(studies)
-    statuses = {cell.key: store.status(cell) for cell in cells}
-    rest = [cell for cell in cells if not is_final(store.path(cell))]
+    collected = _collected(studies, cells, options.results)
+    statuses = {cell.key: store.status(cell) for cell in cells} | collected
+    rest = [cell for cell in cells if cell.key not in collected and not is_final(store.path(cell))]
     predictions = _predictions(rest, statuses, options.measure, console)
     table = _table("cell", "what", "steps", "state", "time", "directory")
     table.columns[5].overflow = "fold"
@@ -262,13 +269,16 @@ def run(options: Run) -> int:
     studies, store, console = options.studies(), Store(options.directory), make_console()
     cells, labels = cells_of(studies), labels_of(studies)
     engine = _engine(options)
+    if options.wandb:
+        import_wandb()
     if options.cell is not None:
         if not 0 <= options.cell < len(cells):
             raise InputError(f"--cell counts from 0 to {len(cells) - 1}, not {options.cell}")
         cells = [cells[options.cell]]
-    statuses = {cell.key: store.status(cell) for cell in cells}
+    collected = _collected(studies, cells, options.results)
+    statuses = {cell.key: store.status(cell) for cell in cells} | collected
     _say(console, _intention(studies, cells, statuses.values()), "bold")
-    jobs = [job for job in _jobs(studies, cells, store, options) if not is_over(job)]
+    jobs = [job for job in _jobs(studies, cells, store, options) if job.cell.key not in collected and not is_over(job)]
     by_key = {cell.key: cell for cell in cells}
     if options.results:
         for cell in cells:
@@ -292,7 +302,7 @@ def run(options: Run) -> int:
         return 128 + stopped.signal_number
     finally:
         progress.close()
-    return _conclude(cells, labels, store, console)
+    return _conclude({cell.key: store.status(cell) for cell in cells} | collected, labels, console)
 
 
 def report(options: Report) -> int:
@@ -357,18 +367,33 @@ def _engine(options: Run) -> Engine:
     return run_here if engine == "local" else partial(run_in_processes, workers=options.workers)
 
 
-def _jobs(studies: Sequence[Study], cells: Sequence[Cell], store: Store, options: Run) -> list[Job]:
-    """Return the jobs of these cells: a policy is tested as often as the most demanding of their studies asks for."""
+def _collected(studies: Sequence[Study], cells: Sequence[Cell], directory: Path | None) -> dict[str, Status]:
+    """Return how the cells ended that were collected there with all that these studies want of them."""
+    if directory is None:
+        return {}
+    results, rollouts = Results(directory, may_be_empty=True), _rollouts(studies)
+    statuses = {cell.key: results.status(cell, rollouts[cell.key]) for cell in cells}
+    return {key: status for key, status in statuses.items() if status is not None}
+
+
+def _rollouts(studies: Sequence[Study]) -> Counter[str]:
+    """Return how many episodes each policy is tested on: as many as the most demanding of the studies asks for."""
     rollouts = Counter[str]()
     for study in studies:
         for entry in study.entries():
             rollouts[entry.cell.key] = max(rollouts[entry.cell.key], study.rollouts_each)
+    return rollouts
+
+
+def _jobs(studies: Sequence[Study], cells: Sequence[Cell], store: Store, options: Run) -> list[Job]:
+    rollouts = _rollouts(studies)
     return [
         Job(
             cell,
             store.path(cell),
             device=options.device,
             keep_checkpoints=options.keep_checkpoints,
+            wandb=options.wandb,
             rollouts=rollouts[cell.key],
             command=shlex.join(["csac", *sys.argv[1:]]),
         )
@@ -381,13 +406,12 @@ def _intention(studies: Sequence[Study], cells: Sequence[Cell], statuses: Iterab
     return f"{', '.join(study.name for study in studies)}{scale}: {len(cells)} cells, {_counted(statuses)}"
 
 
-def _conclude(cells: Sequence[Cell], labels: Mapping[str, str], store: Store, console: Console) -> int:
+def _conclude(statuses: Mapping[str, Status], labels: Mapping[str, str], console: Console) -> int:
     """Print what became of the cells, and return the exit code."""
-    statuses = {cell.key: store.status(cell) for cell in cells}
     failed = {key: status.reason for key, status in statuses.items() if status.state == "failed"}
     for key, reason in failed.items():
         _say(console, f"failed: {labels[key]}: {reason}", "red")
-    _say(console, f"{len(cells)} cells: {_counted(statuses.values())}")
+    _say(console, f"{len(statuses)} cells: {_counted(statuses.values())}")
     return 3 if failed else 0
 
 

@@ -33,6 +33,7 @@ class Job:
     checkpoint_interval: int = 50_000
     keep_checkpoints: bool = False
     tensorboard: bool = True
+    wandb: bool = False
     rollouts: int = 0
     """Fresh episodes that the finished policy is tested on: `rollouts.csv` in its run."""
     command: str | None = None
@@ -143,6 +144,7 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
         checkpoint_interval=job.checkpoint_interval,
         resume=True,
         tensorboard=job.tensorboard,
+        wandb=job.wandb,
         command=job.command,
         on_evaluation=lambda step, returns: tell(Advanced(cell.key, step, returns.get(cell.seed, float("nan")))),
     )

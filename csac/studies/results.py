@@ -11,7 +11,7 @@ from csac.record import manifest as manifests
 from csac.record.atomic import write_atomically
 from csac.record.csv_tables import read_rows
 from csac.record.run import RunDirectory
-from csac.studies.cells import Cell, Store, is_final, read_history
+from csac.studies.cells import Cell, Status, Store, is_final, read_history
 from csac.studies.job import ROLLOUTS
 from csac.types import InputError
 
@@ -61,7 +61,7 @@ class Runs:
 class Results:
     """Records from files that were collected: `cells/<task>/<arm>/seed-<k>.json` and its tables."""
 
-    def __init__(self, directory: str | Path) -> None:
+    def __init__(self, directory: str | Path, may_be_empty: bool = False) -> None:
         self.directory = Path(directory)
         self._files: dict[str, Path] = {}
         for path in sorted(self.directory.glob("cells/*/*/seed-*.json")):
@@ -69,7 +69,7 @@ class Results:
                 self._files[Cell.of_run(manifests.read(path.read_bytes())).key] = path
             except (InputError, OSError) as error:
                 raise InputError(f"{path} is not a cell's: {error}") from None
-        if not self._files:
+        if not self._files and not may_be_empty:
             raise InputError(
                 f"{self.directory} holds no results of a study; csac study run NAME --results DIR makes them"
             )
@@ -82,6 +82,13 @@ class Results:
         content = path.read_bytes()
         tables = read_rows(path.with_suffix(".csv")), _rows(_rollouts(path))
         return Record(manifests.read(content), json.loads(content).get("seconds", 0.0), *tables)
+
+    def status(self, cell: Cell, rollouts: int) -> Status | None:
+        """Return how a cell ended that was collected, with the rollouts that are wanted, or None."""
+        record = self.record(cell)
+        if record is None or (rollouts and record.rollouts is None and not record.failure):
+            return None
+        return Status("failed" if record.failure else "complete", cell.steps, record.failure, record.seconds)
 
 
 def collect(store: Store, cell: Cell, directory: str | Path) -> None:

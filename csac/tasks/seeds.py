@@ -13,16 +13,18 @@ from csac.tasks.making import Task
 from csac.tasks.spaces import EnvironmentFailure
 from csac.types import Snapshot
 
-EVALUATION_SEED = 1_000_000
-FRESH_EVALUATION_SEED = 2_000_000
+# What episode 0 of an evaluation is reset with; the next ones with the numbers after it.
+EVALUATION_SEED = 1_000_000  # in training: the curves
+FRESH_EVALUATION_SEED = 2_000_000  # of finished policies: what nothing was chosen by
+TUNING_EVALUATION_SEED = 3_000_000  # in training for `csac tune`: what hyperparameters are chosen by
 
-_FIRST_TRAINING_SEED = 2**30  # above every evaluation seed, and with as many again still a C int
+FIRST_TRAINING_SEED = 2**30  # above every evaluation seed, and with as many again still a C int
 
 
 def training_seed(seed: int, episode: int) -> int:
     """Return the reset seed of a seed's training episode: its own, and never an evaluation episode's."""
     word = int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
-    return _FIRST_TRAINING_SEED + word % _FIRST_TRAINING_SEED
+    return FIRST_TRAINING_SEED + word % FIRST_TRAINING_SEED
 
 
 class FinishedEpisode(NamedTuple):

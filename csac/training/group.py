@@ -83,7 +83,9 @@ class Group:
         plan = settings.plan
         self.settings, self.seeds, self.step = settings, list(seeds), settings.begin
         self.environments = SeedEnvironments(plan.task, plan.environment_arguments, seeds)
-        self.evaluator = Evaluator(plan.task, plan.environment_arguments, plan.evaluation_episodes, events=plan.events)
+        self.evaluator = Evaluator(
+            plan.task, plan.environment_arguments, plan.evaluation_episodes, plan.evaluation_seed, plan.events
+        )
         processes = plan.evaluation_processes
         self._pool = EvaluationPool(self.evaluator, processes, cores) if processes else None
         self._evaluation: Evaluation | None = None  # the one on its way

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import errno
+import os
 import signal
+import socket
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Any
 
 from csac.record.run import RunDirectory, StorageFailure
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 _CANNOT_WRITE = (
     errno.ENOSPC,
@@ -37,15 +39,31 @@ class Interrupted(Exception):
 
 
 @contextmanager
-def caught_signals() -> Iterator[tuple[threading.Event, list[int]]]:
+def leaving_at_once() -> Iterator[None]:
+    """Let SIGINT and SIGTERM end this process at once, with their exit code and a line, while nothing is to be saved.
+
+    An exception in their place does not always arrive: imports and finalisers swallow some. SIGHUP is ignored from the
+    beginning, as `caught_signals` does, which takes over while something is learnt.
+    """
+
+    def leave(number: int, _: Any) -> None:
+        with suppress(OSError):
+            os.write(
+                2, f"csac: stopped by {signal.Signals(number).name} outside of training; nothing is lost\n".encode()
+            )
+        os._exit(128 + number)
+
+    with _handled(leave):
+        yield
+
+
+@contextmanager
+def caught_signals(tell: Callable[[], None] | None = None) -> Iterator[tuple[threading.Event, list[int]]]:
     """Yield (a request to stop, the signals behind it). A second SIGINT or SIGTERM is taken literally.
 
-    SIGHUP is ignored: a run outlives its terminal.
+    SIGHUP is ignored: a run outlives its terminal. `tell` is called, in a thread, as soon as the first signal arrives.
     """
     stop, received = threading.Event(), []
-    if threading.current_thread() is not threading.main_thread():
-        yield stop, received
-        return
 
     def note(number: int, _: Any) -> None:
         if received:
@@ -53,14 +71,55 @@ def caught_signals() -> Iterator[tuple[threading.Event, list[int]]]:
         received.append(number)
         stop.set()
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    with _handled(note), _told_at_once(tell) if tell else nullcontext():
+        yield stop, received
+
+
+@contextmanager
+def _handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Give SIGINT and SIGTERM to a handler, and SIGHUP to nobody; outside of the main thread, nothing changes."""
+    if not _is_main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     if hasattr(signal, "SIGHUP"):
         before[signal.SIGHUP] = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        yield stop, received
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, former in before.items():
+            signal.signal(number, former)
+
+
+@contextmanager
+def _told_at_once(tell: Callable[[], None]) -> Iterator[None]:
+    """Call `tell` when SIGINT or SIGTERM arrives, also while the main thread compiles and runs no handler."""
+    if not _is_main_thread():
+        yield
+        return
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    before = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+
+    def wait() -> None:
+        while number := ours.recv(1):
+            if number[0] in (signal.SIGINT, signal.SIGTERM):
+                tell()
+                return
+
+    thread = threading.Thread(target=wait, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        theirs.close()
+        thread.join()
+        ours.close()
+
+
+def _is_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 @contextmanager

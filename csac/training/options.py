@@ -78,6 +78,7 @@ class PlanOptions(TypedDict, total=False):
     device: Literal["cpu", "gpu"]
     evaluation_interval: int
     evaluation_episodes: int
+    evaluation_seed: int
     checkpoint_interval: int
     keep_checkpoints: int
     environment_arguments: dict[str, Any] | None

@@ -16,6 +16,7 @@ from csac.record.run import RunDirectory, default_directory, is_run
 from csac.tasks.environment import Environment
 from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
+from csac.tasks.seeds import EVALUATION_SEED, FIRST_TRAINING_SEED
 from csac.tasks.trust import remember
 from csac.training.devices import choose_device
 from csac.training.options import Options, check_whole, checked_options
@@ -43,6 +44,8 @@ class Plan(Options):
     """Keyword arguments for the environment."""
     perturbations: tuple[Perturbation, ...] = ()
     """Changes of the task in mid-training, in the order of their steps."""
+    evaluation_seed: int = EVALUATION_SEED
+    """What the first evaluation episode is reset with; the next ones with the numbers after it."""
     events: tuple[str, ...] = ()
     """Names in the last `info` of an evaluation episode: each is a column of evaluations.csv."""
     groups: tuple[tuple[int, ...], ...]
@@ -64,7 +67,7 @@ class Plan(Options):
             seeds=tuple(self.labels),
             groups=self.groups,
             steps=self.steps,
-            evaluation=EvaluationPlan(self.evaluation_interval, self.evaluation_episodes),
+            evaluation=EvaluationPlan(self.evaluation_interval, self.evaluation_episodes, self.evaluation_seed),
             events=self.events,
             checkpoints=CheckpointPlan(self.checkpoint_interval, self.keep_checkpoints),
             device=self.device,
@@ -138,6 +141,7 @@ def make_plan(
         task_name=task_name,
         environment_arguments=arguments,
         perturbations=changes,
+        evaluation_seed=_choose_evaluation_seed(others.get("evaluation_seed", EVALUATION_SEED), options),
         events=_choose_events(task, others.get("events"), continued),
         groups=parts,
         evaluation_processes=processes,
@@ -154,6 +158,12 @@ def _choose_events(task: Task, given: Sequence[str] | None, before: Manifest | N
     if given is None and before:
         return before.events
     return events_of(task, given or ())
+
+
+def _choose_evaluation_seed(given: int, options: Options) -> int:
+    """Return what the first evaluation episode is reset with, if no training episode can be reset with one of them."""
+    check_whole("evaluation_seed", given, 0, FIRST_TRAINING_SEED - options.evaluation_episodes)
+    return int(given)
 
 
 def _choose_parts(
@@ -195,6 +205,7 @@ def options_of(run: RunDirectory) -> tuple[str, PlanOptions]:
         "first_seed": manifest.seeds[0],
         "evaluation_interval": manifest.evaluation.interval,
         "evaluation_episodes": manifest.evaluation.episodes,
+        "evaluation_seed": manifest.evaluation.first_seed,
         "environment_arguments": manifest.environment_arguments,
         "perturbations": perturbations_of(manifest.perturbations),
         "device": manifest.device,

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from csac.console.progress import Reporter
     from csac.deploy.policy import Policy
     from csac.record.run import RunDirectory
-    from csac.record.tensorboard import TensorBoardLog
+    from csac.record.scalars import Log
     from csac.training.checkpoint import Checkpoints
     from csac.training.messages import Message
     from csac.training.seed_files import Files
@@ -46,7 +46,7 @@ class Recorder:
         run: the run directory.
         groups: the seeds of each group.
         reporter: where progress is shown, or None.
-        tensorboard: where it is written as well, or None.
+        logs: where its curves go as well.
         checkpoints: where checkpoints are committed, or None.
         begin: the step that the run goes on from; 0 for a new run.
         failures: the seeds that had failed by then, and how.
@@ -58,13 +58,13 @@ class Recorder:
         run: RunDirectory,
         groups: Sequence[Sequence[int]],
         reporter: Reporter | None,
-        tensorboard: TensorBoardLog | None,
+        logs: Sequence[Log],
         checkpoints: Checkpoints | None = None,
         begin: int = 0,
         failures: Mapping[int, str] = MappingProxyType({}),
         perturbations: Sequence[tuple[int, str]] = (),
     ) -> None:
-        self.run, self.groups, self.reporter, self.tensorboard = run, groups, reporter, tensorboard
+        self.run, self.groups, self.reporter, self.logs = run, groups, reporter, logs
         self.checkpoints = checkpoints
         self.failures: dict[int, str] = dict(failures)
         self._failed_at = dict.fromkeys(failures, begin)
@@ -141,7 +141,7 @@ class Recorder:
         for seed, value in mean_returns(message.rows).items():
             if value > self._best.get(seed, -np.inf):
                 self._best[seed] = value
-                message.policies[seed].save(self.run.policy(seed, "best"))
+                message.policies[seed].save_layers(self.run.policy(seed, "best"))
 
     def _commit_when_whole(self, group: int, message: Saved) -> None:
         """Keep a group's best policies with its files; with the last living group's files there is a checkpoint."""
@@ -217,6 +217,11 @@ class Recorder:
         if self.reporter:
             self.reporter.failed(seed, step, reason)
 
+    def tell(self, lines: Sequence[str]) -> None:
+        """Write lines into the log and show them."""
+        for line in lines:
+            self._note(line)
+
     def _note(self, text: str) -> None:
         self.run.log(text)
         if self.reporter:
@@ -241,12 +246,13 @@ class Recorder:
             if not self.run.contract.exists():
                 self.run.contract.parent.mkdir(exist_ok=True)
                 policy.contract.save(self.run.contract)
-            policy.save(self.run.policy(seed))
+            policy.save_layers(self.run.policy(seed))
 
     def _flush(self, until: int = OVER) -> None:
         """Write the rows that no group can precede any more, as far as step `until`."""
         limit = min(until, *self._passed)
         self._written = max(limit, self._written)
+        written: dict[Table, list[dict[str, Any]]] = {}
         for table in get_args(Table):
             waiting = self._pending[table]
             ready = [row for row in waiting if row["step"] <= limit]
@@ -255,10 +261,11 @@ class Recorder:
             self._pending[table] = [row for row in waiting if row["step"] > limit]
             ready.sort(key=lambda row: (row["step"], row["seed"], row.get("episode", 0)))
             self.run.append(table, ready)
-            if self.tensorboard:
-                getattr(self.tensorboard, table)(ready)
-            if table == "evaluations":
-                self._announce(ready)
+            written[table] = ready
+        if written:
+            for log in self.logs:
+                self.tell(log.write(written))
+            self._announce(written.get("evaluations", []))
         self._tell_perturbations(min(limit, max(self._steps.values())))
 
     def _announce(self, rows: list[dict[str, Any]]) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.processes import end_if_unguarded
 from csac.record.run import RunDirectory
+from csac.record.wandb import WandbLog, import_wandb, logs_to_wandb
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.tasks.trust import refuse_untrusted
 from csac.training.checkpoint import Checkpoints
@@ -24,6 +25,7 @@ from csac.training.provenance import provenance
 from csac.training.recorder import Recorder
 from csac.training.resume import BEGINNING, Restart, refuse_differences, roll_back
 from csac.training.scheduler import run_groups
+from csac.types import InputError
 
 if TYPE_CHECKING:
     import threading
@@ -33,13 +35,15 @@ if TYPE_CHECKING:
 
     from csac.console.progress import Reporter
     from csac.record.manifest import State
-    from csac.record.tensorboard import TensorBoardLog
+    from csac.record.scalars import Log
     from csac.tasks.making import Task
     from csac.training.options import PlanOptions
     from csac.types import Algorithm
 
     OnEvaluation = Callable[[int, dict[int, float]], Any]
     StopWhen = Callable[[int, dict[int, float]], bool]
+
+_STOPPING = "stopping at the next step where all can be saved; once more to leave at once"
 
 
 def train(
@@ -50,6 +54,7 @@ def train(
     resume: bool = False,
     start_from: str | Path | None = None,
     tensorboard: bool = True,
+    wandb: bool | str = False,
     reporter: Reporter | None = None,
     command: str | None = None,
     on_evaluation: OnEvaluation | None = None,
@@ -65,6 +70,8 @@ def train(
         resume: go on with the run in `directory`, where there is one, from its newest checkpoint.
         start_from: `DIRECTORY` or `DIRECTORY@STEP` of a run: begin with a copy of its checkpoint of that step.
         tensorboard: whether to write TensorBoard files.
+        wandb: whether to log to Weights & Biases too (`csac[wandb]`), or the project to log to: a W&B run for each
+            seed, those of a run directory in one group. Training never waits for W&B, nor fails with it.
         reporter: where progress is shown; None is silent, but for a warning about each seed that fails.
         command: the command line, for the manifest.
         on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation.
@@ -76,6 +83,8 @@ def train(
             - `perturbations`: changes of the task, in training and evaluations, such as `("friction=1.5@300000",)`: see
               `Perturbation`. What a run begins with (`start_from`) keeps what had happened to it; with None also what
               was still to happen;
+            - `evaluation_seed`: what the first evaluation episode is reset with, the next ones with the numbers after
+              it: 1,000,000 by default, 2,000,000 are those of `evaluate`, 3,000,000 those of `csac tune`;
             - `events`: names in the `info` of an evaluation episode's last step (booleans or numbers): each becomes a
               column of evaluations.csv, beside those that the task has by itself. None keeps those of the run that
               this one goes on from or begins with;
@@ -93,7 +102,9 @@ def train(
     """
     end_if_unguarded()
     check_algorithm(algorithm)
-    watchers = Watchers(reporter, tensorboard, on_evaluation, stop_when)
+    if wandb:
+        import_wandb()
+    watchers = Watchers(reporter, tensorboard, wandb, on_evaluation, stop_when)
     before = Before.find(directory, resume, start_from)
     plan, spec = make_plan(algorithm, task, options, before, may_evaluate_beside=stop_when is None)
     notes = [memory_needed(plan, spec), *_warmup_note(plan)]
@@ -151,6 +162,7 @@ def resume(
         directory=directory,
         resume=True,
         tensorboard=run.tensorboard.exists(),
+        wandb=logs_to_wandb(run) and _has_wandb(reporter),
         reporter=reporter,
         command=command,
         on_evaluation=on_evaluation,
@@ -159,11 +171,23 @@ def resume(
     )
 
 
+def _has_wandb(reporter: Reporter | None) -> bool:
+    """Whether W&B is still there for a run that was logged to it; it goes on without as well."""
+    try:
+        import_wandb()
+    except InputError as error:
+        if reporter:
+            reporter.note(f"note: this run was logged to W&B, and is no more: {error}")
+        return False
+    return True
+
+
 class Watchers(NamedTuple):
     """Who is told what happens, beside the run directory."""
 
     reporter: Reporter | None
     tensorboard: bool
+    wandb: bool | str
     on_evaluation: OnEvaluation | None
     stop_when: StopWhen | None
 
@@ -199,7 +223,9 @@ def _go_on(run: RunDirectory, plan: Plan, wanted: Any, notes: list[str], watcher
 
 def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, restart: Restart) -> RunDirectory:
     """Train until the last step or a signal, from the first preparation to the last picture."""
-    with caught_signals() as (stop, received):
+    reporter = watchers.reporter
+    told = functools.partial(reporter.note, _STOPPING) if reporter else None
+    with caught_signals(told) as (stop, received):
         recorder = _follow(run, plan, notes, watchers, restart, stop, received)
     if run.manifest.state == "interrupted":
         is_saved = recorder.checkpoints is not None and recorder.checkpoints.newest is not None
@@ -223,18 +249,16 @@ def _follow(
     if reporter:
         reporter.start(plan.task_name, plan.algorithm.name, plan.labels, plan.steps, run.path, notes)
         reporter.go_on(begin, run.evaluations, failures)
-    log = _tensorboard_log(run, plan.labels, begin) if watchers.tensorboard else None
+    logs = _logs(run, plan.labels, begin, watchers)
     folder = run.checkpoints.absolute() if begin or plan.checkpoint_interval else None
     settings = Settings(plan, folder, begin, _begins_on_another_task(run, begin))
     checkpoints = Checkpoints(folder, plan.keep_checkpoints, restart.pinned) if folder else None
-    recorder = Recorder(run, groups, reporter, log, checkpoints, begin, failures, by_step(plan.perturbations))
+    recorder = Recorder(run, groups, reporter, logs, checkpoints, begin, failures, by_step(plan.perturbations))
+    for log in logs:
+        recorder.tell(log.write({}))
     try:
         with closing(run_groups(settings, groups, stop.is_set, checkpoints)) as told:
-            is_told = False
             for group, message in told:
-                if received and reporter and not is_told:
-                    is_told = True
-                    reporter.note("stopping at the next step where all can be saved; once more to leave at once")
                 recorder.handle(group, message)
                 if watchers.tell(recorder.evaluated):
                     stop.set()
@@ -245,8 +269,10 @@ def _follow(
         _leave(run, recorder)
         raise
     finally:
-        if log:
-            log.close()
+        for log in logs:
+            lines = log.close()
+            with suppress(OSError):
+                recorder.tell(lines)
         if reporter:
             reporter.close()
     return recorder
@@ -258,10 +284,17 @@ def _begins_on_another_task(run: RunDirectory, begin: int) -> bool:
     return origin is not None and origin.step == begin and any(text.startswith("task is ") for text in origin.changes)
 
 
-def _tensorboard_log(run: RunDirectory, labels: list[int], begin: int) -> TensorBoardLog:
-    from csac.record.tensorboard import TensorBoardLog  # slow to import, and some runs do without
+def _logs(run: RunDirectory, labels: list[int], begin: int, watchers: Watchers) -> list[Log]:
+    """Return where the curves go beside the tables. Both are slow to import, and some runs do without."""
+    logs: list[Log] = []
+    if watchers.tensorboard:
+        from csac.record.tensorboard import TensorBoardLog
 
-    return TensorBoardLog(run.tensorboard, labels, begin)
+        logs.append(TensorBoardLog(run.tensorboard, labels, begin))
+    if watchers.wandb:
+        project = watchers.wandb if isinstance(watchers.wandb, str) else None
+        logs.append(WandbLog(run, labels, begin, project))
+    return logs
 
 
 def _leave(run: RunDirectory, recorder: Recorder) -> None:

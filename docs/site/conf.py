@@ -40,6 +40,7 @@ NAVIGATION = {
         "docs/perturbations",
         "docs/studies",
         "docs/cluster",
+        "docs/tuning",
         "docs/going-on",
         "docs/reliability",
     ],

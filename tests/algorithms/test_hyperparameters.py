@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from csac.algorithms import ALGORITHMS, CSAC, SAC
+from csac.algorithms import ALGORITHMS, CSAC, SAC, SD3, TD3
 from csac.types import InputError
 
 BOTH = {
@@ -108,3 +108,10 @@ def test_every_number_has_a_range():
                 settings: dict[str, Any] = {name: -1}
                 with pytest.raises(InputError, match=name):
                     algorithm(**settings)
+
+
+@pytest.mark.parametrize("algorithm", [CSAC, SAC, TD3, SD3])
+def test_a_replay_holds_a_batch(algorithm):
+    with pytest.raises(InputError, match="replay_size must be at least batch_size, 256, not 255"):
+        algorithm(replay_size=255)
+    algorithm(replay_size=256)

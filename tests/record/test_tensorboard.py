@@ -13,7 +13,8 @@ def log(tmp_path):
 
 
 def test_each_seed_has_a_directory_and_metrics_their_own_tags(log, tmp_path):
-    log.metrics([{"seed": 0, "step": 1000, "critic_loss": 0.5}, {"seed": 7, "step": 1000, "critic_loss": 0.25}])
+    rows = [{"seed": 0, "step": 1000, "critic_loss": 0.5}, {"seed": 7, "step": 1000, "critic_loss": 0.25}]
+    log.write({"metrics": rows})
     log.close()
 
     # 1000 steps from 10 s to 12 s.
@@ -22,8 +23,8 @@ def test_each_seed_has_a_directory_and_metrics_their_own_tags(log, tmp_path):
 
 
 def test_training_episodes_are_averaged_over_the_last_hundred(log, tmp_path):
-    log.episodes([{"seed": 0, "step": step, "return": 1.0, "length": 10} for step in range(1, 101)])
-    log.episodes([{"seed": 0, "step": step, "return": 5.0, "length": 30} for step in range(101, 151)])
+    log.write({"episodes": [{"seed": 0, "step": step, "return": 1.0, "length": 10} for step in range(1, 101)]})
+    log.write({"episodes": [{"seed": 0, "step": step, "return": 5.0, "length": 30} for step in range(101, 151)]})
     log.close()
 
     # One point per call: a hundred ones, then fifty ones and fifty fives.
@@ -35,17 +36,16 @@ def test_training_episodes_are_averaged_over_the_last_hundred(log, tmp_path):
 
 
 def test_evaluations_are_averaged_per_seed_and_step(log, tmp_path):
-    log.evaluations(
-        [
-            {"seed": seed, "step": step, "episode": episode, "return": value, "length": 4, "success": success}
-            for seed, step, episode, value, success in [
-                (0, 10, 0, 1.0, 1.0),
-                (0, 10, 1, 2.0, 0.0),
-                (0, 20, 0, 5.0, None),
-                (7, 10, 0, 8.0, None),
-            ]
+    rows = [
+        {"seed": seed, "step": step, "episode": episode, "return": value, "length": 4, "success": success}
+        for seed, step, episode, value, success in [
+            (0, 10, 0, 1.0, 1.0),
+            (0, 10, 1, 2.0, 0.0),
+            (0, 20, 0, 5.0, None),
+            (7, 10, 0, 8.0, None),
         ]
-    )
+    ]
+    log.write({"evaluations": rows})
     log.close()
 
     assert scalars(tmp_path / "seed_0") == {

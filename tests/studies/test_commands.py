@@ -62,9 +62,18 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
     monkeypatch.setattr(commands, "run_here", lambda jobs, tell: pytest.fail("complete cells are skipped"))
     assert csac("study run tiny.toml --engine local --seeds 1") == 0
     capsys.readouterr()
-    assert csac("study show tiny.toml --no-measure") == 0
-    states = re.findall(r" (complete|waiting) ", capsys.readouterr().out)
-    assert states == ["complete", "waiting"]
+    for choice in ("", "--directory another/machine --results out"):
+        assert csac(f"study show tiny.toml --no-measure {choice}") == 0
+        states = re.findall(r" (complete|waiting) ", capsys.readouterr().out)
+        assert states == ["complete", "waiting"]
+    assert csac("study run tiny.toml --engine local --seeds 1 --directory another/machine --results out") == 0
+    assert "1 cells: 1 complete" in capsys.readouterr().out
+    assert Results("out").status(one, rollouts=100) is None, "its policy was not tested yet"
+
+
+def test_what_a_folder_has_not_collected_is_run(engine):
+    assert csac("study run tiny.toml --engine local --results empty") == 0
+    assert len(engine) == 2
 
 
 def test_a_manifest_tells_the_command_and_not_where_csac_is(engine, monkeypatch):

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from csac.deploy.contract import Activation, Contract, Head
 from csac.deploy.policy import Policy
-from csac.types import Layer, PolicyNetwork, PolicyParameters, Spec
+from csac.types import Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
+
+Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
 
 DICT_PARTS = (("achieved", (2,)), ("position", (1, 2)), ("speed", ()))
 
@@ -42,3 +45,35 @@ def random_network(spec: Spec, width: int = 8, seed: int = 0) -> PolicyNetwork:
 
 def random_policy(contract: Contract, seed: int = 0) -> Policy:
     return Policy(random_network(contract.spec, seed=seed), contract)
+
+
+ALGORITHMS = ("csac", "sac", "td3", "sd3", "ppo")
+
+
+def algorithm_policy(algorithm: str, parts: Parts = ((None, (5,)),), action_shape: tuple[int, ...] = (3,)) -> Policy:
+    """A random policy in the form that an algorithm gives its own, on a task with bounds that are not symmetric."""
+    heads: dict[str, Head] = {"csac": "tanh_gaussian", "sac": "tanh_gaussian", "ppo": "clipped_gaussian"}
+    head = heads.get(algorithm, "tanh")
+    agreement = contract(parts, action_shape, -0.5, 2.0, "tanh" if algorithm == "ppo" else "relu", head)
+    observation_size, action_size = agreement.spec
+    outputs = 2 * action_size if head == "tanh_gaussian" else action_size
+
+    def network(*sizes: int, seed: int = 0) -> tuple[Layer, ...]:
+        layers = random_layers(*sizes, seed=seed)
+        return tuple(Layer(0.7 * layer.weight / math.sqrt(len(layer.weight)), 0.3 * layer.bias) for layer in layers)
+
+    # Widths that are whole blocks of 16, and that are not.
+    actors = tuple(network(observation_size, 32, 21, outputs, seed=seed) for seed in range(1 + (algorithm == "sd3")))
+    parameters = PolicyParameters(actors)
+    if algorithm == "sd3":
+        critics = tuple(network(observation_size + action_size, 19, 16, 1, seed=seed) for seed in (2, 3))
+        parameters = parameters._replace(critics=critics)
+    if algorithm == "ppo":
+        generator = np.random.default_rng(4)
+        mean, std = generator.normal(size=observation_size), generator.uniform(0.5, 2.0, observation_size)
+        parameters = parameters._replace(
+            normaliser=Normaliser(mean, std, np.array(10.0)), log_std=generator.normal(-1.0, 0.5, action_size)
+        )
+    return Policy(
+        PolicyNetwork(parameters, agreement.activation, agreement.head), replace(agreement, algorithm=algorithm)
+    )

@@ -589,7 +589,7 @@ def test_the_beginning_is_perturbed_from_the_first_observation(tmp_path):
 def test_two_groups_tell_once_and_in_order(tmp_path):
     manifest = Manifest(task="Hopper-v4", algorithm="csac", seeds=(0, 1), steps=900)
     record = RunDirectory.create(tmp_path / "run", manifest)
-    recorder = Recorder(record, [[0], [1]], None, None, perturbations=[(0, "mass x 2"), (300, "friction x 2")])
+    recorder = Recorder(record, [[0], [1]], None, (), perturbations=[(0, "mass x 2"), (300, "friction x 2")])
 
     def evaluated(group: int, step: int) -> None:
         row = {"seed": group, "step": step, "episode": 0, "return": 1.0, "length": 1, "success": None}
@@ -614,7 +614,7 @@ def test_two_groups_tell_once_and_in_order(tmp_path):
 def test_what_a_run_does_not_reach_is_not_told(tmp_path):
     manifest = Manifest(task="Hopper-v4", algorithm="csac", seeds=(0,), steps=900)
     record = RunDirectory.create(tmp_path / "run", manifest)
-    recorder = Recorder(record, [[0]], None, None, perturbations=[(300, "friction x 2")])
+    recorder = Recorder(record, [[0]], None, (), perturbations=[(300, "friction x 2")])
     recorder.handle(0, messages.Ended(300, {}))
     recorder.close()
     assert not (record.path / "log.txt").exists()

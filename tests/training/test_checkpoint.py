@@ -448,7 +448,7 @@ def test_what_an_interrupted_write_left_is_removed(tmp_path):
 def recorder(tmp_path):
     manifest = Manifest(task="t", algorithm="a", seeds=(0, 1), steps=900)
     run = RunDirectory.create(tmp_path / "run", manifest)
-    return Recorder(run, [[0], [1]], None, None, Checkpoints(tmp_path / "run" / "checkpoint", 2))
+    return Recorder(run, [[0], [1]], None, (), Checkpoints(tmp_path / "run" / "checkpoint", 2))
 
 
 def saves(recorder: Recorder, group: int, step: int) -> None:
@@ -653,7 +653,7 @@ def test_a_full_disk_keeps_nobody_waiting_for_tensorboard(tmp_path):
     log = TensorBoardLog(tmp_path, [0])
     row = {"seed": 0, "step": 1, "return": 1.0, "length": 5}
     with no_file_larger_than(10_000), pytest.raises(OSError, match="File too large"):
-        consume(log.episodes([row]) for _ in range(2000))
+        consume(log.write({"episodes": [row]}) for _ in range(2000))
     with no_file_larger_than(10_000):
         log.close()
 

@@ -1,0 +1,95 @@
+"""An artefact as files: written to a folder of its own, and put in its place once it is whole and has been tested."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import tempfile
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from csac.deploy import tensors
+from csac.deploy.artefact_contract import CONTRACT, POLICY_FILES, sha256_of
+from csac.deploy.parameters import to_tensors
+from csac.deploy.templates import LOADER
+from csac.record.atomic import write_atomically
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from csac.deploy.artefact_contract import ArtefactContract
+    from csac.types import PolicyNetwork
+
+CARD = "README.md"
+CURVE = "curve.png"
+
+_OURS = {CONTRACT, CARD, CURVE, LOADER.name, *POLICY_FILES.values()}
+
+
+def write_artefact(folder: Path, network: PolicyNetwork, contract: ArtefactContract) -> ArtefactContract:
+    """Write an artefact into a folder that is there; return its contract, with the hash of the policy's file.
+
+    Raises:
+        InputError: what the format cannot have, or a package that it needs is not installed.
+    """
+    path = folder / contract.file
+    match contract.format:
+        case "numpy":
+            write_atomically(path, tensors.encode(to_tensors(network.parameters)))
+            write_atomically(folder / LOADER.name, LOADER.read_bytes())
+        case "onnx":
+            from csac.deploy.onnx_graph import onnx_model
+
+            write_atomically(path, onnx_model(network, contract))
+        case "c":
+            from csac.deploy.c_source import c_header
+
+            write_atomically(path, c_header(network, contract).encode())
+    contract = dataclasses.replace(contract, sha256=sha256_of(path))
+    write_contract(folder, contract)
+    return contract
+
+
+def write_contract(folder: Path, contract: ArtefactContract) -> None:
+    """Write contract.json into the folder of an artefact."""
+    write_atomically(folder / CONTRACT, contract.text().encode())
+
+
+def check_place(place: Path) -> None:
+    """Raise InputError where an artefact cannot be put: over anything but an artefact."""
+    if place.exists() and not place.is_dir():
+        raise InputError(f"{place} is a file: choose a folder for the artefact")
+    names = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
+    if names and not (CONTRACT in names and names <= _OURS):
+        raise InputError(f"{place} holds more than an artefact: choose a new or an empty folder")
+
+
+@contextmanager
+def placed(place: Path) -> Iterator[Path]:
+    """Yield a new folder that takes the place of `place` at the end, or is removed where something is raised.
+
+    Raises:
+        InputError: as `check_place`, or the place cannot be written.
+    """
+    check_place(place)
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
+    except OSError as error:
+        raise InputError(f"cannot write to {place}: {error.strerror}; choose another place") from None
+    try:
+        folder = aside / "new"
+        folder.mkdir()
+        yield folder
+        with suppress(FileNotFoundError):
+            os.rename(place, aside / "old")
+        try:
+            os.rename(folder, place)
+        except OSError:
+            os.rename(aside / "old", place)
+            raise
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)

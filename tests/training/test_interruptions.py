@@ -1,0 +1,68 @@
+"""Signals: before there is anything to save, and while the main thread is busy."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from csac.training.interruptions import caught_signals
+
+SWALLOWING = """
+import os, signal
+from csac.training.interruptions import leaving_at_once
+
+with leaving_at_once():
+    try:
+        os.kill(os.getpid(), signal.{})
+        for _ in range(1000):
+            pass
+    except BaseException:
+        pass
+    print("went on")
+"""
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 0)])
+def test_before_training_a_signal_is_not_swallowed(name, code):
+    ended = subprocess.run([sys.executable, "-c", SWALLOWING.format(name)], capture_output=True, text=True)
+    assert ended.returncode == code
+    assert ended.stdout == ("went on\n" if code == 0 else "")
+    assert ended.stderr == (f"csac: stopped by {name} outside of training; nothing is lost\n" if code else "")
+
+
+def test_a_signal_while_the_task_is_imported_stops_training(tmp_path):
+    (tmp_path / "swallowing.py").write_text(SWALLOWING.format("SIGINT"))
+    command = [sys.executable, "-m", "csac", "train", "swallowing:Task-v0", "--directory", "run"]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert ended.returncode == 130
+    assert ended.stderr == "csac: stopped by SIGINT outside of training; nothing is lost\n"
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_signal_is_told_while_the_main_thread_is_busy():
+    """Handlers run between two instructions of the main thread, and a compilation is one of them."""
+    order = []
+    with caught_signals(lambda: order.append("told")) as (stop, received):
+        threading.Timer(0.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 2_000_000)
+        order.append("worked")
+        assert stop.wait(10)
+        assert received == [signal.SIGINT]
+    assert order == ["told", "worked"]
+
+
+def test_what_was_there_for_signals_is_there_again():
+    def handlers():
+        return [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+
+    before, descriptor = handlers(), signal.set_wakeup_fd(-1)
+    with caught_signals(lambda: None) as (_, received):
+        assert handlers() != before
+    assert (handlers(), received) == (before, [])
+    assert signal.set_wakeup_fd(descriptor) == -1
