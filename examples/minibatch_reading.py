@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from csac.algorithms.adaptation import weights_now
 from csac.algorithms.csac import CSAC
 from csac.algorithms.networks import MLP
 from csac.types import Layer
@@ -34,10 +35,12 @@ def flat_critics() -> tuple[MLP, MLP]:
 def gradients(algorithm: CSAC, std: float) -> np.ndarray:
     """Return dJ/dmean at every quadrature node of the action noise [64], with the actor as its own reference."""
     actor = constant_policy(0.3, std)
+    weights = weights_now((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
 
     def gradient(noise: jax.Array) -> jax.Array:
         def loss(learnt: MLP) -> jax.Array:
-            return algorithm.actor_loss(learnt, jnp.zeros(1), noise, reference=actor, critics=flat_critics())[0]
+            networks = {"reference": actor, "critics": flat_critics()}
+            return algorithm.actor_loss(learnt, jnp.zeros(1), noise, weights=weights, **networks)[0]
 
         return jax.grad(loss)(actor).layers[0].bias[0]
 

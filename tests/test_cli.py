@@ -5,7 +5,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import gymnasium
@@ -22,6 +22,7 @@ from csac.deploy.policy import Policy
 from csac.record.manifest import EvaluationPlan, Manifest
 from csac.record.run import RunDirectory
 from csac.training.checkpoint import Checkpoint
+from csac.training.plan import algorithm_of
 from csac.training.resume import Source
 from csac.types import Layer, PolicyNetwork, PolicyParameters
 
@@ -287,6 +288,28 @@ def test_a_preset_is_the_algorithms_own(train_call):
     algorithm = train_call("Ant-v4 --algorithm sac --preset paper")["algorithm"]
 
     assert algorithm == SAC(temperature="fixed", entropy_weight=0.2)
+
+
+def test_weights_that_adapt_come_back_from_the_manifest(train_call):
+    line = "Hopper-v4 --entropy-weight auto --relative-entropy-weight auto --target-relative-entropy 0.02"
+    algorithm = train_call(line)["algorithm"]
+    assert algorithm == CSAC(entropy_weight="auto", relative_entropy_weight="auto", target_relative_entropy=0.02)
+    assert train_call("Hopper-v4 --entropy-weight 0.3")["algorithm"] == CSAC(entropy_weight=0.3)
+
+    told = replace(NOTHING, hyperparameters=asdict(algorithm))
+    RunDirectory.create(Path("adaptive"), told)
+    assert algorithm_of(RunDirectory.open("adaptive").manifest) == algorithm
+
+
+def test_a_manifest_from_before_csac_had_options_means_what_it_meant():
+    newer = {"critic_reference", "relative_entropy_form", "target_log_prob_bound"}
+    newer |= {"target_entropy", "target_relative_entropy", "weight_learning_rate"}
+    values = {name: value for name, value in asdict(CSAC(entropy_weight=0.3)).items() if name not in newer}
+    told = replace(NOTHING, hyperparameters=values)
+    explicit = CSAC(
+        entropy_weight=0.3, critic_reference="same", relative_entropy_form="explicit", target_log_prob_bound=0.0
+    )
+    assert algorithm_of(told) == explicit
 
 
 def test_negative_numbers_are_values(train_call):

@@ -7,45 +7,70 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import optax
 
+from csac.algorithms.adaptation import LearntWeights, Weights, adapted, begin_weights, told, weights_now
 from csac.algorithms.critics import Critics, critic_loss, least_q_value, make_critics
-from csac.algorithms.distributions import kl, log_ratio, policy_at
+from csac.algorithms.distributions import bounded, kl, log_ratio, policy_at
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.references import ReferencePolicy, reference_after, references_before
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
 class State(NamedTuple):
-    """Everything that one seed of CSAC learns."""
+    """Everything that one seed of CSAC learns; what an option does without is None."""
 
     actor: MLP
-    reference: MLP
+    reference: MLP | None
     critics: Critics
     target_critics: Critics
     actor_optimiser: Any
     critic_optimiser: Any
+    earlier_reference: MLP | None = None
+    learnt_weights: LearntWeights | None = None
+
+
+FIRST_WEIGHTS = Weights(1.0, 0.5)  # of those that adapt: SAC's first temperature, and the paper's τ
+
+NOT_TOGETHER = (
+    ({"relative_entropy_weight": ["auto"], "reference_policy": ["algorithm1"]}, "the actor is its own reference"),
+    ({"relative_entropy_weight": ["auto"], "relative_entropy_form": ["implicit"]}, "there is no reference"),
+    ({"critic_reference": ["earlier"], "relative_entropy_form": ["actor_only", "implicit"]}, "the target has none"),
+    ({"critic_reference": ["earlier"], "reference_policy": ["previous", "average"]}, "no copy replaces another"),
+)
 
 
 @dataclass(frozen=True)
 class CSAC:
     """Conservative Soft Actor-Critic (the paper's Algorithm 1)."""
 
-    entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.2
-    """Weight of the entropy (the paper's sigma)."""
-    relative_entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.5
-    """Weight of the relative entropy towards the reference policy (the paper's tau); 0 is SAC."""
-    reference_policy: Literal["algorithm1", "previous", "periodic", "average"] = "periodic"
+    entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.2
+    """Weight of the entropy (the paper's sigma); `auto` holds the policy's entropy at its target, as SAC does."""
+    relative_entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.5
+    """Weight of the relative entropy towards the reference (the paper's tau); 0 is SAC, `auto` holds it at a target."""
+    reference_policy: ReferencePolicy = "periodic"
     """The reference: the actor before the gradients or before the last update, a periodic copy, or an average."""
     reference_period: Annotated[int, COUNT] = 1000
     """Updates between two copies of the actor, with `periodic`."""
     reference_rate: Annotated[float, RATE] = 0.005
     """Step of the running average towards the actor, with `average`."""
+    critic_reference: Literal["same", "earlier"] = "same"
+    """The reference of the critic's target: the actor's, or the one that it replaced (CVI's pi_{k-1} beside pi_k)."""
     relative_entropy_estimator: Literal["closed_form", "sampled"] = "closed_form"
     """The exact KL of the two policies, or the paper's log-ratio at the sampled action."""
+    relative_entropy_form: Literal["explicit", "actor_only", "implicit"] = "explicit"
+    """In the critic's target and the actor's loss; in the latter alone; or as tau log pi in the reward (Munchausen)."""
+    target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Bound on the size of each log-density and log-ratio in the critic's target, in nats; 0 leaves them alone."""
+    target_entropy: float | None = None
+    """Entropy that `auto` aims at, in nats; by default minus the number of action dimensions."""
+    target_relative_entropy: Annotated[float, POSITIVE] = 0.01
+    """Relative entropy towards the reference that `auto` aims at, in nats per action dimension."""
+    weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
+    """Learning rate of the weights that are `auto`."""
     discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
     target_rate: Annotated[float, RATE] = 0.005
@@ -74,51 +99,86 @@ class CSAC:
     name: ClassVar[str] = "csac"
 
     def __post_init__(self) -> None:
-        take_hyperparameters(self)
+        take_hyperparameters(self, NOT_TOGETHER)
 
     def critic_target(
-        self, transition: Transition, noise: Action, *, actor: MLP, reference: MLP, target_critics: Critics
+        self,
+        transition: Transition,
+        noise: Action,
+        *,
+        actor: MLP,
+        reference: MLP | None,
+        target_critics: Critics,
+        weights: Weights,
     ) -> Scalar:
         """Return y(s, a, s') with a' = tanh(mean + std noise) (Eq. Q_TD_2), and no future after a terminal step."""
-        value, _ = self.regularised_value(transition.next_observation, noise, actor, reference, target_critics)
-        return transition.reward + self.discount * (1.0 - transition.terminated) * value
+        reward, bound = transition.reward, self.target_log_prob_bound
+        if self.relative_entropy_form == "actor_only":
+            reference, weights = None, weights._replace(relative_entropy=0.0)
+        elif self.relative_entropy_form == "implicit":
+            log_prob = policy_at(actor, transition.observation).log_prob_of(transition.action)
+            reward = reward + weights.relative_entropy * bounded(log_prob, bound)
+        next_observation = transition.next_observation
+        value, _ = self.regularised_value(next_observation, noise, actor, reference, target_critics, weights, bound)
+        return reward + self.discount * (1.0 - transition.terminated) * value
 
     def actor_loss(
-        self, actor: MLP, observation: Observation, noise: Action, *, reference: MLP, critics: Critics
+        self,
+        actor: MLP,
+        observation: Observation,
+        noise: Action,
+        *,
+        reference: MLP | None,
+        critics: Critics,
+        weights: Weights,
     ) -> tuple[Scalar, Metrics]:
         """Return J(φ) = (τ + σ) log π - τ log π̃ - min Q at ã(s, noise) (Eq. actor_update_2), and what to log."""
-        value, metrics = self.regularised_value(observation, noise, actor, reference, critics)
+        value, metrics = self.regularised_value(observation, noise, actor, reference, critics, weights)
         return -value, {"actor_loss": -value, **metrics}
 
     def regularised_value(
-        self, observation: Observation, noise: Action, actor: MLP, reference: MLP, critics: Critics
+        self,
+        observation: Observation,
+        noise: Action,
+        actor: MLP,
+        reference: MLP | None,
+        critics: Critics,
+        weights: Weights,
+        bound: float = 0.0,
     ) -> tuple[Scalar, Metrics]:
-        """Return min Q - σ log π - τ log(π/π̃) at ã(s, noise) (the bracket of Eq. Q_CSAC), and its parts."""
-        policy, reference_policy = policy_at(actor, observation), policy_at(reference, observation)
+        """Return min Q - σ log π - τ log(π/π̃) at ã(s, noise) (the bracket of Eq. Q_CSAC), and its parts.
+
+        Without a reference the critics are those of P = Q + τ log π̃ (Eq. actor_update_3), and it is P - (σ + τ) log π.
+        """
+        policy = policy_at(actor, observation)
         q_value = least_q_value(critics, observation, policy.sample(noise))
-        log_prob = policy.log_prob(noise)
+        log_prob = bounded(policy.log_prob(noise), bound)
+        if reference is None:
+            return q_value - (weights.entropy + weights.relative_entropy) * log_prob, {"entropy": -log_prob}
+        reference_policy = policy_at(reference, observation)
         if self.relative_entropy_estimator == "closed_form":
-            relative_entropy = kl(policy, reference_policy)
+            relative_entropy = bounded(kl(policy, reference_policy), bound)
         else:
-            relative_entropy = log_ratio(policy, reference_policy, noise)
-        value = q_value - self.entropy_weight * log_prob - self.relative_entropy_weight * relative_entropy
+            relative_entropy = bounded(log_ratio(policy, reference_policy, noise), bound)
+        value = q_value - weights.entropy * log_prob - weights.relative_entropy * relative_entropy
         return value, {"entropy": -log_prob, "relative_entropy": relative_entropy}
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
-        """Take one gradient step on the critics, then one on the actor, then move the target critics."""
+        """Take one gradient step on the critics, then one on the actor, then move weights and target critics."""
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
-        reference = self.reference_before(state, step)
+        weights = weights_now((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
+        renews, kept = step % self.reference_period == 0, (state.reference, state.earlier_reference)
+        references = references_before(self.reference_policy, *kept, state.actor, renews)
 
-        critic_target = partial(
-            self.critic_target, actor=state.actor, reference=reference, target_critics=state.target_critics
-        )
+        networks = {"actor": state.actor, "reference": references.critic, "target_critics": state.target_critics}
+        critic_target = partial(self.critic_target, weights=weights, **networks)
         targets = jax.vmap(critic_target)(batch, target_noise)
         optimiser = self._optimiser(self.critic_learning_rate)
         critics, critic_optimiser, critic_metrics = descend(
             optimiser, critic_loss, state.critics, state.critic_optimiser, batch, targets
         )
 
-        actor_loss = partial(self.actor_loss, reference=reference, critics=critics)
+        actor_loss = partial(self.actor_loss, reference=references.actor, critics=critics, weights=weights)
         optimiser = self._optimiser(self.actor_learning_rate)
         actor, actor_optimiser, actor_metrics = descend(
             optimiser, actor_loss, state.actor, state.actor_optimiser, batch.observation, actor_noise
@@ -126,30 +186,27 @@ class CSAC:
 
         new_state = State(
             actor=actor,
-            reference=self.reference_after(state, reference),
+            reference=reference_after(self.reference_policy, references.actor, state.actor, self.reference_rate),
             critics=critics,
             target_critics=polyak(state.target_critics, critics, self.target_rate),
             actor_optimiser=actor_optimiser,
             critic_optimiser=critic_optimiser,
+            earlier_reference=references.critic if self.critic_reference == "earlier" else None,
+            learnt_weights=adapted(
+                state.learnt_weights,
+                self.slack(actor_metrics, batch.action.shape[-1]),
+                self._optimiser(self.weight_learning_rate),
+            ),
         )
-        return new_state, {**critic_metrics, **actor_metrics}
+        return new_state, {**critic_metrics, **actor_metrics, **told(weights, state.learnt_weights)}
 
-    def reference_before(self, state: State, step: Count) -> MLP:
-        """Return the reference policy that this update uses."""
-        if self.reference_policy == "algorithm1":
-            return state.actor
-        if self.reference_policy == "periodic":
-            renew = step % self.reference_period == 0
-            return jax.tree.map(lambda old, new: jnp.where(renew, new, old), state.reference, state.actor)
-        return state.reference
-
-    def reference_after(self, state: State, reference: MLP) -> MLP:
-        """Return the reference policy to keep, given the state before the gradients and the reference just used."""
-        if self.reference_policy == "previous":
-            return state.actor
-        if self.reference_policy == "average":
-            return polyak(state.reference, state.actor, self.reference_rate)
-        return reference
+    def slack(self, metrics: Metrics, dimensions: int) -> Weights:
+        """Return by how much the entropy lies above its target, and the relative entropy below its own, in nats."""
+        target_entropy = -float(dimensions) if self.target_entropy is None else self.target_entropy
+        relative_entropy = metrics.get("relative_entropy", 0.0)
+        return Weights(
+            metrics["entropy"] - target_entropy, self.target_relative_entropy * dimensions - relative_entropy
+        )
 
     @property
     def cadence(self) -> Cadence:
@@ -161,17 +218,23 @@ class CSAC:
         return Replay.create(min(self.replay_size, steps), spec, self.update_interval)
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
-        """Return random networks; targets and reference are copies."""
+        """Return random networks; targets and references are copies."""
         actor_key, critics_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, 2 * spec.action_size)
         critics = make_critics(critics_key, spec, self.critic_hidden_sizes)
         return State(
             actor=actor,
-            reference=copy_tree(actor),
+            reference=None if self.relative_entropy_form == "implicit" else copy_tree(actor),
             critics=critics,
             target_critics=copy_tree(critics),
             actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
             critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
+            earlier_reference=copy_tree(actor) if self.critic_reference == "earlier" else None,
+            learnt_weights=begin_weights(
+                (self.entropy_weight, self.relative_entropy_weight),
+                FIRST_WEIGHTS,
+                self._optimiser(self.weight_learning_rate),
+            ),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
 
 class Limit(NamedTuple):
@@ -34,13 +35,15 @@ WIDTHS = Limit(
 )
 
 
-def take_hyperparameters(algorithm: Any) -> None:
+def take_hyperparameters(algorithm: Any, not_together: Iterable[tuple[Mapping[str, Sequence[Any]], str]] = ()) -> None:
     """Take an algorithm's fields as plain Python values, and refuse one outside its range or its choices.
 
     NumPy's scalars become Python's, and lists tuples, so that what is recorded does not depend on how it was given.
+    `not_together` are values of fields that make no sense together, and why.
 
     Raises:
-        InputError: the first such field, its value and what it may be; or a replay that holds less than a batch.
+        InputError: the first such field, its value and what it may be; fields that make no sense together; or a replay
+            that holds less than a batch.
     """
     hints = get_type_hints(type(algorithm), include_extras=True)
     for field in dataclasses.fields(algorithm):
@@ -48,6 +51,10 @@ def take_hyperparameters(algorithm: Any) -> None:
         if words := _what_it_must_be(value, hints[field.name]):
             raise InputError(f"{field.name} must be {words}, not {value!r}")
         object.__setattr__(algorithm, field.name, value)
+    for values, why in not_together:
+        if all(getattr(algorithm, name) in refused for name, refused in values.items()):
+            told = " with ".join(f"{name} {getattr(algorithm, name)}" for name in values)
+            raise InputError(f"{told} makes no sense: {why}")
     if hasattr(algorithm, "replay_size") and algorithm.replay_size < algorithm.batch_size:
         raise InputError(
             f"replay_size must be at least batch_size, {algorithm.batch_size:,}, not {algorithm.replay_size:,}"
@@ -56,9 +63,12 @@ def take_hyperparameters(algorithm: Any) -> None:
 
 def _what_it_must_be(value: Any, hint: Any) -> str | None:
     """Say what a value of this type and these limits must be, or return None where it is."""
+    if get_origin(hint) in (Union, UnionType) and NoneType not in get_args(hint):
+        found = [_what_it_must_be(value, kind) for kind in get_args(hint)]
+        return None if None in found else ", or ".join(filter(None, found))
     hint, *limits = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     if get_origin(hint) is Literal and value not in get_args(hint):
-        return f"one of {', '.join(get_args(hint))}"
+        return f"{'one of ' * (len(get_args(hint)) > 1)}{', '.join(get_args(hint))}"
     if hint is bool and not isinstance(value, bool):
         return "true or false"
     if hint is int and not _is_whole(value):

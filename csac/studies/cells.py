@@ -10,7 +10,7 @@ import json
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_type_hints
 
 from csac.algorithms import ALGORITHMS
 from csac.console.tables import short
@@ -271,4 +271,4 @@ def _in_its_type(value: Any, hint: Any) -> Any:
     if isinstance(value, list):
         return tuple(value)
     is_whole = isinstance(value, int) and not isinstance(value, bool)
-    return float(value) if is_whole and hint in (float, float | None) else value
+    return float(value) if is_whole and float in (hint, *get_args(hint)) else value

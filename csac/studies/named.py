@@ -80,19 +80,21 @@ PANDA = Study(
 REFERENCE = replace(
     MUJOCO,
     name="reference",
-    title="CSAC's reference policies and estimators against SAC",
-    tasks=("HalfCheetah-v4", "Walker2d-v4", "Hopper-v4"),
+    title="CSAC's reference policies against SAC",
+    tasks=("Hopper-v4", "Walker2d-v4", "HalfCheetah-v4"),
     methods=(
-        SAC,
+        replace(SAC, label="SAC, 0.2"),
+        Method("SAC, automatic", "sac"),
+        replace(CSAC_PAPER, label="CSAC, paper"),
         *(
-            Method(
-                f"CSAC, {policy}, {estimator.replace('_', ' ')}",
-                "csac",
-                hyperparameters={"reference_policy": policy, "relative_entropy_estimator": estimator},
+            Method(f"CSAC, {label}", "csac", hyperparameters={"relative_entropy_weight": 0.5, **hyperparameters})
+            for label, hyperparameters in (
+                ("previous", {"reference_policy": "previous"}),
+                ("periodic 100", {"reference_policy": "periodic", "reference_period": 100}),
+                ("periodic 1000", {"reference_policy": "periodic", "reference_period": 1000}),
+                ("average 0.005", {"reference_policy": "average", "reference_rate": 0.005}),
+                ("average 0.05", {"reference_policy": "average", "reference_rate": 0.05}),
             )
-            for policy in ("algorithm1", "previous", "periodic", "average")
-            for estimator in ("sampled", "closed_form")
-            if (policy, estimator) != ("algorithm1", "closed_form")  # which is SAC, exactly
         ),
     ),
 )

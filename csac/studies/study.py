@@ -56,6 +56,7 @@ class Study:
     tasks: tuple[str, ...]
     methods: tuple[Method, ...]
     seeds: int = 5
+    first_seed: int = 0
     steps: int = 1_000_000
     steps_on: Mapping[str, int] = field(default_factory=dict)
     """Tasks on which it is another number of steps."""
@@ -129,7 +130,8 @@ class Study:
 
     def entries(self) -> list[Entry]:
         """Return every cell: seed by seed, so that an unfinished study compares all methods on fewer seeds."""
-        parts = itertools.product(range(self.seeds), self.tasks, self.conditions_for(), self.methods)
+        seeds = range(self.first_seed, self.first_seed + self.seeds)
+        parts = itertools.product(seeds, self.tasks, self.conditions_for(), self.methods)
         return [Entry(method, part, self._cell(task, method, part, seed)) for seed, task, part, method in parts]
 
     def _cell(self, task: str, method: Method, condition: tuple[str, ...], seed: int) -> Cell:
@@ -188,6 +190,8 @@ def _study(name: str, told: dict[str, Any]) -> Study:
     for key in ("seeds", "steps", "evaluation_interval", "evaluation_episodes"):
         if key in values and values[key] < 1:
             raise InputError(f"{key} must be at least 1, not {values[key]}")
+    if values.get("first_seed", 0) < 0:
+        raise InputError(f"first_seed must be 0 or more, not {values['first_seed']}")
     check_events(values.get("events", ()))
     for task in values.get("steps_on", {}):
         _some([task], values["tasks"], "steps_on: the study has no task")
@@ -268,6 +272,7 @@ _KEYS: Mapping[str, Callable[[str, Any], Any]] = {
     "tasks": _texts,
     "methods": _methods,
     "seeds": _of(int, "a whole number"),
+    "first_seed": _of(int, "a whole number"),
     "steps": _of(int, "a whole number"),
     "steps_on": _steps_on,
     "evaluation_interval": _of(int, "a whole number"),

@@ -13,6 +13,7 @@ from scipy.special import logsumexp, softmax
 
 from csac.algorithms import CSAC, SAC
 from csac.algorithms import csac as csac_file
+from csac.algorithms.adaptation import weights_now
 from csac.types import Spec, Transition
 
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(80)
@@ -32,14 +33,17 @@ def critic(inputs: jax.Array) -> jax.Array:
     return 1.5 * action - 2.0 * action**2 + 0.4 * jnp.sin(5.0 * action)
 
 
+def weights_of(algorithm):
+    return weights_now((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
+
+
 def actor_losses(algorithm, parameters, reference, noises):
     """The actor loss at each noise, of the policy with these [mean, log_std] at the only observation."""
 
     def loss(noise):
-        actor, previous = (lambda _: parameters), (lambda _: reference)
-        return algorithm.actor_loss(actor, ONE_OBSERVATION, noise[None], reference=previous, critics=(critic, critic))[
-            0
-        ]
+        networks = {"reference": lambda _: reference, "critics": (critic, critic)}
+        weights = weights_of(algorithm)
+        return algorithm.actor_loss(lambda _: parameters, ONE_OBSERVATION, noise[None], weights=weights, **networks)[0]
 
     return jax.vmap(loss)(noises)
 
@@ -121,6 +125,15 @@ def test_algorithm1_with_the_closed_form_is_sac(sac_state):
     assert_equals_sac(after_updates(algorithm), sac_state)
 
 
+def test_an_adaptive_entropy_weight_is_sac_s_automatic_temperature():
+    settings = {**SMALL, "entropy_weight": "auto", "weight_learning_rate": 3e-3}
+    ours = after_updates(CSAC(relative_entropy_weight=0.0, **settings))
+    theirs = after_updates(SAC(**{**SMALL, "entropy_weight": 1.0, "temperature_learning_rate": 3e-3}))
+    assert_equals_sac(ours, theirs)
+    assert abs(float(theirs.log_temperature)) > 0.05
+    assert float(ours.learnt_weights.entropy.log_weight) == pytest.approx(float(theirs.log_temperature), abs=1e-5)
+
+
 @pytest.mark.parametrize("reference_policy", ["previous", "periodic", "average"])
 def test_every_other_reference_policy_changes_what_is_learnt(reference_policy, sac_state):
     algorithm = CSAC(relative_entropy_weight=0.5, reference_policy=reference_policy, **SMALL)
@@ -190,6 +203,9 @@ class Table(NamedTuple):
     def log_prob(self, noise):
         return self.log_probs[choice(noise)]
 
+    def log_prob_of(self, action):
+        return self.log_probs[choice(jnp.arctanh(action))]
+
 
 def choice(pre_tanh):
     """Which of the actions lies here."""
@@ -217,8 +233,8 @@ def tables(monkeypatch):
 
 
 def actor_of(log_policy):
-    """A network whose outputs are those of this table [state, action]."""
-    return lambda observation: log_policy[observation[0].astype(int)]
+    """A network whose outputs are those of this table [state, action]; no network for none."""
+    return log_policy if log_policy is None else lambda observation: log_policy[observation[0].astype(int)]
 
 
 def critics_of(q):
@@ -235,7 +251,8 @@ def expected_loss(algorithm, log_policy, log_reference, q):
 
     def loss(state, noise):
         networks = {"reference": actor_of(log_reference), "critics": critics_of(q)}
-        return algorithm.actor_loss(actor_of(log_policy), state[None], noise[None], **networks)[0]
+        weights = weights_of(algorithm)
+        return algorithm.actor_loss(actor_of(log_policy), state[None], noise[None], weights=weights, **networks)[0]
 
     losses = jax.vmap(jax.vmap(loss, (None, 0)), (0, None))(jnp.arange(STATES), jnp.asarray(PRE_TANH))
     return jnp.sum(jnp.exp(log_policy) * losses, axis=1)
@@ -244,21 +261,21 @@ def expected_loss(algorithm, log_policy, log_reference, q):
 def expected_target(algorithm, log_policy, log_reference, q):
     """The mean of `critic_target` over next states and over the policy's actions there [state, action]."""
 
-    def target(reward, next_state, noise):
-        nothing = jnp.zeros(())
-        transition = Transition(None, None, reward, next_state[None], nothing, nothing)
+    def target(state, action, reward, next_state, noise):
+        transition = Transition(state[None], action[None], reward, next_state[None], jnp.zeros(()), jnp.zeros(()))
         return algorithm.critic_target(
             transition,
             noise[None],
             actor=actor_of(log_policy),
             reference=actor_of(log_reference),
             target_critics=critics_of(q),
+            weights=weights_of(algorithm),
         )
 
-    each_action = jax.vmap(target, (None, None, 0))
-    each_next_state = jax.vmap(each_action, (None, 0, None))
-    each_reward = jax.vmap(jax.vmap(each_next_state, (0, None, None)), (0, None, None))
-    targets = each_reward(jnp.asarray(REWARD), jnp.arange(STATES), jnp.asarray(PRE_TANH))  # [s, a, s', a']
+    for axes in ((4,), (3,), (1, 2), (0, 2)):  # in the end [state, action, next state, next action]
+        target = jax.vmap(target, [0 if axis in axes else None for axis in range(5)])
+    states, actions = jnp.arange(STATES), jnp.asarray(PRE_TANH)
+    targets = target(states, jnp.tanh(actions), jnp.asarray(REWARD), states, actions)
     return jnp.einsum("ijk,kl,ijkl->ij", DYNAMICS, jnp.exp(log_policy), targets)
 
 
@@ -276,27 +293,30 @@ def improve(algorithm, log_reference, q):
     return jax.nn.log_softmax(log_policy - size * slope, axis=1)
 
 
-def iterate(sigma, tau, iterations, estimator: Any = "sampled"):
+def iterate(sigma, tau, iterations, estimator: Any = "sampled", first_q=FIRST_Q, **options):
     """CSAC's own equations, exactly: yields (Q_k, log π_k, V_k).
 
     The actor descends towards π_k with π_(k-1) as its reference, and the critic's target is taken with π_k against
-    π_(k-1).
+    π_(k-1). Without a reference, in the implicit form, what is yielded as Q_k is P_k.
     """
     algorithm = CSAC(
         entropy_weight=sigma,
         relative_entropy_weight=tau,
         relative_entropy_estimator=estimator,
         discount=DISCOUNT,
+        **options,
     )
 
     @jax.jit
     def step(q, log_before):
+        if algorithm.relative_entropy_form == "implicit":
+            log_before = None
         log_policy = improve(algorithm, log_before, q)
         value = -expected_loss(algorithm, log_policy, log_before, q)
         return log_policy, value, expected_target(algorithm, log_policy, log_before, q)
 
     with jax.enable_x64(True):
-        q, log_policy = jnp.array(FIRST_Q), jnp.array(FIRST_POLICY)
+        q, log_policy = jnp.array(first_q), jnp.array(FIRST_POLICY)
         for _ in range(iterations):
             before = q
             log_policy, value, q = step(q, log_policy)
@@ -339,6 +359,33 @@ def test_the_fixed_point_is_that_of_sac_whatever_the_relative_entropy_weighs(tau
     expected = soft_value_iteration(sigma)
     np.testing.assert_allclose(q, expected, atol=1e-8)
     np.testing.assert_allclose(np.exp(log_policy), softmax(expected / sigma, axis=1), atol=1e-8)
+
+
+@pytest.mark.usefixtures("tables")
+@pytest.mark.parametrize(("sigma", "tau"), [(0.2, 0.5), (0.2, 5.0), (0.0, 0.5), (0.2, 0.0)])
+def test_the_implicit_form_goes_the_same_way_without_a_reference(sigma, tau):
+    # Its critics learn the preference P_k = Q_k + τ log π_(k-1) (Eq. actor_update_3). From Q_(k+1)'s target,
+    #   P_(k+1) = r + τ log π_k(a|s) + γ E[P_k - (σ + τ) log π_k],
+    # which is M-RL (Vieillard et al. 2020) with the temperature τ + σ and α = τ / (τ + σ).
+    explicit = iterate(sigma, tau, 40)
+    first = FIRST_Q + tau * FIRST_POLICY
+    implicit = iterate(sigma, tau, 40, relative_entropy_form="implicit", first_q=first)
+    log_before = FIRST_POLICY
+    for (q, log_policy, value), (preference, same_policy, same_value) in zip(explicit, implicit, strict=True):
+        np.testing.assert_allclose(preference, q + tau * log_before, atol=1e-8)
+        np.testing.assert_allclose(np.exp(same_policy), np.exp(log_policy), atol=1e-8)
+        np.testing.assert_allclose(same_value, value, atol=1e-8)
+        log_before = log_policy
+
+
+@pytest.mark.usefixtures("tables")
+@pytest.mark.parametrize("tau", [0.05, 0.5, 5.0])
+def test_the_implicit_fixed_point_is_that_of_sac(tau):
+    sigma = 0.2
+    *_, (preference, log_policy, _) = iterate(sigma, tau, 1000, relative_entropy_form="implicit")
+    expected = soft_value_iteration(sigma)
+    np.testing.assert_allclose(np.exp(log_policy), softmax(expected / sigma, axis=1), atol=1e-8)
+    np.testing.assert_allclose(preference - tau * log_policy, expected, atol=1e-8)
 
 
 @pytest.mark.usefixtures("tables")

@@ -4,59 +4,33 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equations import (
+    BOTH_WEIGHTS,
+    CRITICS,
+    LINEAR,
+    NOISE,
+    ONE,
+    POLICY,
+    REFERENCE,
+    batch_of,
+    csac,
+    gaussian,
+    linear,
+    transition,
+    update,
+)
 from scipy.stats import norm
 
 from csac.algorithms import CSAC, SAC, SD3, TD3
 from csac.algorithms.critics import critic_loss, q_values
 from csac.algorithms.distributions import kl, policy_at
 from csac.algorithms.networks import MLP, descend, make_optimiser, polyak
-from csac.types import Layer, Spec, Transition
-
-ONE = Spec(1, 1)
-
-
-def linear(weight: list[list[float]], bias: list[float]) -> MLP:
-    return MLP((Layer(jnp.array(weight), jnp.array(bias)),))
-
-
-def gaussian(mean: float, std: float) -> MLP:
-    """A policy that is tanh(N(mean, std²)) everywhere."""
-    return linear([[0.0, 0.0]], [mean, math.log(std)])
-
-
-def transition(observation=1.0, action=0.5, reward=2.0, next_observation=1.0, terminated=0.0, truncated=0.0):
-    observation, action, next_observation = (np.array([x], np.float32) for x in (observation, action, next_observation))
-    reward, terminated, truncated = (np.array(x, np.float32) for x in (reward, terminated, truncated))
-    return Transition(observation, action, reward, next_observation, terminated, truncated)
-
-
-def batch_of(*transitions: Transition) -> Transition:
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *transitions)
-
-
-@partial(jax.jit, static_argnums=0)
-def update(algorithm, state, batch: Transition, step: int = 0):
-    return algorithm.update(state, batch, jax.random.key(step), step)
-
-
-# Policy tanh(N(0, 1)), reference tanh(N(1, 2²)), noise 0.5, so u = 0.5, a = tanh 0.5 = 0.4621172, 1 - a² = 0.7864477.
-# log N(u; 0, 1) = -0.125 - 0.9189385              = -1.0439385
-# log N(u; 1, 2²) = -0.03125 - 0.6931472 - 0.9189385 = -1.6433357
-# log π = -1.0439385 - log 0.7864477 = -1.0439385 + 0.2402290 = -0.8037095;  log π̃ = -1.6433357 + 0.2402290 = -1.4031067
-# sampled: log π - log π̃ = 0.5993972;  closed form: KL = log 2 + (1² + 1²) / (2·2²) - 1/2 = 0.4431472
-# Q₁ = s + 2a = 1.9242343, Q₂ = 3 - a = 2.5378828 at s = 1, so min Q = 1.9242343
-POLICY, REFERENCE, NOISE = gaussian(0.0, 1.0), gaussian(1.0, 2.0), jnp.array([0.5])
-CRITICS = (linear([[1.0], [2.0]], [0.0]), linear([[0.0], [-1.0]], [3.0]))
-
-
-def csac(**settings) -> CSAC:
-    return CSAC(**{"entropy_weight": 0.2, "relative_entropy_weight": 0.5, "discount": 0.9, **settings})
+from csac.types import Spec
 
 
 @pytest.mark.parametrize(
@@ -74,7 +48,8 @@ def csac(**settings) -> CSAC:
 def test_csac_critic_target(estimator, terminated, truncated, expected):
     step = transition(terminated=terminated, truncated=truncated)
     algorithm = csac(relative_entropy_estimator=estimator)
-    target = algorithm.critic_target(step, NOISE, actor=POLICY, reference=REFERENCE, target_critics=CRITICS)
+    networks = {"actor": POLICY, "reference": REFERENCE, "target_critics": CRITICS}
+    target = algorithm.critic_target(step, NOISE, weights=BOTH_WEIGHTS, **networks)
     assert float(target) == pytest.approx(expected, abs=2e-6)
 
 
@@ -89,7 +64,8 @@ def test_csac_critic_target(estimator, terminated, truncated, expected):
 )
 def test_csac_actor_loss(estimator, expected):
     algorithm = csac(relative_entropy_estimator=estimator)
-    loss, metrics = algorithm.actor_loss(POLICY, jnp.array([1.0]), NOISE, reference=REFERENCE, critics=CRITICS)
+    networks = {"reference": REFERENCE, "critics": CRITICS}
+    loss, metrics = algorithm.actor_loss(POLICY, jnp.array([1.0]), NOISE, weights=BOTH_WEIGHTS, **networks)
     assert float(loss) == pytest.approx(expected, abs=2e-6)
     assert float(metrics["entropy"]) == pytest.approx(0.8037095, abs=1e-6)
 
@@ -146,14 +122,6 @@ def test_q_mean_is_the_critics_mean_value_of_the_batch_before_the_update(algorit
     assert float(update(learner, state, given)[1]["q_mean"]) == pytest.approx(float(np.mean(values)), rel=1e-5)
 
 
-LINEAR = {
-    "actor_hidden_sizes": (),
-    "critic_hidden_sizes": (),
-    "discount": 0.5,
-    "target_rate": 0.5,
-    "actor_learning_rate": 0.1,
-    "critic_learning_rate": 0.1,
-}
 NO_ENTROPY = [
     CSAC(entropy_weight=0.0, relative_entropy_weight=0.0, **LINEAR),
     SAC(temperature="fixed", entropy_weight=0.0, **LINEAR),

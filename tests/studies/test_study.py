@@ -80,7 +80,7 @@ def test_studies_share_what_they_have_in_common():
     keys = {name: {one.key for one in cells_of(studies)} for name, studies in NAMED.items()}
     assert keys["efficiency"] == keys["mujoco"]
     assert len(keys["ablation"] & keys["mujoco"]) == 2 * 5  # tau 0.5, for both of CSAC's variants
-    assert len(keys["reference"] & keys["mujoco"]) == 3 * 3 * 5  # SAC, algorithm 1 and the default
+    assert len(keys["reference"] & keys["mujoco"]) == 3 * 3 * 5  # SAC 0.2, the paper's CSAC and the default
     assert len(keys["mujoco"]) == 4 * 6 * 5
     assert len(keys["robustness"]) == 3 * 3 * 5
 
@@ -143,6 +143,7 @@ def test_a_sweep_is_a_method_for_each_combination(tmp_path):
         (("batch_size = 8", "bach_size = 8"), "sac has no hyperparameter 'bach_size'; did you mean batch_size?"),
         (("seeds = 2", 'seeds = "two"'), "seeds is a whole number, not 'two'"),
         (("seeds = 2", "seeds = 0"), "seeds must be at least 1, not 0"),
+        (("seeds = 2", "first_seed = -1"), "first_seed must be 0 or more, not -1"),
         (("seeds = 2", "seeds = "), "is not TOML"),
         (('tasks = ["Hopper-v4"]', "tasks = []"), "tasks missing"),
         (('tasks = ["Hopper-v4"]', 'tasks = "Hopper-v4"'), "tasks is a list of texts, not 'Hopper-v4'"),
@@ -160,6 +161,29 @@ def test_mistakes_in_a_file_are_told_in_one_line(tmp_path, change, message):
     assert str(raised.value).startswith(str(path))
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+EVIDENCE = Path(__file__).parents[2] / "results" / "reference"
+
+
+def test_the_screen_is_the_named_study_in_short():
+    # A twentieth and a half of 1M steps is 150,000: the interval and the warm-up stay, as the protocol says.
+    (named,) = NAMED["reference"]
+    screen = read_study(EVIDENCE / "screen.toml")
+    named = named.shortened(0.15).narrowed(tasks=screen.tasks, seeds=3)
+    hopper = Study(**{**vars(named), "steps_on": {}})
+    assert {one.key for one in cells_of([screen])} == {one.key for one in cells_of([hopper])}
+    assert [method.label for method in screen.methods] == [method.label for method in named.methods]
+
+
+@pytest.mark.parametrize("path", sorted(EVIDENCE.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_study_of_the_protocol_is_understood(path):
+    study = read_study(path)
+    first = study.methods[0].hyperparameters_on(study.tasks[0])
+    assert (study.methods[0].algorithm, first["temperature"], first["entropy_weight"]) == ("sac", "fixed", 0.2)
+    assert (study.evaluation_interval, study.evaluation_episodes) == (5_000, 10)
+    fresh = {"confirm", "ant", "recovery"}
+    assert {one.seed for one in cells_of([study])} == (set(range(100, 105)) if path.stem in fresh else {0, 1, 2})
 
 
 def test_a_file_that_there_is_not(tmp_path):

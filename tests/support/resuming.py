@@ -27,6 +27,14 @@ LEARNERS = [
     ROLLOUT,
     SAC(update_interval=7, **SMALL),
 ]
+ADAPTIVE = CSAC(
+    entropy_weight="auto",
+    relative_entropy_weight="auto",
+    weight_learning_rate=0.01,
+    critic_reference="earlier",
+    reference_period=30,
+    **SMALL,
+)
 SHORT: dict[str, Any] = {"evaluation_interval": 100, "evaluation_episodes": 2, "tensorboard": False}
 
 

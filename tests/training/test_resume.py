@@ -17,7 +17,7 @@ import probes
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
 from plans import settings
-from resuming import LEARNERS, ROLLOUT, Crash, contents, crash_at, run
+from resuming import ADAPTIVE, LEARNERS, ROLLOUT, Crash, contents, crash_at, run
 
 from csac.record.manifest import Origin
 from csac.record.run import RunDirectory
@@ -45,12 +45,14 @@ def everything(group: Group) -> list[np.ndarray]:
     return [*leaves, group._actions, group._observations]
 
 
-@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda learner: f"{learner.name}-{learner.cadence.update_interval}")
+@pytest.mark.parametrize(
+    "algorithm", [*LEARNERS, ADAPTIVE], ids=lambda learner: f"{learner.name}-{learner.cadence.update_interval}"
+)
 def test_a_group_goes_on_bit_for_bit(tmp_path, algorithm):
     check_that_a_group_goes_on(tmp_path, algorithm, (3,))
 
 
-@pytest.mark.parametrize("algorithm", [LEARNERS[0], ROLLOUT], ids=lambda algorithm: algorithm.name)
+@pytest.mark.parametrize("algorithm", [LEARNERS[0], ADAPTIVE, ROLLOUT], ids=lambda algorithm: algorithm.name)
 def test_a_group_of_two_goes_on_bit_for_bit(tmp_path, algorithm):
     check_that_a_group_goes_on(tmp_path, algorithm, (0, 4))
 
@@ -68,6 +70,14 @@ def check_that_a_group_goes_on(tmp_path: Path, algorithm, seeds: tuple[int, ...]
     assert advance(again, 330) == after
     for ours, theirs in zip(everything(again), everything(whole), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_weights_that_are_learnt_have_moved_when_they_are_saved(tmp_path):
+    one = group(tmp_path, ADAPTIVE, (3,), 400)
+    advance(one, 150)
+    learnt = one.learner.carry(0).state.learnt_weights
+    for weight, first in ((learnt.entropy, 1.0), (learnt.relative_entropy, 0.5)):
+        assert abs(float(weight.log_weight) - np.log(first)) > 0.01
 
 
 def test_a_grown_run_equals_one_that_was_long_from_the_start(tmp_path):

@@ -1,0 +1,60 @@
+"""What is measured along a run: parts of the gradient, and what a critic ought to have said."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from equations import CRITICS, LINEAR, ONE, POLICY, REFERENCE
+
+from csac.algorithms import CSAC
+
+MECHANISM = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "results" / "reference" / "mechanism.py")))
+
+
+def rollout(reward, terminated, ended, next_q_value, next_charge, q_value):
+    n = len(reward)
+    given = (np.zeros((n, 1)), reward, terminated, ended, q_value, next_q_value, np.zeros(n), next_charge)
+    return MECHANISM.Rollout(*map(np.asarray, given))
+
+
+def test_what_the_critic_ought_to_have_said():
+    # γ = 0.5. Step 2 terminates: 3. Step 1: 2 + 0.5 (3 - 0.4) = 3.3. Step 0: 1 + 0.5 (3.3 - 0.2) = 2.55. Step 3 is the
+    # last: 4 + 0.5 (10 - 2) = 8.
+    given = rollout([1, 2, 3, 4], [0, 0, 1, 0], [0, 0, 1, 0], [9, 9, 9, 10], [0.2, 0.4, 9, 2], [3, 3, 3, 3])
+    returns, ahead = MECHANISM.returns_of(given, 0.5)
+    np.testing.assert_allclose(returns, [2.55, 3.3, 3.0, 8.0])
+    np.testing.assert_array_equal(ahead, [np.inf, np.inf, np.inf, 1])
+    # Steps 0 to 2 are seen to their end: the critic's 3 is 0.45, -0.3 and 0 too high.
+    error = MECHANISM.critic_error(given, 0.5)
+    assert error == pytest.approx({"monte_carlo": 2.95, "critic_bias": 0.05, "critic_rms": np.sqrt(0.2925 / 3)})
+
+
+def test_a_time_limit_is_no_end():
+    given = rollout([1, 2], [0, 0], [1, 0], [6, 4], [2, 0], [0, 0])  # 1 + 0.5 (6 - 2) and 2 + 0.5·4
+    np.testing.assert_allclose(MECHANISM.returns_of(given, 0.5)[0], [3.0, 4.0])
+
+
+@pytest.mark.parametrize("estimator", ["closed_form", "sampled"])
+def test_the_parts_are_those_of_the_actor_s_gradient(estimator):
+    # KL(N(μ, s²) ‖ N(1, 2²)) has the slope (μ - 1)/4 = -0.25 in μ and s²/4 - 1 = -0.75 in log s, at μ = 0 and s = 1;
+    # the sampled log-ratio has them on average over the noise.
+    algorithm = CSAC(entropy_weight=0.2, relative_entropy_weight=0.5, relative_entropy_estimator=estimator, **LINEAR)
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(actor=POLICY, critics=CRITICS)
+    noises = jax.random.normal(jax.random.key(0), (4, 20_000, 1))
+    q, entropy, relative_entropy = MECHANISM.parts_of_the_gradient(
+        algorithm, state, REFERENCE, jnp.ones((4, 20_000, 1)), noises
+    )
+    order = [0.5 * -0.25, 0.5 * -0.75]  # of the bias; the weights' gradient is the same, as the observation is 1
+    np.testing.assert_allclose(relative_entropy.mean(axis=0), order * 2, atol=0.01)
+    # At s = 1 Q₁ = 1 + 2a is the smaller one where a < 2/3, and Q₂ = 3 - a above; da/dμ = 1 - a² and
+    # dlog π/dlog s = -1 + 2ua.
+    u = np.asarray(noises, np.float64)
+    slopes = np.where(np.tanh(u) < 2 / 3, -2.0, 1.0) * (1 - np.tanh(u) ** 2)
+    assert float(q.mean(axis=0)[2]) == pytest.approx(np.mean(slopes), abs=1e-3)
+    assert float(entropy.mean(axis=0)[3]) == pytest.approx(0.2 * np.mean(-1 + 2 * u * np.tanh(u)), abs=1e-3)
