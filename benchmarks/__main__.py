@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING
 
 from benchmarks.parts import Options, Part, shown
-from benchmarks.suites import checkpoint, gpu, growth, limit, peers
+from benchmarks.suites import checkpoint, gpu, growth, latency, limit, peers
 from benchmarks.suites import time as times
 from csac.processes import usable_cores
 from csac.types import InputError
@@ -22,6 +22,7 @@ SUITES = {
     "growth": growth,
     "time": times,
     "checkpoint": checkpoint,
+    "latency": latency,
     "gpu": gpu,
 }
 PARTS: list[Part] = [part for suite in SUITES.values() for part in suite.PARTS]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from csac.arguments import HelpShown, json_object, nearest, options_in, parse
-from csac.commands import Chosen, Evaluate, Export, Play, Report, Resume, Runs, Tune
+from csac.commands import Chosen, Evaluate, Export, Latency, Play, Report, Resume, Runs, Tune
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ Train controllers for continuous-control tasks with Conservative Soft Actor-Crit
   csac evaluate DIR    test the policies of a run on fresh episodes
   csac play DIR        watch the policy of a run, or write a video of it
   csac export DIR      take a policy out of a run: NumPy, ONNX or C, verified
+  csac latency PATH    measure how long an exported policy takes for an action
   csac runs [DIR]      list the runs below a directory
   csac report DIR...   put runs side by side: a page of curves, tables and commands
   csac study COMMAND   run the paper's experiments, or your own
@@ -85,6 +86,7 @@ def _dispatch(arguments: list[str]) -> int:
         "evaluate": _evaluate,
         "play": _play,
         "export": _export,
+        "latency": _latency,
         "runs": _runs,
         "report": _report,
         "study": _study,
@@ -268,6 +270,30 @@ def _export(arguments: list[str]) -> int:
         return _complain(error, 1)
     if (sizes := size_table(exported)) is not None:
         console.print(sizes)
+    return 0
+
+
+def _latency(arguments: list[str]) -> int:
+    options = parse(Latency, arguments, "csac latency")
+    if not options.artefacts:
+        raise InputError("give the folder of an artefact (csac export writes one)")
+    from csac.console.latencies import latency_table
+    from csac.console.tables import make_console
+    from csac.evaluation.latency import measure
+    from csac.record.csv_tables import check_new
+
+    console, measured = make_console(), {}
+    if options.plot:
+        check_new(options.plot, "picture", ".png")
+    for path in options.artefacts:
+        console.print(f"measuring {path}", soft_wrap=True)  # once: what moves on a terminal takes time from a core
+        measured[str(path)] = measure(path, options.calls, options.rate, options.seconds)
+    console.print(latency_table(measured))
+    if options.plot:
+        from csac.record.jitter import Calls, jitter  # matplotlib is slow to import
+
+        jitter([Calls(name, *latency) for name, several in measured.items() for latency in several], options.plot)
+        console.print(str(options.plot), soft_wrap=True)
     return 0
 
 

@@ -240,6 +240,25 @@ class Export:
 
 
 @dataclass(frozen=True)
+class Latency:
+    """Measure how long artefacts take for one action, flat out and at a fixed rate, call by call.
+
+    An artefact in C is timed inside of a compiled program, the others around their call in Python.
+    """
+
+    artefacts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ARTEFACT")]
+    """Folders that csac export has written."""
+    calls: int = 100_000
+    """Calls one after the other."""
+    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: the task's, or 100)")] = None
+    """Calls a second, when they are made at a rate."""
+    seconds: float = 10.0
+    """How long they are made at the rate; 0 leaves that out."""
+    plot: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="(default: none)")] = None
+    """Draw how many calls take how long, and how late they begin."""
+
+
+@dataclass(frozen=True)
 class Runs:
     """List the runs below a directory."""
 

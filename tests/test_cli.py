@@ -108,7 +108,7 @@ def make_run(path, task, observation_size, low, high, seeds=(0, 1)):
     for seed in seeds:
         weight = generator.normal(size=(observation_size, 2 * len(low))).astype(np.float32)
         network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * len(low), np.float32)),),)))
-        Policy(network, contract).save(path / "policy" / f"seed_{seed}.safetensors")
+        Policy(network, contract).save_layers(path / "policy" / f"seed_{seed}.safetensors")
         rows = {"seed": seed, "step": 100, "episode": 0, "return": float(seed), "length": 5, "success": None}
         run.append("evaluations", [rows])
     run.update_manifest(state="finished")

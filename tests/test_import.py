@@ -46,7 +46,7 @@ def tiny_run(tmp_path):
     agreement = contract()
     (run.path / "policy").mkdir()
     agreement.save(run.path / "policy" / "contract.json")
-    random_policy(agreement).save(run.path / "policy" / "seed_0.safetensors")
+    random_policy(agreement).save_layers(run.path / "policy" / "seed_0.safetensors")
     return tmp_path
 
 

@@ -1,25 +1,23 @@
-"""Which of a run's policies to load: one seed's, or that of the seed with the best last evaluations."""
+"""Which policy to load: of a run one seed's, or that of the seed with the best last evaluations; or a saved one."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, get_args
+from pathlib import Path
+from typing import get_args
 
-from csac.deploy.contract import Contract
-from csac.deploy.policy import Policy
-from csac.record.run import RunDirectory, Which
+from csac.deploy.contract import Contract, read_json
+from csac.deploy.policy import CONTRACT, SAVED, Policy
+from csac.record.run import RunDirectory, Which, is_run
 from csac.record.statistics import last_evaluations
 from csac.types import InputError
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 def load(directory: str | Path, seed: int | None = None, which: Which = "last") -> Policy:
-    """Return a policy of a run.
+    """Return a policy of a run, or one that was saved by itself (`Policy.save`).
 
     Args:
-        directory: the run directory.
+        directory: the run directory, or the folder of the saved policy, which has neither seeds nor a choice of them.
         seed: the seed's label; by default the seed with the best mean return over its last three evaluation points,
             among those that did not fail. That choice favours a lucky seed: report the policy on fresh evaluation
             seeds.
@@ -33,8 +31,21 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
     """
     if which not in get_args(Which):
         raise InputError(f"which={which!r}: choose 'last' or 'best'")
+    folder = Path(directory)
+    if not is_run(folder) and (folder / SAVED).exists():
+        return _saved(folder, seed, which)
     run = RunDirectory.open(directory)
     return Policy.load(run.policy(choose_seed(run, seed), which), Contract.load(run.contract))
+
+
+def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
+    """Return the policy that was saved by itself, or has left as an artefact without guards."""
+    if seed is not None or which != "last":
+        raise InputError(f"{folder} holds one policy and no run: leave out seed and which")
+    fields = read_json(folder / CONTRACT)
+    if fields.get("guards") and any(value not in (None, 0) for value in fields["guards"].values()):
+        raise InputError(f"{folder} is an artefact with guards: csac.deploy.artefact.open_artefact keeps them")
+    return Policy.load(folder / SAVED, Contract.of_fields(fields, folder / CONTRACT))
 
 
 def choose_seed(run: RunDirectory, seed: int | None = None) -> int:

@@ -13,6 +13,7 @@ from csac.deploy.parameters import check_network, copied, from_tensors, to_tenso
 from csac.record.atomic import write_atomically
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork
 
+CONTRACT, SAVED = "contract.json", "policy.safetensors"  # in the folder of a policy that was saved by itself
 LOG_STD_RANGE = (-20.0, 2.0)
 
 _STREAM = 0x706F6C69  # far from what a task that spawns generators of its own would use: 0, 1, 2, ...
@@ -106,8 +107,25 @@ class Policy:
             return np.clip(action, -1.0, 1.0, out=action)
         return np.tanh(action, out=action)
 
-    def save(self, path: str | Path) -> None:
-        """Write the layers as safetensors, whole or not at all."""
+    def save(self, directory: str | Path) -> None:
+        """Write the policy and its contract into a folder, made where it is not there; `csac.load` reads it.
+
+        Raises:
+            InputError: the folder holds a run or an artefact, or cannot be written.
+        """
+        folder = Path(directory)
+        strangers = {"manifest.json", "policy.py", "policy.onnx", "policy.h"}
+        if folder.is_dir() and strangers & {path.name for path in folder.iterdir()}:
+            raise InputError(f"{folder} holds a run or an artefact: choose another folder for the policy")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self.contract.save(folder / CONTRACT)
+            self.save_layers(folder / SAVED)
+        except OSError as error:
+            raise InputError(f"{folder} cannot be written: {error.strerror}") from error
+
+    def save_layers(self, path: str | Path) -> None:
+        """Write the layers alone as safetensors, whole or not at all; a contract belongs to them."""
         write_atomically(Path(path), tensors.encode(to_tensors(self.network.parameters)))
 
     @staticmethod

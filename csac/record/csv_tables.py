@@ -54,10 +54,10 @@ def _header(path: Path, line: bytes) -> list[str]:
         raise InputError(f"{path} is not a table of a run: its first line is no header; restore it") from None
 
 
-def check_new(path: Path) -> None:
+def check_new(path: Path, what: str = "table", suffix: str = ".csv") -> None:
     """Raise InputError where there is a file already or none can be, before anything has been computed for it."""
-    if path.suffix.lower() != ".csv":
-        raise InputError(f"the table is a .csv file: name it {path.with_suffix('.csv')}")
+    if path.suffix.lower() != suffix:
+        raise InputError(f"the {what} is a {suffix} file: name it {path.with_suffix(suffix)}")
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
     folder = path.parent

@@ -141,7 +141,7 @@ class Recorder:
         for seed, value in mean_returns(message.rows).items():
             if value > self._best.get(seed, -np.inf):
                 self._best[seed] = value
-                message.policies[seed].save(self.run.policy(seed, "best"))
+                message.policies[seed].save_layers(self.run.policy(seed, "best"))
 
     def _commit_when_whole(self, group: int, message: Saved) -> None:
         """Keep a group's best policies with its files; with the last living group's files there is a checkpoint."""
@@ -246,7 +246,7 @@ class Recorder:
             if not self.run.contract.exists():
                 self.run.contract.parent.mkdir(exist_ok=True)
                 policy.contract.save(self.run.contract)
-            policy.save(self.run.policy(seed))
+            policy.save_layers(self.run.policy(seed))
 
     def _flush(self, until: int = OVER) -> None:
         """Write the rows that no group can precede any more, as far as step `until`."""

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from policies import contract, random_policy
 
+from csac.deploy.artefact_contract import ArtefactContract
 from csac.deploy.choosing import load
+from csac.deploy.guards import NO_GUARDS, make_guards
 from csac.deploy.policy import Policy
+from csac.deploy.writing import write_artefact
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.types import InputError
@@ -25,8 +28,8 @@ def save_run(
     agreement.save(run.contract)
     policies = {seed: random_policy(agreement, seed) for seed in seeds}
     for seed, policy in policies.items():
-        policy.save(run.policy(seed))
-        random_policy(agreement, seed + 100).save(run.policy(seed, "best"))
+        policy.save_layers(run.policy(seed))
+        random_policy(agreement, seed + 100).save_layers(run.policy(seed, "best"))
     if evaluations:
         (directory / "evaluations.csv").write_text("seed,step,episode,return,length,success\n" + evaluations)
     return policies
@@ -116,3 +119,39 @@ def test_where_every_seed_failed_none_is_chosen(tmp_path):
     with pytest.raises(InputError, match=r"every seed of .* failed \(seed 0 at step 0: reward is nan\): train again"):
         load(tmp_path)
     assert same(load(tmp_path, seed=1), policies[1])
+
+
+def test_a_policy_is_saved_and_loaded_in_one_call_each(tmp_path):
+    policy = random_policy(contract(), 7)
+    policy.save(tmp_path / "kept" / "cheetah")
+    files = sorted(path.name for path in (tmp_path / "kept" / "cheetah").iterdir())
+    assert files == ["contract.json", "policy.safetensors"]
+    again = load(tmp_path / "kept" / "cheetah")
+    assert same(again, policy)
+    assert again.contract.fields() == policy.contract.fields()
+    random_policy(contract(), 8).save(tmp_path / "kept" / "cheetah")
+    assert same(load(str(tmp_path / "kept" / "cheetah")), random_policy(contract(), 8))
+
+
+def test_a_saved_policy_has_no_seeds_and_replaces_no_run(tmp_path):
+    policies = save_run(tmp_path / "run")
+    policies[0].save(tmp_path / "kept")
+    with pytest.raises(InputError, match="holds one policy and no run: leave out seed and which"):
+        load(tmp_path / "kept", seed=0)
+    with pytest.raises(InputError, match="holds one policy and no run: leave out seed and which"):
+        load(tmp_path / "kept", which="best")
+    with pytest.raises(InputError, match="holds a run or an artefact: choose another folder"):
+        policies[0].save(tmp_path / "run")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        policies[0].save(tmp_path / "file")
+
+
+def test_an_artefact_without_guards_is_loaded_and_one_with_guards_is_not(tmp_path):
+    policy = random_policy(contract(), 3)
+    for name, guards in (("bare", NO_GUARDS), ("guarded", make_guards(policy.contract, fallback="zero"))):
+        (tmp_path / name).mkdir()
+        write_artefact(tmp_path / name, policy.network, ArtefactContract(policy.contract, "numpy", guards=guards))
+    assert same(load(tmp_path / "bare"), policy)
+    with pytest.raises(InputError, match="is an artefact with guards"):
+        load(tmp_path / "guarded")

@@ -236,7 +236,7 @@ def test_of_two_actors_each_row_gets_the_action_valued_more():
 @pytest.mark.parametrize("make", [clipped_gaussian, two_actors])
 def test_every_kind_of_policy_is_the_same_after_saving_and_loading(tmp_path, make):
     policy = make()
-    policy.save(tmp_path / "policy")
+    policy.save_layers(tmp_path / "policy")
     policy.contract.save(tmp_path / "contract.json")
     again = Policy.load(tmp_path / "policy", Contract.load(tmp_path / "contract.json"))
     observations = np.random.default_rng(2).normal(size=(7, 2)).astype(np.float32)
@@ -249,7 +249,7 @@ def test_every_kind_of_policy_is_the_same_after_saving_and_loading(tmp_path, mak
 
 def test_a_policy_is_the_same_after_saving_and_loading(tmp_path):
     policy = random_policy(contract(DICT_PARTS, (2, 3), low=-2.0, high=0.5))
-    policy.save(tmp_path / "policy.safetensors")
+    policy.save_layers(tmp_path / "policy.safetensors")
     policy.contract.save(tmp_path / "contract.json")
     again = Policy.load(tmp_path / "policy.safetensors", Contract.load(tmp_path / "contract.json"))
     observations = np.random.default_rng(2).normal(size=(7, 5))
@@ -260,14 +260,14 @@ def test_a_policy_is_the_same_after_saving_and_loading(tmp_path):
 
 def test_equal_policies_are_equal_files(tmp_path):
     for name in ("a", "b"):
-        random_policy(contract()).save(tmp_path / name)
+        random_policy(contract()).save_layers(tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 @pytest.mark.parametrize("damage", [lambda whole: whole[:-4], lambda whole: whole[:5], lambda whole: b"x" * 100])
 def test_a_damaged_policy_is_refused(tmp_path, damage):
     path = tmp_path / "seed_0.safetensors"
-    random_policy(contract()).save(path)
+    random_policy(contract()).save_layers(path)
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(InputError, match=r"seed_0\.safetensors is damaged"):
         Policy.load(path, contract())
@@ -276,13 +276,13 @@ def test_a_damaged_policy_is_refused(tmp_path, damage):
 def test_a_policy_that_is_not_a_number_is_refused(tmp_path):
     network, agreement = random_network(Spec(2, 1)), contract()
     network.parameters.actors[0][1].bias[3] = np.nan
-    Policy(network, agreement).save(tmp_path / "policy")
+    Policy(network, agreement).save_layers(tmp_path / "policy")
     with pytest.raises(InputError, match="not finite float32"):
         Policy.load(tmp_path / "policy", agreement)
 
 
 def test_a_policy_of_another_task_is_refused(tmp_path):
-    random_policy(contract()).save(tmp_path / "policy")
+    random_policy(contract()).save_layers(tmp_path / "policy")
     with pytest.raises(InputError, match="after 3 inputs"):
         Policy.load(tmp_path / "policy", contract(((None, (3,)),)))
 
@@ -339,7 +339,7 @@ def test_a_policy_needs_numpy_and_nothing_else(tmp_path):
     policy = random_policy(contract(DICT_PARTS, (2,)))
     run = RunDirectory.create(tmp_path / "run", Manifest(task="Task-v0", algorithm="csac", seeds=(3,), steps=9))
     run.contract.parent.mkdir()
-    policy.save(run.policy(3))
+    policy.save_layers(run.policy(3))
     policy.contract.save(run.contract)
     code = f"""
 import sys
@@ -360,7 +360,7 @@ print(*action.tolist())
     assert done.returncode == 0, done.stderr
     expected, _ = policy.predict({"speed": 0.5, "position": [[0.3, 0.4]], "achieved": [0.1, 0.2]})
     np.testing.assert_array_equal(np.array(done.stdout.split(), np.float32), expected)
-    assert (tmp_path / "again").read_bytes() == run.policy(3).read_bytes()
+    assert (tmp_path / "again" / "policy.safetensors").read_bytes() == run.policy(3).read_bytes()
 
 
 @given(st.data())
@@ -369,7 +369,7 @@ def test_a_changed_file_is_a_policy_or_is_refused_in_one_line(data):
     policy = random_policy(contract(DICT_PARTS, (2,)))
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder, "policy"), Path(folder, "contract.json")]
-        policy.save(files[0])
+        policy.save_layers(files[0])
         policy.contract.save(files[1])
         file = data.draw(st.sampled_from(files))
         content = file.read_bytes()

@@ -54,7 +54,7 @@ def run_of(tmp_path):
         run = RunDirectory.create(tmp_path / "run", Manifest(task=task, algorithm="csac", seeds=(0,), steps=9))
         run.contract.parent.mkdir()
         contract().save(run.contract)
-        random_policy(contract()).save(run.policy(0))
+        random_policy(contract()).save_layers(run.policy(0))
         return run
 
     return make

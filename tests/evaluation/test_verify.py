@@ -76,7 +76,7 @@ def make_run(path: Path, algorithm: str = "csac", task: str = "Follow-v0") -> Ru
     policy.contract.save(run.contract)
     for seed in (0, 1):
         for which in ("last", "best"):
-            policy.save(run.policy(seed, which))
+            policy.save_layers(run.policy(seed, which))
     rows = [
         {"seed": seed, "step": step, "episode": episode, "return": value + episode, "length": 20, "success": None}
         for step, values in ((100, (6.0, 5.0)), (200, (1.0, 3.0)))

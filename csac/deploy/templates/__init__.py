@@ -1,4 +1,4 @@
-"""What artefacts are made of: the C header, the model card, and the loader that leaves as it is."""
+"""What artefacts are made of: the C header, the model card, the loader that leaves as it is, what times a header."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from jinja2 import Template
 
 LOADER = Path(__file__).parent / "policy.py"
+LATENCY = Path(__file__).parent / "latency.c"
 
 
 def template(name: str) -> Template:

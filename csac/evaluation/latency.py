@@ -1,0 +1,161 @@
+"""How long an artefact takes for one action: flat out, and at the rate of a controller, call by call."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+
+from csac.deploy.artefact import C_STANDARD, compile_c, open_artefact
+from csac.deploy.templates import LATENCY
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from csac.deploy.artefact import Artefact
+
+NANOSECONDS = 10**9
+USUAL_RATE = 100.0  # Hz, where neither the contract nor anybody says one
+OBSERVATIONS = 1024  # that are gone through in turn
+WARM_UP = 1_000  # calls that nobody counts
+SECONDS_OF_A_PART = 0.25  # of a measurement at a rate: between two parts a Ctrl-C is heard
+
+
+class Latency(NamedTuple):
+    """What was measured of single calls, in nanoseconds."""
+
+    durations: np.ndarray
+    """From right before a call to right after it, int64 [calls]."""
+    lateness: np.ndarray | None = None
+    """How long after it was due a call began, int64 [calls]; None where calls followed each other at once."""
+    rate: float | None = None
+    """Calls a second that were due."""
+
+
+class Measure(Protocol):
+    """Makes calls: so many, `period` nanoseconds apart (0: at once)."""
+
+    def __call__(self, calls: int, period: int, durations: np.ndarray, lateness: np.ndarray) -> None:
+        """Write the nanoseconds of each call, and how late it began, int64 [calls]."""
+        ...
+
+
+def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, seconds: float = 10.0) -> list[Latency]:
+    """Return what an artefact takes flat out, and then at a rate.
+
+    An artefact in C is timed inside of a compiled program, one in Python around `act`, with the garbage collector off.
+    Observations are random, between the task's bounds where they are known, and standard normal else: what a network
+    costs does not depend on them, but for denormal numbers and the saturation of `tanh`.
+
+    Args:
+        path: the artefact's folder.
+        calls: how many follow each other flat out, at least 1.
+        rate: Hz; by default the control rate of the task, or 100 where it is not known.
+        seconds: how long calls are made at the rate; 0 leaves that out.
+
+    Raises:
+        InputError: no artefact there, nothing here to run it with, or arguments out of their range.
+    """
+    if calls < 1:
+        raise InputError(f"calls must be at least 1, not {calls}")
+    if rate is not None and not 0 < rate <= NANOSECONDS:
+        raise InputError(f"the rate must be more than 0 Hz and at most 1e9, not {rate:g}")
+    if not 0 <= seconds < float("inf"):
+        raise InputError(f"seconds must be 0 or more, not {seconds:g}")
+    artefact = open_artefact(path)
+    rate = rate or artefact.contract.control_rate or USUAL_RATE
+    make_calls = (
+        _measure_c(artefact) if artefact.format == "c" else measure_python(artefact.act, _observations(artefact))
+    )
+    _in_parts(make_calls, WARM_UP, WARM_UP, 0)
+    durations, _ = _in_parts(make_calls, calls, WARM_UP, 0)
+    several = [Latency(durations)]
+    if seconds:
+        part, period = max(1, round(rate * SECONDS_OF_A_PART)), round(NANOSECONDS / rate)
+        several.append(Latency(*_in_parts(make_calls, max(1, round(rate * seconds)), part, period), rate))
+    return several
+
+
+def measure_python(act: Callable[[np.ndarray], object], observations: np.ndarray) -> Measure:
+    """Return what makes calls of a function of Python, on observations [n, observation] in turn."""
+    several = list(observations)
+
+    def make_calls(calls: int, period: int, durations: np.ndarray, lateness: np.ndarray) -> None:
+        clock, count = time.perf_counter_ns, len(several)
+        due, is_collecting = clock(), gc.isenabled()
+        gc.disable()
+        try:
+            for call in range(calls):
+                due += period
+                if period and (wait := due - clock()) > 0:
+                    time.sleep(wait / NANOSECONDS)
+                began = clock()
+                act(several[call % count])
+                durations[call] = clock() - began
+                lateness[call] = began - due if period else 0
+        finally:
+            if is_collecting:
+                gc.enable()
+
+    return make_calls
+
+
+def _in_parts(make_calls: Measure, calls: int, part: int, period: int) -> tuple[np.ndarray, np.ndarray]:
+    durations, lateness = np.zeros((2, calls), np.int64)
+    for begin in range(0, calls, part):
+        some = slice(begin, begin + part)
+        make_calls(len(durations[some]), period, durations[some], lateness[some])
+    return durations, lateness
+
+
+def _measure_c(artefact: Artefact) -> Measure:
+    """Return what makes calls inside of a compiled program, so that none of Python's time is in them."""
+    with tempfile.TemporaryDirectory(prefix="csac-") as name:
+        library = Path(name, "latency.so")
+        compile_c(
+            *C_STANDARD,
+            "-I",
+            artefact.folder,
+            "-fPIC",
+            "-shared",
+            "-O3",
+            "-march=native",
+            LATENCY,
+            "-o",
+            library,
+            "-lm",
+        )
+        function = ctypes.CDLL(str(library)).latency_measure  # stays in memory without its file
+    function.restype = None
+    observations = _observations(artefact)
+
+    def make_calls(calls: int, period: int, durations: np.ndarray, lateness: np.ndarray) -> None:
+        function(
+            ctypes.c_void_p(observations.ctypes.data),
+            ctypes.c_int64(len(observations)),
+            ctypes.c_int64(calls),
+            ctypes.c_int64(period),
+            ctypes.c_void_p(durations.ctypes.data),
+            ctypes.c_void_p(lateness.ctypes.data),
+        )
+
+    return make_calls
+
+
+def _observations(artefact: Artefact) -> np.ndarray:
+    """Return random observations, float32 [n, observation]: the same for artefacts of one policy."""
+    contract, generator = artefact.contract, np.random.default_rng(0)
+    shape = (OBSERVATIONS, contract.policy.spec.observation_size)
+    normal, uniform = generator.standard_normal(shape), generator.random(shape)
+    if contract.observation_low is None or contract.observation_high is None:
+        return normal.astype(np.float32)
+    low, high = contract.observation_low, contract.observation_high
+    bounded = np.isfinite(low) & np.isfinite(high) & (np.abs(low) < 1e6) & (np.abs(high) < 1e6)
+    between = np.where(bounded, low, 0.0) + uniform * (np.where(bounded, high, 1.0) - np.where(bounded, low, 0.0))
+    return np.ascontiguousarray(np.where(bounded, between, normal), np.float32)

@@ -1,0 +1,68 @@
+/* A control loop in C: read the sensors, ask the policy, drive the actuators, at a fixed rate.
+ *
+ *     csac export runs/pendulum --format c --fallback zero
+ *     cc -std=c99 -O2 -I runs/pendulum/export/c examples/deploy/control_loop.c -o control_loop -lm
+ *     ./control_loop < observations.txt > actions.txt
+ *
+ * Sensors and actuators are standard input and output here, a line for each step. On a robot, write these two functions
+ * anew: the rest stays.
+ */
+#define _POSIX_C_SOURCE 200112L
+#include <stdbool.h>
+#include <stdio.h>
+#include <time.h>
+
+#include "policy.h"
+
+#ifndef CSAC_CONTROL_RATE_HZ
+#define CSAC_CONTROL_RATE_HZ 100.0f /* where the task does not say: as often as the policy was trained to act */
+#endif
+
+static bool read_sensors(float observation[CSAC_OBSERVATIONS])
+{
+    for (int i = 0; i < CSAC_OBSERVATIONS; i++)
+        if (scanf("%f", &observation[i]) != 1) /* "nan" is a number here: a sensor that fails, for the guard */
+            return false;
+    return true;
+}
+
+static void drive_actuators(const float action[CSAC_ACTIONS])
+{
+    for (int i = 0; i < CSAC_ACTIONS; i++)
+        printf("%.9g%c", (double)action[i], i + 1 < CSAC_ACTIONS ? ' ' : '\n');
+    fflush(stdout);
+}
+
+static struct timespec later(struct timespec time, long nanoseconds)
+{
+    time.tv_nsec += nanoseconds;
+    time.tv_sec += time.tv_nsec / 1000000000;
+    time.tv_nsec %= 1000000000;
+    return time;
+}
+
+int main(void)
+{
+    static csac_state state = CSAC_INITIAL; /* what the guards remember; csac_reset(&state) where an episode begins */
+    float observation[CSAC_OBSERVATIONS], action[CSAC_ACTIONS];
+    const long period = (long)(1e9f / CSAC_CONTROL_RATE_HZ);
+    long steps = 0, missed = 0;
+    struct timespec due, now;
+
+    clock_gettime(CLOCK_MONOTONIC, &due);
+    while (read_sensors(observation)) {
+        csac_step(&state, observation, action);
+        drive_actuators(action);
+        steps++;
+
+        due = later(due, period);
+        clock_gettime(CLOCK_MONOTONIC, &now);
+        if (now.tv_sec > due.tv_sec || (now.tv_sec == due.tv_sec && now.tv_nsec > due.tv_nsec)) {
+            missed++;
+            due = now; /* go on from here: steps that are late are not made up for by steps that are early */
+        } else
+            clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
+    }
+    fprintf(stderr, "%ld steps at %g Hz, %ld of them too late\n", steps, (double)CSAC_CONTROL_RATE_HZ, missed);
+    return 0;
+}
