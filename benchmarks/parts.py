@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from benchmarks.measuring import ROOT, Window, machine
-from benchmarks.tables import Row, between_markers, formatted, read_rows, write_rows
+from benchmarks.tables import Row, formatted, read_rows, write_rows
+from csac.record.rendering import between_markers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""From measurements to files: rows in CSV, tables in Markdown, and the places in pages where they stand.
+"""From measurements to files: rows in CSV, and tables in Markdown.
 
 A row is a dictionary from column to number or text; all rows of a table have the same columns.
 """
@@ -63,17 +63,3 @@ def with_range(values: Sequence[float], form: str, unit: str = "") -> str:
     """Return the median, and in brackets the smallest and the largest where there are several."""
     median = f"{statistics.median(values):{form}}{unit}"
     return f"{median} ({min(values):{form}} to {max(values):{form}})" if len(values) > 1 else median
-
-
-def between_markers(page: str, name: str, text: str) -> str:
-    """Return the page with `text` between its markers `name`.
-
-    Raises:
-        ValueError: it lacks them.
-    """
-    start, stop = (f"<!-- {name}: {end} -->" for end in ("begin", "end"))
-    head, begin, rest = page.partition(start)
-    _, end, tail = rest.partition(stop)
-    if not (begin and end):
-        raise ValueError(f"the page lacks the lines {start} and {stop}, between which the table goes")
-    return f"{head}{start}\n{text}{stop}{tail}"

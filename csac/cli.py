@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from csac.arguments import HelpShown, json_object, nearest, options_in, parse
-from csac.commands import Chosen, Evaluate, Export, Latency, Play, Resume, Runs, Tune
+from csac.commands import Chosen, Evaluate, Export, Latency, Play, Report, Resume, Runs, Tune
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ Train controllers for continuous-control tasks with Conservative Soft Actor-Crit
   csac export DIR      take a policy out of a run: NumPy, ONNX or C, verified
   csac latency PATH    measure how long an exported policy takes for an action
   csac runs [DIR]      list the runs below a directory
+  csac report DIR...   put runs side by side: a page of curves, tables and commands
   csac study COMMAND   run the paper's experiments, or your own
   csac tune TASK       search for good hyperparameters
 
@@ -87,6 +88,7 @@ def _dispatch(arguments: list[str]) -> int:
         "export": _export,
         "latency": _latency,
         "runs": _runs,
+        "report": _report,
         "study": _study,
         "tune": _tune,
     }
@@ -306,6 +308,27 @@ def _runs(arguments: list[str]) -> int:
         print_runs(make_console(), runs)
     else:
         _say(f"no runs in {options.directory} yet; csac train HalfCheetah-v4 starts one")
+    return 0
+
+
+def _report(arguments: list[str]) -> int:
+    options = parse(Report, arguments, "csac report")
+    from csac.studies import run_report as reports  # matplotlib is slow to import
+
+    runs = reports.read_runs(options.runs, options.labels())
+    comparison = reports.Comparison(runs, options.perturb, options.until)
+    if options.into:
+        page, name = options.place()
+        reports.write_table(comparison, page, name, options.table)
+        _say(str(page))
+    if options.curve:
+        reports.draw_curves(comparison, options.curve, options.title)
+        _say(str(options.curve))
+    if options.out or not (options.into or options.curve):
+        path = options.out or reports.default_page()
+        command = shlex.join(["csac", "report", *arguments])
+        reports.write_run_report(comparison, path, options.title, [command])
+        _say(f"{path}\n{path.with_suffix('.md')}")
     return 0
 
 

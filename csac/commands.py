@@ -266,6 +266,50 @@ class Runs:
     """Where to look."""
 
 
+@dataclass(frozen=True)
+class Report:
+    """Put runs side by side: curves, returns, intervals, what perturbations cost, cases, hyperparameters, commands.
+
+    Runs that differ in their seeds alone are one arm. A file of rows, as evaluations.csv has them, counts as a run.
+    """
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="(or --label)")] = ()
+    """Run directories, or directories that hold some."""
+    label: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=DIR,...")] = ()
+    """More runs, which together are an arm of this name."""
+    perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE@STEP")] = ()
+    """What changed in these runs, where files of rows do not tell it."""
+    until: Annotated[int | None, arg(help_behavior_hint="(default: the end)")] = None
+    """Leave out evaluations after this step."""
+    title: Annotated[str | None, arg(help_behavior_hint="(default: the task)")] = None
+    """Of the report, or of the picture."""
+    out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="(default: runs/reports/DATE-TIME/)")] = (
+        None
+    )
+    """Where the report goes; the same in Markdown and its figures go beside it."""
+    into: Annotated[str | None, arg(metavar="FILE.md#NAME", help_behavior_hint="(default: none)")] = None
+    """In place of a report, write one table into a page, between <!-- NAME: begin --> and <!-- NAME: end -->."""
+    table: Literal["returns", "recovery", "cases"] = "returns"
+    """The table for --into."""
+    curve: Annotated[Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")] = None
+    """In place of a report, draw the learning curves there."""
+
+    def labels(self) -> list[tuple[str, list[Path]]]:
+        """Return the labels, each with its runs. Raises InputError for one that is not written NAME=DIR,..."""
+        pairs = [text.partition("=")[::2] for text in self.label]
+        for text, (name, paths) in zip(self.label, pairs, strict=True):
+            if not (name and all(paths.split(","))):
+                raise InputError(f"--label is written NAME=DIR,DIR, not {text!r}")
+        return [(name, [Path(path) for path in paths.split(",")]) for name, paths in pairs]
+
+    def place(self) -> tuple[Path, str]:
+        """Return the page and the name of its markers. Raises InputError where --into is not written FILE.md#NAME."""
+        page, _, name = (self.into or "").rpartition("#")
+        if not (page and name):
+            raise InputError(f"--into is written FILE.md#NAME, not {self.into!r}")
+        return Path(page), name
+
+
 class Chosen(NamedTuple):
     """What is known of a `csac train` before its options can be: they and their defaults depend on it."""
 

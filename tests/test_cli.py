@@ -209,7 +209,7 @@ def test_train_passes_its_options_on(train_call):
     call = train_call(
         "Hopper-v4 --steps 1e5 --seeds 3 --first-seed 7 --directory some/where --device gpu --groups 2 "
         "--evaluation-interval 1_000 --evaluation-episodes 4 --evaluation-processes 3 "
-        "--checkpoint-interval 5e3 --keep-checkpoints 0 --resume "
+        "--checkpoint-interval 5e3 --keep-checkpoints 0 --resume --wandb "
         "--warmup-steps 2e3 --actor-hidden-sizes 8 9 "
         "--perturb friction=1.5@5e4 --perturb=action-noise=0.1 "
         """--env-kwargs '{"ctrl_cost_weight": 0.5}'"""
@@ -234,6 +234,7 @@ def test_train_passes_its_options_on(train_call):
         "checkpoint_interval": 5000,
         "keep_checkpoints": 0,
         "resume": True,
+        "wandb": True,
     }
     assert call["start_from"] is None
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from csac.record.curve_measures import REGAINED, Recovery
 from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric, short
 from csac.record.statistics import FEWEST_FOR_BOOTSTRAP, FEWEST_FOR_INTERVAL
-from csac.record.summaries import OverSeeds, case_names, cases
+from csac.record.summaries import OverSeeds, case_names, cases, over_seeds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -125,15 +125,21 @@ def case_table(rows: np.ndarray) -> Table | None:
 
 
 def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | None:
-    """Return the case table of several runs, given as `(label, rows)`: a column for each, mean ± std over its seeds."""
+    """Return the case table of several runs, given as `(label, rows)`: a column for each, mean ± std over its seeds.
+
+    Above the cases stands the return of these episodes.
+    """
     names = case_names([rows for _, rows in runs])
+    if not names:
+        return None
     by_run = [{case.name: case for case in cases(rows, names)} for _, rows in runs]
     body = [
         Row((Cell(_case_name(name, happens)), *(_rate_over_seeds(found.get(name)) for found in by_run)))
         for name, happens in names.items()
     ]
     headings = (_rollouts([rows for _, rows in runs]), *(label for label, _ in runs))
-    return Table(headings, tuple(body)) if body else None
+    returns = Row((Cell("return (mean)"), *(_mean_return(rows) for _, rows in runs)))
+    return Table(headings, (returns, *body))
 
 
 def events_table(last: np.ndarray, names: dict[str, bool]) -> Table | None:
@@ -260,6 +266,12 @@ def _case_name(name: str, is_case: bool) -> str:
 
 def _rate(is_case: bool, value: float) -> Cell:
     return numeric(value, f"{ROLLOUTS * value:,.1f}" if is_case else f"{value:,.3f}")
+
+
+def _mean_return(rows: np.ndarray) -> Cell:
+    over = over_seeds(rows["return"][rows["seed"] == seed].mean() for seed in set(rows["seed"].tolist()))
+    mean, std = (numeric(value, f"{value:,.1f}").text for value in (over.mean, over.std))
+    return numeric(over.mean, f"{mean} ± {std}" if std else mean)
 
 
 def _rate_over_seeds(case: CaseSummary | None) -> Cell:

@@ -1,50 +1,58 @@
-"""The arms of a study: the cells of one method on one task under one condition, their seeds merged."""
+"""The arms of a comparison: the runs of one method on one task under one condition, their seeds merged."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 
+from csac.record.csv_tables import COLUMNS, structured
 from csac.record.statistics import evaluation_matrix, maximum_average_return
 from csac.record.summaries import over_seeds
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
+    from csac.record.manifest import Manifest
     from csac.record.summaries import OverSeeds
     from csac.studies.results import Record, Source
-    from csac.studies.study import Method, Study
+    from csac.studies.study import Study
 
 
 @dataclass
 class Arm:
-    """What the seeds of one method on one task under one condition have given. Failed seeds are in no table of rows."""
+    """Seeds that belong together: what one method has given on one task under one condition, without what failed."""
 
-    method: Method
+    label: str
     task: str
-    condition: tuple[str, ...]
-    records: list[Record] = field(default_factory=list)
+    condition: tuple[str, ...] = ()
+    """What the task was perturbed by."""
+    algorithm: str = ""
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    published: str | None = None
+    """The paper's column that stands beside it."""
+    manifests: list[Manifest] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    """How long each of its runs took, as far as that is known."""
+    evaluations: list[np.ndarray] = field(default_factory=list)
+    tests: list[np.ndarray] = field(default_factory=list)
+    """Rows of fresh episodes of finished policies."""
     failures: dict[int, str] = field(default_factory=dict)
     missing: list[int] = field(default_factory=list)
     """Seeds that are not over."""
 
     @property
-    def label(self) -> str:
-        """The method's."""
-        return self.method.label
-
-    @property
     def rows(self) -> np.ndarray:
         """The rows of evaluations.csv of every seed that did not fail."""
-        return _joined([record.evaluations for record in self.records])
+        return _joined(self.evaluations)
 
     @property
     def rollouts(self) -> np.ndarray:
         """The rows of the fresh episodes of every seed that did not fail."""
-        return _joined([record.rollouts for record in self.records if record.rollouts is not None])
+        return _joined(self.tests)
 
     def best(self) -> tuple[np.ndarray, int]:
         """Return each seed's return at the step of the maximum average return, and that step; none without one."""
@@ -65,14 +73,15 @@ def gather(study: Study, source: Source) -> list[Arm]:
     """Return every arm of a study with what its cells have given, task by task."""
     arms: dict[tuple[str, tuple[str, ...], str], Arm] = {}
     for method, condition, cell in study.entries():
-        arm = arms.setdefault((cell.task, condition, method.label), Arm(method, cell.task, condition))
+        made = Arm(method.label, cell.task, condition, method.algorithm, method.hyperparameters, method.published)
+        arm = arms.setdefault((cell.task, condition, method.label), made)
         record = source.record(cell)
         if record is None:
             arm.missing.append(cell.seed)
         elif record.failure:
             arm.failures[cell.seed] = record.failure
         else:
-            arm.records.append(record)
+            _add(arm, record)
     order = {task: index for index, task in enumerate(study.tasks)}
     return sorted(arms.values(), key=lambda arm: order[arm.task])
 
@@ -82,7 +91,30 @@ def with_rows(arms: Sequence[Arm]) -> list[Arm]:
     return [arm for arm in arms if len(arm.rows)]
 
 
+def by_condition(arms: Sequence[Arm]) -> dict[tuple[str, tuple[str, ...]], list[Arm]]:
+    """Return the arms of each task and condition."""
+    groups: dict[tuple[str, tuple[str, ...]], list[Arm]] = {}
+    for arm in arms:
+        groups.setdefault((arm.task, arm.condition), []).append(arm)
+    return groups
+
+
+def tasks_of(arms: Sequence[Arm]) -> dict[str, list[Arm]]:
+    """Return the arms of each task."""
+    return {task: [arm for arm in arms if arm.task == task] for task in dict.fromkeys(arm.task for arm in arms)}
+
+
+def _add(arm: Arm, record: Record) -> None:
+    arm.manifests.append(record.manifest)
+    arm.seconds += [record.seconds] * bool(record.seconds)
+    arm.evaluations.append(record.evaluations)
+    arm.tests += [] if record.rollouts is None else [record.rollouts]
+
+
 def _joined(tables: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the rows of all tables, with the columns that each of them has."""
     if not tables:
-        return np.zeros(0, [("seed", np.int64), ("step", np.int64), ("episode", np.int64), ("return", np.float64)])
-    return np.concatenate(tables)
+        return structured(COLUMNS["evaluations"], [])
+    columns = [table.dtype.names or () for table in tables]
+    names = [name for name in columns[0] if all(name in own for own in columns)]
+    return np.concatenate([repack_fields(table[names]) for table in tables])

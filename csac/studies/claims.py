@@ -15,7 +15,7 @@ from csac.record.statistics import (
 )
 from csac.record.summaries import cases
 from csac.studies import paper
-from csac.studies.arms import with_rows
+from csac.studies.arms import tasks_of, with_rows
 from csac.tasks.perturbations import by_step, perturbations_of
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def comparisons(name: str, analyses: Sequence[str], arms: Sequence[Arm]) -> list
 
 def lower_boundary(arms: Sequence[Arm]) -> float:
     """Return the lowest maximum average return of the arms that the paper has too; NaN where there is none."""
-    maxima = [arm.maximum().mean for arm in with_rows(arms) if arm.method.published]
+    maxima = [arm.maximum().mean for arm in with_rows(arms) if arm.published]
     return min(maxima, default=np.nan)
 
 
@@ -89,19 +89,14 @@ def interactions(arm: Arm, threshold: float) -> np.ndarray:
     return np.array([steps_to_reach(steps, line, threshold) for line in returns])
 
 
-def tasks_of(arms: Sequence[Arm]) -> dict[str, list[Arm]]:
-    """Return the arms of each task."""
-    return {task: [arm for arm in arms if arm.task == task] for task in dict.fromkeys(arm.task for arm in arms)}
-
-
 def _returns(arms: Sequence[Arm]) -> Iterator[Comparison]:
     for task, own in tasks_of(arms).items():
-        if any(arm.method.published and arm.method.published.startswith("tau") for arm in own):
+        if any(arm.published and arm.published.startswith("tau") for arm in own):
             yield from _weights(own)
             continue
         published = paper.RETURNS.get(task, {})
         for arm, other in _pairs(own):
-            name = other.method.published or ""
+            name = other.published or ""
             if name in published and published["CSAC"].mean > published[name].mean:
                 claim = f"{task}: {arm.label} has a higher maximum average return than {name}"
                 yield Comparison(claim, arm.best()[0], other.best()[0])
@@ -109,7 +104,7 @@ def _returns(arms: Sequence[Arm]) -> Iterator[Comparison]:
 
 def _weights(arms: Sequence[Arm]) -> Iterator[Comparison]:
     """The weight that the paper finds best against each other weight, within each variant."""
-    values = [(arm, arm.method.hyperparameters["relative_entropy_weight"]) for arm in arms]
+    values = [(arm, arm.hyperparameters["relative_entropy_weight"]) for arm in arms]
     for best in (arm for arm, value in values if value == paper.BEST_TAU):
         variant = best.label.partition(", ")[0]
         for other, value in values:
@@ -122,7 +117,7 @@ def _efficiency(arms: Sequence[Arm]) -> Iterator[Comparison]:
     for task, own in tasks_of(arms).items():
         published, threshold = paper.INTERACTIONS.get(task, {}), lower_boundary(own)
         for arm, other in _pairs(own):
-            name = other.method.published or ""
+            name = other.published or ""
             if name in published and published["CSAC"] < published[name]:
                 claim = f"{task}: {arm.label} needs fewer interactions than {name} to reach the lower boundary"
                 yield Comparison(claim, *(_sooner(one, threshold) for one in (arm, other)))
@@ -157,11 +152,11 @@ def _recoveries(arm: Arm) -> list:
 
 def _cases(arms: Sequence[Arm]) -> Iterator[Comparison]:
     for arm, other in _pairs(arms):
-        if other.method.published is None:
+        if other.published is None:
             continue
         for name, published in paper.CASES.items():
             fewer = name != "env_complete"
-            ours, theirs = published["CSAC"].mean, published[other.method.published].mean
+            ours, theirs = published["CSAC"].mean, published[other.published].mean
             if (ours < theirs) == fewer:
                 words = f"{'fewer' if fewer else 'more'} rollouts with {name}"
                 samples = (-_shares(each, name) if fewer else _shares(each, name) for each in (arm, other))
@@ -176,8 +171,8 @@ def _shares(arm: Arm, name: str) -> np.ndarray:
 
 def _pairs(arms: Sequence[Arm]) -> Iterator[tuple[Arm, Arm]]:
     """Each variant of CSAC beside each other method."""
-    for arm in (arm for arm in arms if arm.method.algorithm == "csac"):
-        for other in (other for other in arms if other.method.algorithm != "csac"):
+    for arm in (arm for arm in arms if arm.algorithm == "csac"):
+        for other in (other for other in arms if other.algorithm != "csac"):
             yield arm, other
 
 

@@ -148,7 +148,7 @@ class Report(Chosen):
     results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the runs themselves)")] = None
     """Make it from the files that csac study run --results has collected, and from nothing else."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: below runs/studies/reports)")] = None
-    """Where report.md and its figures go; with --results beside them by default."""
+    """Where report.html, report.md and the figures go; with --results beside them by default."""
 
 
 def narrowed(
@@ -321,7 +321,7 @@ def report(options: Report) -> int:
         folder,
         [shlex.join(["csac", "study", command, *chosen, *results]) for command in ("run", "report")],
     )
-    _say(console, str(path))
+    _say(console, f"{path}\n{path.with_suffix('.md')}")
     return 0
 
 

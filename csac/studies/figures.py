@@ -1,25 +1,53 @@
-"""The pictures of a study: curves, bars and success, as PNG and SVG."""
+"""The figures of a report as data, and how they are drawn as PNG and SVG; `interactive` draws the same in a page."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import matplotlib.style
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, NullLocator
 
-from csac.record.plots import COLOURS, STYLE, Format, learning_curve, save
+from csac.record.curves import DEVIATION
+from csac.record.plots import (
+    RETURN,
+    Format,
+    Panel,
+    draw_legend,
+    head,
+    learning_curves,
+    looks_of,
+    picture,
+    save,
+)
 from csac.record.rendering import short
 from csac.record.statistics import FEWEST_FOR_INTERVAL, is_case
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
+
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+
+    from csac.record.curves import Spread
+    from csac.record.summaries import OverSeeds
 
 FORMATS: tuple[Format, ...] = ("png", "svg")
 NOT_REACHED = "not reached"
+PUBLISHED = "the paper"
+LABEL_CHARACTERS = 75  # that fit side by side below bars
+
+
+class Curves(NamedTuple):
+    """Learning curves, panel by panel on one scale; the band is the paper's: a standard deviation to either side."""
+
+    panels: tuple[Panel, ...]
+    quantity: str = RETURN
+    spread: Spread = DEVIATION
+
+    def save(self, path: Path, title: str) -> None:
+        """Draw it, in each format."""
+        learning_curves(self.panels, path, title, FORMATS, self.quantity, self.spread)
 
 
 class Bar(NamedTuple):
@@ -29,47 +57,120 @@ class Bar(NamedTuple):
     height: float
     low: float
     high: float
-    published: float
+    published: float = np.nan
 
 
-def curves(
-    path: Path, title: str, runs: Sequence[tuple[str, np.ndarray]], marks: Sequence[tuple[int, str]] = ()
-) -> None:
-    """Draw learning curves, given as `(label, rows)`."""
-    learning_curve(runs, path, title=title, marks=marks, formats=FORMATS)
+class BarPanel(NamedTuple):
+    """Bars that stand side by side."""
+
+    bars: tuple[Bar, ...]
+    title: str = ""
 
 
-def success_curves(path: Path, title: str, runs: Sequence[tuple[str, np.ndarray]]) -> None:
-    """Draw the share of successful evaluation episodes; an episode that says nothing of success had none."""
-    told = [(label, _as_success(rows)) for label, rows in runs if is_case(rows["success"])]
-    learning_curve(told, path, title=title, formats=FORMATS, quantity="share of episodes with success")
+class Bars(NamedTuple):
+    """Bars with their reach, a mark where the paper's number is, and words where there is no bar."""
+
+    panels: tuple[BarPanel, ...]
+    quantity: str
+    missing: str = ""
+    """What is written where there is no bar."""
+
+    @property
+    def labels(self) -> list[str]:
+        """What its bars stand for."""
+        return list(dict.fromkeys(bar.label for panel in self.panels for bar in panel.bars))
+
+    @property
+    def needs_legend(self) -> bool:
+        """Whether there is no room for the labels below the bars."""
+        return len(self.panels) > 1 or sum(map(len, self.labels)) > LABEL_CHARACTERS
+
+    def save(self, path: Path, title: str) -> None:
+        """Draw it, in each format."""
+        looks = looks_of(self.labels)
+        with picture(7.5, 3.6, len(self.panels), sharey=False) as figure:
+            published: list[Artist] = []
+            for axes, panel in zip(figure.axes, self.panels, strict=True):
+                for position, bar in enumerate(panel.bars):
+                    _draw_bar(axes, position, bar, looks[bar.label][0], self.missing)
+                published += _draw_published(axes, panel.bars)
+                axes.set_xticks(range(len(panel.bars)), [bar.label for bar in panel.bars])
+                if self.needs_legend:
+                    axes.xaxis.set_major_locator(NullLocator())
+                axes.set_xlim(-0.6, len(panel.bars) - 0.4)
+                axes.set_ylim(bottom=0)
+                axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+                axes.grid(visible=False, axis="x")
+            figure.axes[0].set_ylabel(self.quantity)
+            head(figure, title, [panel.title for panel in self.panels])
+            if self.needs_legend:
+                draw_legend(figure, {label: (colour, "-") for label, (colour, _) in looks.items()}, published[:1])
+            elif published:
+                figure.axes[0].legend(frameon=False, loc="best")
+            save(figure, path, FORMATS)
 
 
-def bars(path: Path, title: str, quantity: str, several: Sequence[Bar]) -> None:
-    """Draw bars with their reach, a mark where the paper's number is, and words where there is no bar."""
-    with matplotlib.style.context(["default", STYLE]):
-        figure = Figure(figsize=(7.5, 3.6), layout="constrained")
-        FigureCanvasAgg(figure)
-        axes = figure.add_subplot()
-        positions = np.arange(len(several))
-        for position, bar in zip(positions, several, strict=True):
-            colour = COLOURS[position % len(COLOURS)]
-            if np.isfinite(bar.height):
-                axes.bar(position, bar.height, width=0.6, color=colour)
-            else:
-                axes.annotate(NOT_REACHED, (position, 0), rotation=90, ha="center", va="bottom", color=colour)
-            if np.isfinite([bar.low, bar.high]).all():
-                axes.plot([position, position], [bar.low, bar.high], color="#333333", linewidth=1.2)
-        published = np.array([bar.published for bar in several])
-        if np.isfinite(published).any():
-            axes.scatter(positions, published, marker="D", s=28, color="#000000", zorder=4, label="the paper")
-            axes.legend(frameon=False)
-        axes.set_xticks(positions, [bar.label for bar in several])
-        axes.set_ylabel(quantity)
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
-        axes.set_title(title, pad=12)
-        axes.grid(visible=False, axis="x")
-        save(figure, path, FORMATS)
+class Line(NamedTuple):
+    """A quantity over another, with its reach: NaN where it has none."""
+
+    label: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
+class Trend(NamedTuple):
+    """Lines over a positive quantity of many magnitudes."""
+
+    lines: tuple[Line, ...]
+    name: str
+    quantity: str
+
+    def save(self, path: Path, title: str) -> None:
+        """Draw it, in each format."""
+        looks = looks_of([line.label for line in self.lines])
+        with picture(7.5, 4.2) as figure:
+            axes = figure.axes[0]
+            for index, line in enumerate(self.lines):
+                colour, style = looks[line.label]
+                x = np.array(line.x) * nudge(index, len(self.lines))
+                axes.plot(x, line.y, color=colour, linestyle=style, linewidth=2.2, marker="o", markersize=6)
+                axes.vlines(x, line.low, line.high, color=colour, linewidth=1.4)
+            axes.set_xscale("log")
+            values = sorted({value for line in self.lines for value in line.x})
+            axes.set_xticks(values, [f"{value:g}" for value in values])
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.set_xlabel(self.name)
+            axes.set_ylabel(self.quantity)
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace("-", "−")))
+            head(figure, title)
+            draw_legend(figure, looks)
+            save(figure, path, FORMATS)
+
+
+Drawing = Curves | Bars | Trend
+
+
+def nudge(index: int, lines: int) -> float:
+    """Return the factor by which a line is moved aside on a logarithmic axis, so that no bar hides another."""
+    return 1.06 ** (index - (lines - 1) / 2)
+
+
+def success_panel(runs: Sequence[tuple[str, np.ndarray]]) -> Panel:
+    """Return the curves of the share of successful episodes; one that says nothing of success had none."""
+    return Panel([(label, _as_success(rows)) for label, rows in runs if tells_of_success(rows)])
+
+
+def tells_of_success(rows: np.ndarray) -> bool:
+    """Return whether the task says which episodes succeed."""
+    return is_case(rows["success"])
+
+
+def bar_over_seeds(label: str, over: OverSeeds, published: float, factor: float = 1.0) -> Bar:
+    """Return a bar for a mean and the standard deviation to either side, as far down as 0."""
+    mean, std = factor * over.mean, factor * over.std
+    return Bar(label, mean, max(mean - std, 0.0) if np.isfinite(std) else np.nan, mean + std, published)
 
 
 def reach(values: np.ndarray) -> tuple[float, float]:
@@ -78,6 +179,28 @@ def reach(values: np.ndarray) -> tuple[float, float]:
     if len(finite) < max(2, min(len(values), FEWEST_FOR_INTERVAL)):
         return np.nan, np.nan
     return float(finite.min()), float(finite.max())
+
+
+def _draw_bar(axes: Axes, position: int, bar: Bar, colour: str, missing: str) -> None:
+    if np.isfinite(bar.height):
+        axes.bar(position, bar.height, width=0.6, color=colour)
+    else:
+        axes.annotate(
+            missing, (position, 0), (0, 3), textcoords="offset points", rotation=90, ha="center", color=colour
+        )
+    if np.isfinite([bar.low, bar.high]).all():
+        axes.plot([position, position], [bar.low, bar.high], color="#333333", linewidth=1.2)
+
+
+def _draw_published(axes: Axes, bars: Sequence[Bar]) -> list[Artist]:
+    """Mark the published numbers, and return what the legend shows of them: nothing where there is none."""
+    published = np.array([bar.published for bar in bars])
+    if not np.isfinite(published).any():
+        return []
+    place = np.arange(len(bars))
+    points = axes.scatter(place, published, marker="D", s=28, color="#000000", edgecolors="white", zorder=4)
+    points.set_label(PUBLISHED)
+    return [points]
 
 
 def _as_success(rows: np.ndarray) -> np.ndarray:

@@ -11,8 +11,9 @@ from benchmarks.__main__ import PARTS, SUITES, main, named
 from benchmarks.measuring import ROOT, Process, run, surroundings
 from benchmarks.parts import Options, Part
 from benchmarks.suites import growth
-from benchmarks.tables import between_markers, formatted, read_rows, write_rows
+from benchmarks.tables import formatted, read_rows, write_rows
 from csac.processes import usable_cores
+from csac.record.rendering import between_markers
 from csac.types import InputError
 
 

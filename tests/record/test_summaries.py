@@ -155,6 +155,7 @@ def test_a_number_that_is_only_ever_0_or_1_in_one_run_is_no_case_beside_another(
     assert case_names([few, many]) == {"stops": False, "crashed": True}
     assert lines(case_comparison_table([("few", few), ("many", many)])) == [
         ["per 1,000 rollouts (from 2 of each seed)", "few", "many"],
+        ["return (mean)", "1.0", "1.0"],
         ["stops (mean)", "0.500", "2.500"],
         ["crashed", "", "1,000.0"],
     ]

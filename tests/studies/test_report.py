@@ -1,4 +1,10 @@
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
 import numpy as np
+import plotly.graph_objects
 import pytest
 from made import MadeRecords
 
@@ -6,7 +12,7 @@ from csac.studies import paper
 from csac.studies.arms import Arm, gather
 from csac.studies.claims import Comparison, comparisons, decide, interactions, lower_boundary
 from csac.studies.named import NAMED
-from csac.studies.report import write_report
+from csac.studies.report import train_command, write_report
 
 HEIGHTS = {"csac": 6_000, "sac": 5_000, "td3": 4_000, "sd3": 3_000, "ppo": 1_000}
 
@@ -19,6 +25,30 @@ def made(cell, step):
 def mujoco(**narrow):
     (study,) = NAMED["mujoco"]
     return study.narrowed(["HalfCheetah-v4"], **narrow)
+
+
+def markdown_of(studies, source, directory):
+    return write_report(studies, source, directory, ["csac study run it"]).with_suffix(".md").read_text()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A function that gives the page and the Markdown of a study's first task, written once."""
+    written = {}
+
+    def give(name):
+        if name not in written:
+            (study,) = NAMED[name]
+            directory = tmp_path_factory.mktemp(name)
+            written[name] = page_of([study.narrowed(tasks=study.tasks[:1])], directory), directory
+        return written[name]
+
+    return give
+
+
+def page_of(studies, directory):
+    path = write_report(studies, MadeRecords(made), directory, ["csac study run it"])
+    return path.read_text(), path.with_suffix(".md").read_text()
 
 
 def compare(ours, others, **options):
@@ -100,7 +130,7 @@ def test_an_arm_of_which_there_is_nothing(tmp_path):
     study = mujoco(algorithms=["sac"])
     source = MadeRecords(lambda *_: None)
     assert isinstance(gather(study, source)[0], Arm)
-    text = write_report([study], source, tmp_path, []).read_text()
+    text = markdown_of([study], source, tmp_path)
     assert "0 of 5 cells are complete, 5 are not over." in text
     assert "## Hyperparameters" in text
 
@@ -109,7 +139,7 @@ def test_an_arm_of_which_there_is_nothing(tmp_path):
 
 
 def test_published_numbers_stand_beside_measured_ones(tmp_path):
-    text = write_report([mujoco()], MadeRecords(made), tmp_path, ["csac study run mujoco"]).read_text()
+    text = markdown_of([mujoco()], MadeRecords(made), tmp_path)
     assert "| SAC | 11,052.89 ± 422.84 | 5,020 ± 16 | 1,000,000 | 5 |" in text
     assert "| CSAC (default) |  | 6,020 ± 16 | 1,000,000 | 5 |" in text
     claim = "HalfCheetah-v4: CSAC (paper) has a higher maximum average return than PPO"
@@ -121,7 +151,7 @@ def test_published_numbers_stand_beside_measured_ones(tmp_path):
 
 
 def test_a_shortened_report_says_so_everywhere(tmp_path):
-    text = write_report([mujoco().shortened(0.1)], MadeRecords(made), tmp_path, []).read_text()
+    text = markdown_of([mujoco().shortened(0.1)], MadeRecords(made), tmp_path)
     assert "**Every run is shortened to 0.1 of its steps.**" in text
     headings = [line for line in text.splitlines() if line.startswith("## ")]
     assert headings[:3] == [
@@ -133,18 +163,29 @@ def test_a_shortened_report_says_so_everywhere(tmp_path):
     assert (tmp_path / "mujoco-curve-halfcheetah-v4-scale-0.1.png").exists()
 
 
-@pytest.mark.parametrize("name", [name for name in NAMED if name not in ("mujoco", "reference", "smoke")])
-def test_every_study_has_its_tables_and_pictures(tmp_path, name):
-    (study,) = NAMED[name]
-    text = write_report([study.narrowed(tasks=study.tasks[:1])], MadeRecords(made), tmp_path, []).read_text()
+def test_the_command_of_an_arm_trains_every_seed_of_it():
+    arm = gather(mujoco(algorithms=["sac"], seeds=2), MadeRecords(made))[0]
+    assert "--seeds 2 --evaluation-interval" in train_command(arm)
+    arm.manifests = [replace(one, seeds=(100 + one.seeds[0],)) for one in arm.manifests]
+    arm.missing, arm.failures = [102], {103: "critic is not finite"}
+    assert "--seeds 4 --first-seed 100 --evaluation-interval" in train_command(arm)
+
+
+STUDIES = [name for name in NAMED if name not in ("reference", "smoke")]
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_study_has_its_tables_and_pictures(whole, name):
+    (_, text), directory = whole(name)
     pictures = {line.split("](")[1].split(")")[0] for line in text.splitlines() if line.startswith("![")}
     assert pictures
-    assert all((tmp_path / picture).stat().st_size > 10_000 for picture in pictures | _svg(pictures))
+    assert all((directory / picture).stat().st_size > 10_000 for picture in pictures | _svg(pictures))
     wanted = {
-        "ablation": "CSAC (paper), tau 0.5 ",
+        "mujoco": "![HalfCheetah-v4](mujoco-curve-halfcheetah-v4.png)",
+        "ablation": "![Walker2d-v4, over tau](ablation-returns-walker2d-v4-over-tau.png)",
         "efficiency": "| CSAC (paper) | 105,000 | 200,000 | 5 of 5 |",
-        "robustness": "friction x 2.5 after step 300,000",
-        "quadx": "| env_complete | 352 ± 241.57 |",
+        "robustness": "![HalfCheetah-v4, friction](robustness-friction-halfcheetah-v4.png)",
+        "quadx": "![PyFlyt/QuadX-Waypoints-v1, out of bounds, collision, env complete](quadx-cases-",
         "panda": "In the paper success is near 100 % for CSAC by 600k steps",
     }
     assert wanted[name] in text
@@ -161,6 +202,97 @@ def test_equal_records_give_equal_reports(tmp_path):
         write_report([study], MadeRecords(made), tmp_path / folder, [])
         files.append({path.name: path.read_bytes() for path in (tmp_path / folder).iterdir()})
     assert files[0] == files[1]
+
+
+# The page.
+
+
+class Reader(HTMLParser):
+    """The text of a page, what it refers to, and the JSON of its plots."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.text, self.links, self.plots, self._is_plot, self._is_code = [], [], [], False, False
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.links += [values[name] for name in ("src", "href") if name in values]
+        self._is_plot = tag == "script" and values.get("type") == "application/json"
+        self._is_code = tag in ("script", "style")
+
+    def handle_endtag(self, tag):
+        self._is_plot = self._is_code = False
+
+    def handle_data(self, data):
+        if self._is_plot:
+            self.plots.append(json.loads(data))
+        elif not self._is_code:
+            self.text.append(data)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_the_page_says_what_the_markdown_says(whole, name):
+    (page, text), _ = whole(name)
+    told = " ".join("".join(Reader(page).text).split())
+    words = [cell for line in text.splitlines() for cell in re.split(r" ?\| ?|^#+ |^- |\*\*|^!\[|\]\(.*", line)]
+    assert len(words) > 100
+    assert [word for word in words if " ".join(word.split()) not in told and word.strip("-:`sh")] == []
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_plotly_takes_every_plot(whole, name):
+    (page, _), _ = whole(name)
+    plots = Reader(page).plots
+    panels = {"robustness": 3, "quadx": 4, "ablation": 3, "panda": 2}
+    assert len(plots) == panels.get(name, 1)
+    for plot in plots:
+        plotly.graph_objects.Figure(plot)  # which raises what plotly.js would ignore
+        assert all(len(trace["x"]) == len(trace["y"]) > 0 for trace in plot["data"])
+
+
+def test_the_page_refers_to_nothing_outside(tmp_path):
+    page, _ = page_of([mujoco(algorithms=["sac"])], tmp_path)
+    links = Reader(page).links
+    assert any(link.startswith("data:image/png;base64,") for link in links)
+    assert [link for link in links if not link.startswith(("data:", "#"))] == []
+    assert not re.search(r"@import|url\((?!#)", page[: page.index("</style>")])
+
+
+def test_curves_on_the_page_have_the_numbers_of_the_rows(tmp_path):
+    page, _ = page_of([mujoco(algorithms=["sac"])], tmp_path)
+    (plot,) = Reader(page).plots
+    band, mean = plot["data"]
+    assert (mean["name"], mean["legendgroup"], band["legendgroup"]) == ("SAC (5 seeds)", "SAC", "SAC")
+    assert (mean["x"][0], mean["y"][0]) == (50_000, 251)  # 5,020 / 20
+    assert (mean["x"][-1], mean["y"][-1]) == (1_000_000, 5_020)
+    deviation = np.std([0, 10, 20, 30, 40], ddof=1)
+    assert (band["y"][19], band["y"][20]) == pytest.approx((5_020 + deviation, 5_020 - deviation), abs=1e-2)
+    assert mean["text"][-1] == " (± standard deviation: 5,004.2 to 5,035.8)"
+
+
+def test_labels_cannot_break_the_page(tmp_path):
+    evil = "</script><script>alert(1)</script> {{ 7 * 7 }} & <b>"
+    study = mujoco(algorithms=["sac"])
+    study = replace(study, methods=(replace(study.methods[0], label=evil),), title=evil)
+    page, _ = page_of([study], tmp_path)
+    assert "<script>alert(1)" not in page
+    assert evil in "".join(Reader(page).text)
+
+
+def test_friction_stands_side_by_side(whole):
+    (page, _), _ = whole("robustness")
+    plots = Reader(page).plots
+    marks = [plot["layout"]["annotations"][0]["text"].strip() for plot in plots]
+    assert marks == ["friction x 1.5", "friction x 2", "friction x 2.5"]
+    assert len({json.dumps(plot["layout"]["yaxis"]) for plot in plots}) == 1  # one scale
+
+
+def test_the_paper_s_rollouts_stand_beside_ours(whole):
+    (page, _), _ = whole("quadx")
+    *bars, published = Reader(page).plots[1]["data"]
+    assert {bar["name"]: bar["y"] for bar in bars}["CSAC (paper)"] == [0]  # as made: none is out of bounds
+    assert dict(zip(published["x"], published["y"], strict=True))["SAC"] == 48.2
 
 
 # The paper.

@@ -1,13 +1,16 @@
-"""Records of cells that nobody has run: what a report shows of numbers that are known."""
+"""Records of cells and runs that nobody has run: what a report shows of numbers that are known."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from csac.record.csv_tables import structured
 from csac.record.manifest import EvaluationPlan, Machine, Manifest
+from csac.record.run import RunDirectory
 from csac.studies.cells import Cell
 from csac.studies.results import Record
 
@@ -55,3 +58,31 @@ class MadeRecords:
         )
         table = rows(cell, lambda step: self.value(cell, step) or 0.0)
         return Record(manifest, 60.0, table, rows(cell, lambda _: 1.0, points=1, episodes=10))
+
+
+def make_run_of(path: str | Path, returns: Sequence[Sequence[float]], **changes: Any) -> RunDirectory:
+    """A run of SAC with evaluations at 10, 20, ... of one episode each: `returns` [seed][point], told of its seeds."""
+    success = changes.pop("success", None)
+    hyperparameters = {"batch_size": 8, "discount": 0.99, **changes.pop("hyperparameters", {})}
+    told: dict[str, Any] = {
+        "task": "Hopper-v4",
+        "algorithm": "sac",
+        "seeds": tuple(range(max(1, len(returns)))),
+        "steps": 100,
+        "steps_done": 100,
+        "state": "finished",
+        "versions": {"csac": "0.1.0"},
+        "commit": "0123456",
+        "command": "csac train Hopper-v4 --seeds 1",
+        **changes,
+    }
+    run = RunDirectory.create(path, Manifest(hyperparameters=hyperparameters, **told))
+    run.append(
+        "evaluations",
+        [
+            {"seed": seed, "step": 10 * (t + 1), "episode": 0, "return": value, "length": 7, "success": success}
+            for seed, line in zip(told["seeds"], returns, strict=False)
+            for t, value in enumerate(line)
+        ],
+    )
+    return run

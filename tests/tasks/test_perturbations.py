@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import runpy
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -755,31 +753,3 @@ def test_a_fork_is_not_perturbed_in_its_past(tmp_path, plain):
     with pytest.raises(InputError, match="friction=2@199 lies before step 200, where this run begins"):
         run(tmp_path / "run", start_from=f"{plain.path}@200", perturbations="friction=2@199", **LONG)
     assert list(tmp_path.iterdir()) == []
-
-
-# The script that compares several runs.
-
-
-def test_several_runs_are_told_side_by_side(tmp_path, monkeypatch, capsys):
-    returns = {"a": [[100, 100, 40, 95], [100, 100, 100, 100]], "b": [[100, 100, 40, 40], [100, 100, 50, 60]]}
-    for name, seeds in returns.items():
-        rows = [
-            f"{seed},{10 * (t + 1)},0,{value},5," for seed, line in enumerate(seeds) for t, value in enumerate(line)
-        ]
-        (tmp_path / f"{name}.csv").write_text("\n".join(["seed,step,episode,return,length,success", *rows, ""]))
-    script = Path(__file__).parents[2] / "results" / "recovery.py"
-    files = [f"{name.upper()}={tmp_path / name}.csv" for name in returns]
-    out = tmp_path / "picture.png"
-    monkeypatch.setattr(sys, "argv", [str(script), "--step", "20", "--out", str(out), *files])
-    runpy.run_path(str(script), run_name="__main__")
-    assert capsys.readouterr().out.splitlines()[2:] == [
-        "| A | 0 | 100.0 | 60.0 | 60% | 20 | 625 | 67.5 | 60.0 |",
-        "| A | 1 | 100.0 | 0.0 | 0% | 0 | 0 | 100.0 | 0.0 |",
-        "| A | mean | 100.0 | 30.0 | 30% | 10 | 312 | 83.8 | 30.0 |",
-        "| A | ± std | 0.0 | 42.4 | 42% | 14 | 442 | 23.0 | 42.4 |",
-        "| B | 0 | 100.0 | 60.0 | 60% | never | 900 | 40.0 | 60.0 |",
-        "| B | 1 | 100.0 | 50.0 | 50% | never | 700 | 55.0 | 50.0 |",
-        "| B | mean | 100.0 | 55.0 | 55% | 0 of 2 | 800 | 47.5 | 55.0 |",
-        "| B | ± std | 0.0 | 7.1 | 7% |  | 141 | 10.6 | 7.1 |",
-    ]
-    assert out.stat().st_size > 10_000

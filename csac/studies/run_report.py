@@ -1,0 +1,320 @@
+"""`csac report`: any runs side by side, as a page and in Markdown, or as one table of a page that is there already.
+
+A run is a run directory, or a file of rows as evaluations.csv has them, of which nothing else is known.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from csac.record.atomic import write_atomically
+from csac.record.csv_tables import read_rows
+from csac.record.plots import learning_curve
+from csac.record.rendering import Cell, Row, Table, between_markers, markdown
+from csac.record.run import RunDirectory, find_runs, is_run
+from csac.record.summaries import case_names, compare, last_rows
+from csac.record.summary_tables import case_comparison_table, comparison_table
+from csac.studies import sections
+from csac.studies.arms import Arm, by_condition, with_rows
+from csac.studies.figures import tells_of_success
+from csac.studies.parts import Heading, Items, Paragraph, write
+from csac.studies.sections import Scope, described, marks_of, plain
+from csac.tasks.perturbations import perturbations_of
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from csac.record.manifest import Manifest
+    from csac.studies.parts import Part
+
+ROLLOUTS = "rollouts.csv"  # as a study leaves them in a run
+TableName = Literal["returns", "recovery", "cases"]
+
+
+class Given(NamedTuple):
+    """One run: what it is called where a label was given, where it is, and what is known of it."""
+
+    label: str | None
+    path: Path
+    rows: np.ndarray
+    manifest: Manifest | None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Runs to report on. Steps are environment steps per seed."""
+
+    runs: tuple[Given, ...]
+    perturbations: tuple[str, ...] = ()
+    """What changed in runs that cannot tell it themselves."""
+    until: int | None = None
+    """The last step that counts."""
+
+    def arms(self) -> list[Arm]:
+        """Return the arms: runs of one label, or else runs that differ in their seeds alone.
+
+        Raises:
+            InputError: runs of one label have a seed in common, or learn another task.
+        """
+        groups: dict[str, list[Given]] = {}
+        for run in self.runs:
+            own = groups.setdefault(_key(run), [])
+            if own and _seeds([run]) & _seeds(own):
+                if run.label:
+                    common = min(_seeds([run]) & _seeds(own))
+                    raise InputError(
+                        f"{run.label}: {own[0].path} and {run.path} both hold seed {common}; label them apart"
+                    )
+                own = groups.setdefault(f"{_key(run)} {run.path}", [])
+            own.append(run)
+        return _named([self._arm(runs) for runs in groups.values()], [runs[0] for runs in groups.values()])
+
+    def _arm(self, runs: Sequence[Given]) -> Arm:
+        manifests = [run.manifest for run in runs if run.manifest]
+        tasks = {manifest.task for manifest in manifests}
+        if len(tasks) > 1:
+            raise InputError(
+                f"{runs[0].label}: its runs learn {' and '.join(sorted(tasks))}; give each a label of its own"
+            )
+        condition = self.perturbations or next((one.perturbations for one in manifests), ())
+        arm = Arm(runs[0].label or "", tasks.pop() if tasks else "", tuple(map(str, perturbations_of(condition))))
+        for run in runs:
+            failed = run.manifest.failures if run.manifest else {}
+            rows = run.rows[~np.isin(run.rows["seed"], list(failed))]
+            rows = rows if self.until is None else rows[rows["step"] <= self.until]
+            arm.failures.update(failed)
+            arm.evaluations.append(rows)
+            arm.tests += _tests(run, rows, failed)
+            if run.manifest:
+                arm.manifests.append(run.manifest)
+                arm.seconds += _seconds(run.path, run.manifest)
+        if manifests:
+            arm.algorithm, arm.hyperparameters = manifests[0].algorithm, _settings(manifests[0])
+        return arm
+
+
+def read_runs(paths: Sequence[Path], labels: Sequence[tuple[str, Sequence[Path]]] = ()) -> tuple[Given, ...]:
+    """Return the runs at these paths and below them, and those that have a label.
+
+    Raises:
+        InputError: there is no run, or one cannot be read.
+    """
+    runs = [run for label, some in ((None, paths), *labels) for path in some for run in _read(path, label)]
+    if not runs:
+        raise InputError("there is nothing to report on: give run directories ('csac runs' lists them)")
+    return tuple(runs)
+
+
+def default_page() -> Path:
+    """Return where a report goes that is given no place; nothing is created."""
+    return Path("runs", "reports", datetime.now().strftime("%Y%m%d-%H%M%S"), "report.html")
+
+
+def write_run_report(comparison: Comparison, path: Path, title: str | None, commands: Sequence[str]) -> None:
+    """Write the page `path`, the same in Markdown beside it, and its figures; `commands` made it.
+
+    Raises:
+        InputError: it cannot be written, or the runs do not go together.
+    """
+    if path.suffix != ".html":
+        raise InputError(f"the report is a page: name it {path.with_suffix('.html')}")
+    arms = comparison.arms()
+    title = title or ", ".join(dict.fromkeys(arm.task for arm in arms if arm.task)) or "Runs"
+    write(path, title, list(_parts(comparison, arms, Scope(path.stem), title, commands)))
+
+
+def write_table(comparison: Comparison, page: Path, name: str, kind: TableName) -> None:
+    """Write one table between the marks `name` of a page in Markdown.
+
+    Raises:
+        InputError: the page lacks them or cannot be written, or the runs have no such table.
+    """
+    tables = _tables(comparison.arms(), kind)
+    if not tables:
+        raise InputError(f"these runs have no table of {kind}")
+    try:
+        text = page.read_text(encoding="utf-8")
+        new = between_markers(text, name, "\n\n".join(map(markdown, tables)) + "\n")
+        write_atomically(page, new.encode())
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot write into {page}: {error}") from None
+
+
+def draw_curves(comparison: Comparison, path: Path, title: str | None) -> None:
+    """Draw the learning curves of runs of one task as one picture. Raises InputError for several tasks."""
+    groups = by_condition(comparison.arms())
+    if len(groups) > 1:
+        raise InputError("these runs are of several tasks or perturbations: one picture would mix them")
+    ((task, condition), arms), *_ = groups.items()
+    kind = path.suffix[1:]
+    if kind not in ("png", "pdf", "svg"):
+        raise InputError(f"a picture is a .png, .pdf or .svg file, not {path}")
+    try:
+        learning_curve([(arm.label, arm.rows) for arm in arms], path, title or task, marks_of(condition), (kind,))
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+
+
+def _tables(arms: Sequence[Arm], kind: TableName) -> list[Table]:
+    groups, tables = by_condition(arms), []
+    for (task, condition), own in groups.items():
+        found: list[Table | None] = []
+        if kind == "returns":
+            found = [comparison_table(compare([(arm.label, arm.rows) for arm in own]))]
+        elif kind == "cases":
+            found = [case_comparison_table([(arm.label, arm.rollouts) for arm in own])]
+        else:
+            found += [
+                sections.recoveries_table(own, marks_of(condition), index) for index in range(len(marks_of(condition)))
+            ]
+        title = described(task, condition) if len(groups) > 1 else ""
+        tables += [table._replace(title=title) for table in found if table]
+    return tables
+
+
+def _parts(
+    comparison: Comparison, arms: list[Arm], scope: Scope, title: str, commands: Sequence[str]
+) -> Iterator[Part]:
+    shown = with_rows(arms)
+    yield Heading(title, 1)
+    if comparison.until is not None:
+        yield Paragraph(f"Evaluations after step {comparison.until:,} are left out.")
+    yield _runs_table(comparison)
+    failed = [f"{arm.label}, seed {seed} failed: {reason}" for arm in arms for seed, reason in arm.failures.items()]
+    if failed:
+        yield Paragraph("Seeds that failed are in no number below.")
+        yield Items(tuple(failed))
+    if plainly := [arm for arm in shown if not arm.condition]:
+        yield from sections.curves(plainly, scope)
+    if shown:
+        yield from sections.returns(shown, scope)
+    if perturbed := [arm for arm in shown if arm.condition]:
+        yield from sections.robustness(perturbed, scope)
+    if any(tells_of_success(arm.rows) for arm in shown):
+        yield from sections.success(shown, scope)
+    if any(len(arm.rollouts) for arm in shown):
+        yield from sections.cases(shown, scope)
+        yield Paragraph(f"Rollouts are those of {ROLLOUTS}, and of a run that has none its last evaluation's episodes.")
+    yield from _hyperparameters(shown)
+    yield from sections.provenance(arms)
+    lines = [one.command for arm in arms for one in arm.manifests if one.command]
+    yield from sections.commands(commands, list(dict.fromkeys(lines)), "The runs:")
+
+
+def _runs_table(comparison: Comparison) -> Table:
+    rows = []
+    for run in comparison.runs:
+        one, seeds = run.manifest, sorted(_seeds([run]))
+        steps = one.steps_done if one else int(run.rows["step"].max(initial=0))
+        told = (one.task, one.algorithm) if one else ("", "")
+        texts = (str(run.path), *told, ", ".join(map(str, seeds)))
+        rows.append(Row((*map(Cell, texts), Cell(f"{steps:,}", steps), Cell(one.state if one else ""))))
+    return Table(("run", "task", "algorithm", "seeds", "steps", "state"), tuple(rows))
+
+
+def _hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
+    """Yield what differs among the arms of each task, and then, once, what is the same in all of them."""
+    known = [arm for arm in arms if arm.hyperparameters]
+    if not known:
+        return
+    yield Heading("Hyperparameters")
+    for (task, condition), own in by_condition(known).items():
+        if names := _differing([arm.hyperparameters for arm in own]):
+            rows = [Row((Cell(name), *(Cell(plain(arm.hyperparameters.get(name))) for arm in own))) for name in names]
+            headings = (f"what differs on {described(task, condition)}", *(arm.label for arm in own))
+            yield Table(headings, tuple(rows))
+    differing = _differing([arm.hyperparameters for arm in known])
+    same = {name: value for name, value in known[0].hyperparameters.items() if name not in differing}
+    rows = [Row((Cell(name), Cell(plain(value)))) for name, value in same.items()]
+    yield Table(("the same in all", "value"), tuple(rows))
+
+
+def _read(path: Path, label: str | None) -> list[Given]:
+    """Return the run at this path, or those below it. Raises InputError where there is none."""
+    if path.name == "evaluations.csv" and is_run(path.parent):
+        path = path.parent
+    if path.suffix == ".csv":
+        return [Given(label, path, read_rows(path), None)]
+    runs = [] if is_run(path) or not path.is_dir() else find_runs(path)
+    found = runs or [RunDirectory.open(path)]
+    return [Given(label, run.path, run.evaluations, run.manifest) for run in found]
+
+
+def _tests(run: Given, rows: np.ndarray, failed: Mapping[int, str]) -> list[np.ndarray]:
+    """Return the fresh episodes of a run, or those of its last evaluation, where they tell of anything that happens."""
+    if run.manifest and (run.path / ROLLOUTS).exists():
+        rows = read_rows(run.path / ROLLOUTS)
+        rows = rows[~np.isin(rows["seed"], list(failed))]
+    return [last_rows(rows)] if case_names([rows]) else []
+
+
+def _key(run: Given) -> str:
+    """Return what runs have in common that are one arm."""
+    if run.label:
+        return f"label {run.label}"
+    one = run.manifest
+    if not one:
+        return f"file {run.path}"
+    fields = [one.task, one.algorithm, one.perturbations, _settings(one)]
+    return f"run {json.dumps(fields, sort_keys=True, default=str)}"
+
+
+def _settings(manifest: Manifest) -> dict[str, Any]:
+    """Return what a run was given that its numbers depend on, beside task, algorithm and perturbations."""
+    settings = {**manifest.hyperparameters, "steps": manifest.steps}
+    settings |= {
+        "evaluation interval": manifest.evaluation.interval,
+        "evaluation episodes": manifest.evaluation.episodes,
+    }
+    settings |= {f"environment: {name}": value for name, value in manifest.environment_arguments.items()}
+    return settings
+
+
+def _named(arms: list[Arm], firsts: Sequence[Given]) -> list[Arm]:
+    """Give a label to each arm that has none: what learns, and how it differs from others of that name beside it."""
+    names = [arm.label or _name(run) for arm, run in zip(arms, firsts, strict=True)]
+    keys = [(name, arm.task, arm.condition) for name, arm in zip(names, arms, strict=True)]
+    labels = []
+    for arm, name, key in zip(arms, names, keys, strict=True):
+        beside = [other.hyperparameters for other, its_key in zip(arms, keys, strict=True) if its_key == key]
+        told = [f"{item} {plain(arm.hyperparameters.get(item))}" for item in _differing(beside)]
+        labels.append(name if arm.label else ", ".join([name, *told]))
+    keys = [(label, arm.task, arm.condition) for label, arm in zip(labels, arms, strict=True)]
+    return [
+        replace(arm, label=f"{key[0]}, {run.path}" if keys.count(key) > 1 else key[0])
+        for arm, key, run in zip(arms, keys, firsts, strict=True)
+    ]
+
+
+def _name(run: Given) -> str:
+    one = run.manifest
+    if not one:
+        return run.path.stem
+    return one.algorithm.upper() + (f" ({one.preset})" if one.preset else "")
+
+
+def _differing(several: Sequence[Mapping[str, Any]]) -> list[str]:
+    names = dict.fromkeys(name for settings in several for name in settings)
+    return [name for name in names if len({plain(settings.get(name)) for settings in several}) > 1]
+
+
+def _seeds(runs: Sequence[Given]) -> set[int]:
+    return {int(seed) for run in runs for seed in np.unique(run.rows["seed"])}
+
+
+def _seconds(path: Path, manifest: Manifest) -> list[float]:
+    """Return how long a run took that was never interrupted, by its manifest and the last line of its log."""
+    if manifest.history or manifest.state != "finished":
+        return []
+    with suppress(OSError, ValueError, IndexError):
+        last = (path / "log.txt").read_text(encoding="utf-8").splitlines()[-1]
+        return [(datetime.fromisoformat(last.split(" ")[0]) - datetime.fromisoformat(manifest.created)).total_seconds()]
+    return []

@@ -1,0 +1,323 @@
+"""The sections of a report, each of the arms that it is about: what `report` and `run_report` have in common."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from csac.console.tables import duration
+from csac.record.plots import Panel
+from csac.record.rendering import Cell, Row, Table, number, numeric, short
+from csac.record.summaries import case_names, compare, recoveries
+from csac.record.summaries import cases as cases_of
+from csac.record.summary_tables import (
+    ROLLOUTS,
+    case_comparison_table,
+    comparison_table,
+    plus_minus,
+    recovery_table,
+)
+from csac.studies import paper
+from csac.studies.arms import by_condition, tasks_of
+from csac.studies.claims import interactions, lower_boundary
+from csac.studies.figures import (
+    NOT_REACHED,
+    Bar,
+    BarPanel,
+    Bars,
+    Curves,
+    Line,
+    Trend,
+    bar_over_seeds,
+    reach,
+    success_panel,
+    tells_of_success,
+)
+from csac.studies.parts import Commands, Figure, Heading, Items, Paragraph
+from csac.tasks.perturbations import by_step, perturbations_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from csac.record.manifest import Manifest
+    from csac.studies.arms import Arm
+    from csac.studies.parts import Part
+
+MOST_CURVES = 7  # that are told apart in one picture
+MOST_PANELS = 3  # side by side
+SYMBOLS = {"relative_entropy_weight": "tau", "entropy_weight": "sigma"}
+_BOUNDARY = (
+    "The boundary is the lowest maximum average return, as measured here, of the methods that the paper has too. A "
+    "seed that does not get there has needed more steps than its run has. Lines on the bars: the range of the seeds."
+)
+_SMOOTHING = "Curves are not smoothed: each point is the mean over the episodes of one evaluation."
+
+
+class Scope(NamedTuple):
+    """What all titles and files of a report say of it: its name, and how much its runs are shortened."""
+
+    name: str
+    scale: float = 1.0
+
+    def titled(self, text: str) -> str:
+        """Return a title that says the scale."""
+        return text + (f" (scale {self.scale:g})" if self.scale < 1 else "")
+
+    def file(self, kind: str, text: str) -> str:
+        """Return what the files of a picture are called, without a suffix."""
+        words = "".join(letter if letter.isalnum() or letter == "." else " " for letter in f"{kind} {text}").split()
+        scale = ["scale", f"{self.scale:g}"] if self.scale < 1 else []
+        return "-".join([self.name, *words, *scale]).lower()
+
+    def figure(self, kind: str, text: str, drawing: Any) -> Figure:
+        """Return a figure about `text`."""
+        return Figure(self.file(kind, text), self.titled(text), drawing)
+
+
+def curves(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
+    """Learning curves, task by task; more than can be told apart in one picture stand in one for each variant."""
+    yield Heading(scope.titled("Learning curves"))
+    for (task, condition), own in by_condition(arms).items():
+        for suffix, some in _pictures(own):
+            panel = Panel(_runs(some), marks=marks_of(condition))
+            title = ", ".join(filter(None, (described(task, condition), suffix))) or "all runs"
+            yield scope.figure("curve", title, Curves((panel,)))
+    yield Paragraph(_SMOOTHING)
+
+
+def returns(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
+    """Maximum average returns, the paper's beside them, and what the last evaluations say."""
+    yield Heading(scope.titled("Maximum average returns"))
+    for (task, condition), own in by_condition(arms).items():
+        yield returns_table(own, scope.titled(described(task, condition)))
+        yield comparison_table(compare([(arm.label, arm.rows) for arm in own]))
+        for name, trend in _trends(own):
+            yield scope.figure("returns", f"{task}, over {name}", trend)
+    yield Paragraph("Mean ± standard deviation over seeds at the evaluation where that mean is highest.")
+
+
+def returns_table(arms: Sequence[Arm], title: str) -> Table:
+    """Return the maximum average returns of the arms of one task."""
+    published = paper.RETURNS.get(arms[0].task, {}) if any(arm.published for arm in arms) else {}
+    rows = []
+    for arm in arms:
+        over, (_, step), told = arm.maximum(), arm.best(), published.get(arm.published or "")
+        beside = Cell(f"{told.mean:,.2f} ± {told.std:,.2f}", told.mean) if told else Cell("", math.nan)
+        cells = (numeric(step, f"{step:,}"), Cell(str(over.seeds), over.seeds))
+        rows.append(Row((Cell(arm.label), *[beside] * bool(published), plus_minus(over), *cells)))
+    headings = ("method", *["the paper"] * bool(published), "measured", "at step", "seeds")
+    return Table(headings, tuple(rows), title)
+
+
+def efficiency(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
+    """Interactions to the lower boundary of the maximum average returns."""
+    yield Heading(scope.titled("Interactions to the lower boundary of the maximum average returns"))
+    for task, own in tasks_of(arms).items():
+        threshold = lower_boundary(own)
+        if math.isnan(threshold):
+            continue
+        published, rows, bars = paper.INTERACTIONS.get(task, {}), [], []
+        for arm in own:
+            steps = interactions(arm, threshold)
+            median, told = float(np.median(steps)), float(published.get(arm.published or "", math.nan))
+            reached = int(np.isfinite(steps).sum())
+            cells = (
+                numeric(told, f"{told:,.0f}"),
+                numeric(median, NOT_REACHED if math.isinf(median) else f"{median:,.0f}"),
+                Cell(f"{reached} of {len(steps)}", reached),
+            )
+            rows.append(Row((Cell(arm.label), *cells)))
+            bars.append(Bar(arm.label, median, *reach(steps), told if scope.scale == 1 else math.nan))
+        title = f"{task}, return {number(threshold)}"
+        yield Table(("method", "the paper", "measured, median seed", "reached"), tuple(rows), scope.titled(title))
+        yield Figure(
+            scope.file("interactions", task),
+            scope.titled(title),
+            Bars((BarPanel(tuple(bars)),), "environment steps", NOT_REACHED),
+        )
+    yield Paragraph(_BOUNDARY)
+
+
+def robustness(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
+    """What perturbations cost: for each task its conditions side by side, and a table for each change of each."""
+    yield Heading(scope.titled("Perturbations"))
+    for task, own in tasks_of([arm for arm in arms if arm.condition]).items():
+        conditions = list(by_condition(own).items())
+        for start in range(0, len(conditions), MOST_PANELS):
+            some = conditions[start : start + MOST_PANELS]
+            panels = [Panel(_runs(each), marks=marks_of(condition)) for (_, condition), each in some]
+            kind = "friction" if all("friction" in panel.marks[0][1] for panel in panels) else "perturbed"
+            title = described(task, some[0][0][1]) if len(some) == 1 else f"{task}, {kind}"
+            number_of_it = f" {start // MOST_PANELS + 1}" * (len(conditions) > MOST_PANELS)
+            if len(some) > 1:
+                panels = [panel._replace(title=", ".join(text for _, text in panel.marks)) for panel in panels]
+            yield Figure(scope.file(kind, f"{task}{number_of_it}"), scope.titled(title), Curves(tuple(panels)))
+        for (_, condition), each in conditions:
+            perturbed = by_step(perturbations_of(condition))
+            for index, (step, text) in enumerate(perturbed):
+                title = scope.titled(f"{task}, {text} after step {step:,}")
+                yield recoveries_table(each, perturbed, index)._replace(title=title)
+
+
+def recoveries_table(arms: Sequence[Arm], perturbed: Sequence[tuple[int, str]], index: int = 0) -> Table:
+    """Return what the change number `index` cost each arm, as far as the next."""
+    step = perturbed[index][0]
+    until = perturbed[index + 1][0] if index + 1 < len(perturbed) else None
+    since = perturbed[index - 1][0] if index else -1
+    return recovery_table([recoveries(arm.label, arm.rows, step, until, since) for arm in arms])
+
+
+def cases(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
+    """How fresh rollouts end, as bars and in a table, and the paper's table."""
+    yield Heading(scope.titled("How rollouts end"))
+    for task, own in tasks_of(arms).items():
+        told = [(arm, arm.rollouts) for arm in own if len(arm.rollouts)]
+        table = case_comparison_table([(arm.label, rows) for arm, rows in told]) if told else None
+        if not table:
+            continue
+        panels = _case_panels(told, scope.scale == 1)
+        for start in range(0, len(panels), MOST_PANELS):
+            some = panels[start : start + MOST_PANELS]
+            title = f"{task}, {', '.join(panel.title for panel in some)}"
+            yield scope.figure("cases", title, Bars(tuple(some), f"per {ROLLOUTS:,} rollouts"))
+        yield table._replace(title=scope.titled(task))
+    if any(arm.published for arm in arms):
+        rows = [
+            Row((Cell(name), *(Cell(f"{one.mean:g} ± {one.std:g}", one.mean) for one in published.values())))
+            for name, published in paper.CASES.items()
+        ]
+        yield Table((f"per {paper.ROLLOUTS:,} rollouts", *paper.METHODS), tuple(rows), "The paper")
+    yield Paragraph("Lines on the bars: the standard deviation over seeds to either side.")
+
+
+def success(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
+    """Curves of the share of successful episodes."""
+    yield Heading(scope.titled("Success"))
+    for (task, condition), own in by_condition([arm for arm in arms if tells_of_success(arm.rows)]).items():
+        panel = success_panel(_runs(own))._replace(marks=marks_of(condition))
+        title = f"{described(task, condition)}, success"
+        yield scope.figure("success", title, Curves((panel,), "share of episodes with success"))
+    if any(arm.published for arm in arms):
+        told = ", ".join(f"{name} by {short(steps)} steps" for name, steps in paper.SUCCESS_STEPS.items())
+        yield Paragraph(f"In the paper success is near 100 % for {told}.")
+
+
+def provenance(arms: Sequence[Arm], more: Sequence[str] = ()) -> Iterator[Part]:
+    """Versions, commit, device and wall time of every run."""
+    manifests = [manifest for arm in arms for manifest in arm.manifests]
+    if not manifests:
+        return
+    seconds = [value for arm in arms for value in arm.seconds]
+    versions = [f"{name} {version}" for one in manifests for name, version in one.versions.items()]
+    yield Heading("Where the numbers come from")
+    lines = [
+        *more,
+        f"Versions: {', '.join(dict.fromkeys(versions))}",
+        f"Commit: {', '.join(sorted({one.commit or 'unknown' for one in manifests}))}",
+        f"Device: {', '.join(sorted({_device(one) for one in manifests}))}",
+    ]
+    if seconds:
+        runs = f"{len(seconds)} run{'s' * (len(seconds) > 1)}"
+        lines.append(f"Wall time: {duration(sum(seconds))} in {runs}" + ", one after another" * (len(seconds) > 1))
+    yield Items(tuple(lines))
+
+
+def commands(lines: Sequence[str], runs: Sequence[str], told: str) -> Iterator[Part]:
+    """The commands that have made the report, and those of the runs."""
+    yield Heading("Commands")
+    yield Commands(tuple(lines))
+    if runs:
+        yield Paragraph(told)
+        yield Commands(tuple(runs))
+
+
+def described(task: str, condition: Sequence[str]) -> str:
+    """Return a task and what was changed there in words."""
+    return ", ".join(filter(None, (task, _changes(condition))))
+
+
+def marks_of(condition: Sequence[str]) -> list[tuple[int, str]]:
+    """Return where something changes, and what."""
+    return by_step(perturbations_of(condition))
+
+
+def plain(value: Any) -> str:
+    """Return a hyperparameter as people write it."""
+    if isinstance(value, tuple | list):
+        return " ".join(map(str, value))
+    if isinstance(value, float):
+        return f"{value:g}"
+    return "" if value is None else f"{value:,}" if type(value) is int else str(value)
+
+
+def _changes(condition: Sequence[str]) -> str:
+    return ", ".join(f"{text} after step {step:,}" if step else text for step, text in marks_of(condition))
+
+
+def _runs(arms: Sequence[Arm]) -> list[tuple[str, np.ndarray]]:
+    return [(arm.label, arm.rows) for arm in arms]
+
+
+def _pictures(arms: Sequence[Arm]) -> list[tuple[str, list[Arm]]]:
+    """Return the arms picture by picture: all in one, or by variant where they would be too many."""
+    groups = _variants(arms)
+    if len(arms) <= MOST_CURVES or min(map(len, groups.values())) == 1:
+        return [("", list(arms))]
+    return list(groups.items())
+
+
+def _variants(arms: Sequence[Arm]) -> dict[str, list[Arm]]:
+    """Return the arms by what stands before the first comma of their labels."""
+    groups: dict[str, list[Arm]] = {}
+    for arm in arms:
+        groups.setdefault(arm.label.partition(", ")[0], []).append(arm)
+    return groups
+
+
+def _trends(arms: Sequence[Arm]) -> Iterator[tuple[str, Trend]]:
+    """Return the maximum average returns over a hyperparameter, where variants differ in that number alone."""
+    swept: dict[str, list[Line]] = {}
+    for variant, own in _variants(arms).items():
+        names = {name for arm in own for name in arm.hyperparameters}
+        differing = [name for name in names if len({plain(arm.hyperparameters.get(name)) for arm in own}) > 1]
+        if len(differing) == 1 and all(_is_positive(arm.hyperparameters.get(differing[0])) for arm in own):
+            own = sorted(own, key=lambda arm: arm.hyperparameters[differing[0]])
+            swept.setdefault(differing[0], []).append(_line(variant, differing[0], own))
+    for name, lines in swept.items():
+        symbol = SYMBOLS.get(name)
+        told = f"{symbol} ({name.replace('_', ' ')})" if symbol else name.replace("_", " ")
+        yield symbol or name.replace("_", " "), Trend(tuple(lines), told, "maximum average return")
+
+
+def _line(label: str, name: str, arms: Sequence[Arm]) -> Line:
+    over = [arm.maximum() for arm in arms]
+    mean, std = (np.array([getattr(one, field) for one in over]) for field in ("mean", "std"))
+    x = tuple(float(arm.hyperparameters[name]) for arm in arms)
+    return Line(label, x, *(tuple(values.tolist()) for values in (mean, mean - std, mean + std)))
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and value > 0
+
+
+def _case_panels(told: Sequence[tuple[Arm, np.ndarray]], is_whole: bool) -> list[BarPanel]:
+    happens = case_names([rows for _, rows in told])
+    names = [name for name, is_case in happens.items() if is_case and name != "success"]  # which has its own curves
+    return [
+        BarPanel(tuple(_case_bar(arm, rows, name, is_whole) for arm, rows in told), name.replace("_", " "))
+        for name in names
+    ]
+
+
+def _case_bar(arm: Arm, rows: np.ndarray, name: str, is_whole: bool) -> Bar:
+    found = cases_of(rows, {name: True})
+    published = paper.CASES.get(name, {}).get(arm.published or "") if is_whole else None
+    if not found:
+        return Bar(arm.label, math.nan, math.nan, math.nan)
+    return bar_over_seeds(arm.label, found[0].over_seeds, published.mean if published else math.nan, ROLLOUTS)
+
+
+def _device(manifest: Manifest) -> str:
+    return f"{manifest.device} ({manifest.machine.processor})" if manifest.machine.processor else manifest.device

@@ -1,0 +1,199 @@
+"""`csac report`: runs side by side, as a report and as a table of a page."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+from made import make_run_of
+
+from csac.cli import main
+
+ROWS = "seed,step,episode,return,length,success"
+
+
+def csac(line):
+    return main(shlex.split(line))
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def write_rows(name, seeds, columns="", values=""):
+    """A file of evaluations at 10, 20, ...: `seeds` [seed][point] are the returns."""
+    rows = [
+        f"{seed},{10 * (t + 1)},0,{value},5,{values}" for seed, line in enumerate(seeds) for t, value in enumerate(line)
+    ]
+    Path(f"{name}.csv").write_text("\n".join([ROWS + columns, *rows, ""]))
+
+
+def table_of(options="", **runs):
+    """The lines of the table that is written between the markers of a page."""
+    for name, seeds in runs.items():
+        write_rows(name, seeds)
+    Path("page.md").write_text("before\n<!-- it: begin -->\nold\n<!-- it: end -->\nafter\n")
+    labels = " ".join(f"--label {name}={name}.csv" for name in runs)
+    assert csac(f"report --into page.md#it {labels} {options}") == 0
+    first, begin, *lines, end, last = Path("page.md").read_text().splitlines()
+    assert (first, begin, end, last) == ("before", "<!-- it: begin -->", "<!-- it: end -->", "after")
+    return lines
+
+
+# One table.
+
+
+def test_three_seeds_have_no_interquartile_mean():
+    head, _, row = table_of(few=[[40.0], [50.0], [60.0]])
+    assert "IQM" not in head
+    assert row == "| few | 3 | 10 | 50 ± 10 | 25 to 75 | 1.00 | 50 at 10 |"  # 10 / sqrt(3) * t(2) = 24.8
+
+
+def test_five_seeds_have_one_with_its_interval():
+    head, _, few, many, outlier = table_of(
+        few=[[40.0], [50.0], [60.0]],
+        many=[[0.0, 100.0, 100.0, 100.0]] * 5,
+        outlier=[[100.0], [200.0], [300.0], [400.0], [10_000.0]],
+    )
+    assert head.endswith("| maximum average return | IQM, 95 % bootstrap interval | above the first, probability |")
+    assert few.endswith("| 50 at 10 | 50 |  |")  # too few for an interval
+    assert many.endswith("| 2.00 | 100 at 20 | 100 (100 to 100) | 1.00 |")  # of the last three evaluations
+    assert "| 300 (" in outlier  # the mean of 200, 300 and 400; the mean of all is 2200
+
+
+def test_two_seeds_and_one_have_no_interval():
+    _, _, two, one = table_of(two=[[40.0], [60.0]], one=[[30.0]])
+    assert two == "| two | 2 | 10 | 50 ± 14 | 2 seeds: no interval | 1.00 | 50 at 10 |"
+    assert one == "| one | 1 | 10 | 30 | 1 seed: no interval | 0.60 | 30 at 10 |"
+
+
+def test_what_a_change_cost_several_runs():
+    lines = table_of(
+        "--table recovery --perturb friction=2@20",
+        A=[[100, 100, 40, 95], [100, 100, 100, 100]],
+        B=[[100, 100, 40, 40], [100, 100, 50, 60]],
+    )
+    assert lines[2:] == [
+        "| A | 0 | 100.0 | 60.0 | 60% | 20 | 625 | 67.5 | 60.0 |",
+        "| A | 1 | 100.0 | 0.0 | 0% | 0 | 0 | 100.0 | 0.0 |",
+        "| A | mean | 100.0 | 30.0 | 30% | 10 | 312 | 83.8 | 30.0 |",
+        "| A | ± std | 0.0 | 42.4 | 42% | 14 | 442 | 23.0 | 42.4 |",
+        "| B | 0 | 100.0 | 60.0 | 60% | never | 900 | 40.0 | 60.0 |",
+        "| B | 1 | 100.0 | 50.0 | 50% | never | 700 | 55.0 | 50.0 |",
+        "| B | mean | 100.0 | 55.0 | 55% | 0 of 2 | 800 | 47.5 | 55.0 |",
+        "| B | ± std | 0.0 | 7.1 | 7% |  | 141 | 10.6 | 7.1 |",
+    ]
+
+
+def test_what_comes_later_is_left_out():
+    _, _, row = table_of("--until 20", a=[[10.0, 20.0, 99.0], [30.0, 40.0, 99.0]])
+    assert row == "| a | 2 | 20 | 25 ± 14 | 2 seeds: no interval | 1.00 | 30 at 20 |"
+
+
+def test_files_of_one_label_are_one_arm():
+    write_rows("a", [[10.0]])
+    Path("b.csv").write_text(f"{ROWS},extra\n7,10,0,30,5,,1\n")  # another seed, and a column that a has not got
+    assert table_of("--label both=a.csv,b.csv")[2].startswith("| both | 2 | 10 | 20 ± 14 |")
+
+
+def test_how_rollouts_end():
+    Path("cases.csv").write_text(f"{ROWS},crash\n0,10,0,30,5,,1\n0,10,1,50,5,,0\n1,10,0,60,5,,0\n1,10,1,60,5,,0\n")
+    assert table_of("--table cases --label it=cases.csv") == [
+        "| per 1,000 rollouts (from 2 of each seed) | it |",
+        "| --- | ---: |",
+        "| return (mean) | 50.0 ± 14.1 |",
+        "| crash | 250.0 ± 353.6 |",
+    ]
+
+
+def test_the_curves_of_one_task_are_a_picture():
+    write_rows("a", [[10.0, 20.0]])
+    assert csac("report --curve curve.png --title T --label a=a.csv --perturb friction=2@10") == 0
+    assert Path("curve.png").stat().st_size > 10_000
+    assert sorted(path.name for path in Path().iterdir()) == ["a.csv", "curve.png"]
+
+
+# A report of runs.
+
+
+def report(line):
+    """The Markdown of a report, whose page says the same."""
+    assert csac(f"report {line} --out out/report.html") == 0
+    page, text = (Path(f"out/report.{kind}").read_text() for kind in ("html", "md"))
+    assert page.startswith("<!doctype html>")
+    return text
+
+
+def test_runs_that_differ_in_their_seeds_alone_are_one_arm():
+    make_run_of("runs/a", [[10.0, 20.0]], seeds=(0,))
+    make_run_of("runs/b", [[30.0, 40.0]], seeds=(1,))
+    make_run_of("runs/c", [[5.0, 5.0]], hyperparameters={"discount": 0.9})
+    make_run_of("runs/d", [[1.0, 2.0]], algorithm="csac")
+    text = report("runs")
+    assert "| SAC, discount 0.99 | 30 ± 14 | 20 | 2 |" in text
+    assert "| SAC, discount 0.9 | 5.00 | 10 | 1 |" in text
+    assert "| CSAC | 2.00 | 20 | 1 |" in text
+    assert "| discount | 0.99 | 0.9 | 0.99 |" in text
+    assert "| batch_size | 8 |" in text.partition("the same in all")[2]
+    assert "csac report runs --out out/report.html\n" in text
+    assert "csac train Hopper-v4 --seeds 1\n" in text
+    assert "Commit: 0123456" in text
+
+
+def test_a_report_tells_of_perturbations_success_and_what_failed():
+    returns = [[100.0, 40.0, 90.0], [100.0, 60.0, 95.0], [100.0, 0.0, 0.0]]
+    make_run_of("runs/a", returns, perturbations=("friction=2@10",), failures={2: "critic is not finite"}, success=1)
+    text = report("runs/a")
+    assert "SAC, seed 2 failed: critic is not finite" in text
+    assert "**Hopper-v4, friction x 2 after step 10**" in text
+    assert "| mean | 100.0 | 50.0 | 50% |" in text  # of two seeds
+    assert "## Success" in text
+    assert "| success | 1,000.0 ± 0.0 |" in text
+    assert {path.suffix for path in Path("out").iterdir()} == {".html", ".md", ".png", ".svg"}
+
+
+def test_equal_runs_with_equal_seeds_stand_side_by_side():
+    for name in ("a", "b"):
+        make_run_of(f"runs/{name}", [[10.0]])
+    text = report("runs/a runs/b/evaluations.csv")
+    assert "| SAC, runs/a | 10.00 |" in text
+    assert "| SAC, runs/b | 10.00 |" in text
+
+
+def test_a_run_without_evaluations_is_told():
+    make_run_of("runs/a", [])
+    text = report("runs/a")
+    assert "| runs/a | Hopper-v4 | sac |" in text
+    assert "## Learning curves" not in text
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("report", "there is nothing to report on: give run directories"),
+        ("report nowhere", "nowhere does not exist; give a run directory"),
+        ("report --label a", "--label is written NAME=DIR,DIR, not 'a'"),
+        ("report --label a=a.csv,", "--label is written NAME=DIR,DIR, not 'a=a.csv,'"),
+        ("report --label a=a.csv,a.csv", "a: a.csv and a.csv both hold seed 0; label them apart"),
+        ("report --label a=a.csv --into page.md", "--into is written FILE.md#NAME, not 'page.md'"),
+        ("report --label a=a.csv --into page.md#x", "the page lacks the lines <!-- x: begin -->"),
+        ("report --label a=a.csv --into none.md#x", "cannot write into none.md"),
+        ("report --label a=a.csv --into page.md#it --table cases", "these runs have no table of cases"),
+        ("report --label a=a.csv --curve a.gif", "a picture is a .png, .pdf or .svg file, not a.gif"),
+        ("report --label a=a.csv --out a.pdf", "the report is a page: name it a.html"),
+        ("report --label a=a.csv --out page.md/a.html", "cannot write page.md/a.html"),
+        ("report --label a=a.csv --perturb frction=2", "no perturbation is called 'frction': did you mean friction?"),
+        ("report --label a=run,other", "a: its runs learn Ant-v4 and Hopper-v4; give each a label of its own"),
+        ("report run other --curve a.png", "these runs are of several tasks"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(capsys, line, message):
+    write_rows("a", [[1.0]])
+    make_run_of("run", [[1.0]])
+    make_run_of("other", [[1.0]], seeds=(1,), task="Ant-v4")
+    Path("page.md").write_text("<!-- it: begin -->\n<!-- it: end -->\n")
+    before = sorted(path.name for path in Path().iterdir())
+    assert csac(line) == 2
+    (complaint,) = capsys.readouterr().err.splitlines()
+    assert message in complaint
+    assert sorted(path.name for path in Path().iterdir()) == before

@@ -1,0 +1,68 @@
+"""Every table in results/ follows from the rows beside it: the commands in a page write the tables that stand there."""
+
+import csv
+import re
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from chaos import MARKERS, Kill, summary
+
+from csac.cli import main
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "results").glob("**/README.md"))
+TABLE = re.compile(r"^\|.*\|\n\| ?:?---", re.MULTILINE)
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The words of each `csac report` that a page names."""
+    blocks = "\n".join(re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL))
+    lines = blocks.replace("\\\n", " ").splitlines()
+    return [words[1:] for words in map(shlex.split, lines) if words[:2] == ["csac", "report"]]
+
+
+WITH_COMMANDS = [page for page in PAGES if commands(page)]
+
+
+@pytest.fixture
+def copied(tmp_path, monkeypatch):
+    """A copy of the rows and pages, without the pictures."""
+    shutil.copytree(ROOT / "results", tmp_path / "results", ignore=shutil.ignore_patterns("*.png"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.parent.name)
+def test_the_commands_of_a_page_write_its_tables(copied, page):
+    there = copied / page.relative_to(ROOT)
+    emptied = re.sub(r"(<!-- (\S+): begin -->\n).*?(<!-- \2: end -->)", r"\1\3", page.read_text(), flags=re.DOTALL)
+    there.write_text(emptied)
+    for words in commands(page):
+        if "--curve" in words:  # which would take a second each, and is another's test
+            place = words.index("--curve")
+            del words[place : place + 2]
+        assert main(words) == 0
+    assert there.read_text() == page.read_text()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
+def test_no_table_of_numbers_is_written_by_hand(page):
+    """What stands between markers is written by a command; any other table may only list files and commands."""
+    text = re.sub(r"<!-- (\S+): begin -->.*?<!-- \1: end -->", "", page.read_text(), flags=re.DOTALL)
+    text = re.sub(f"{MARKERS[0]}.*?{MARKERS[1]}", "", text, flags=re.DOTALL)
+    headings = [match.group().splitlines()[0] for match in TABLE.finditer(text)]
+    assert set(headings) <= {"| file | command |"}
+
+
+def test_the_table_of_kills_follows_from_its_rows():
+    folder = ROOT / "results" / "reliability"
+    with open(folder / "chaos.csv", newline="") as file:
+        kills = [Kill(**{name: _value(row.get(name, "")) for name in Kill._fields}) for row in csv.DictReader(file)]
+    assert f"{MARKERS[0]}\n{summary(kills)}\n{MARKERS[1]}" in (folder / "README.md").read_text()
+
+
+def _value(text: str) -> Any:
+    return int(text) if text.lstrip("-").isdecimal() else text or None
