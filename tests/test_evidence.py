@@ -25,11 +25,16 @@ def rows(curves: Mapping[int, Sequence[float]]) -> np.ndarray:
 
 
 def arm(method: Method, curves: Mapping[int, Sequence[float]], failed: tuple[int, ...] = (), condition=()) -> Arm:
-    records: list[Any] = [
-        SimpleNamespace(manifest=SimpleNamespace(seeds=[seed]), evaluations=rows({seed: curve}), rollouts=None)
-        for seed, curve in curves.items()
-    ]
-    return Arm(method, "Hopper-v4", condition, records, dict.fromkeys(failed, "NaN"))
+    manifests: list[Any] = [SimpleNamespace(seeds=[seed]) for seed in curves]
+    evaluations = [rows({seed: curve}) for seed, curve in curves.items()]
+    return Arm(
+        method.label,
+        "Hopper-v4",
+        condition,
+        manifests=manifests,
+        evaluations=evaluations,
+        failures=dict.fromkeys(failed, "NaN"),
+    )
 
 
 def test_the_final_return_is_the_mean_of_the_last_fifth():

@@ -71,7 +71,7 @@ def measured(study: Study, arms: list[Arm]) -> dict[str, dict[str, Measured]]:
     found: dict[str, dict[str, Measured]] = {}
     for task in study.tasks:
         here = [arm for arm in arms if arm.task == task]
-        over = [{record.manifest.seeds[0] for record in arm.records} | set(arm.failures) for arm in here]
+        over = [{manifest.seeds[0] for manifest in arm.manifests} | set(arm.failures) for arm in here]
         seeds = sorted(set.intersection(*over))
         if seeds:
             found[task] = {arm.label: measure(arm, study.steps_for(task), seeds) for arm in here}

@@ -315,12 +315,14 @@ def iterate(sigma, tau, iterations, estimator: Any = "sampled", first_q=FIRST_Q,
         value = -expected_loss(algorithm, log_policy, log_before, q)
         return log_policy, value, expected_target(algorithm, log_policy, log_before, q)
 
+    iterates = []  # and not one by one: between two of a generator's, float64 would stay on for everybody
     with jax.enable_x64(True):
         q, log_policy = jnp.array(first_q), jnp.array(FIRST_POLICY)
         for _ in range(iterations):
             before = q
             log_policy, value, q = step(q, log_policy)
-            yield np.asarray(before), np.asarray(log_policy), np.asarray(value)
+            iterates.append((np.asarray(before), np.asarray(log_policy), np.asarray(value)))
+    return iterates
 
 
 def soft_value_iteration(sigma):
