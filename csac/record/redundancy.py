@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 PIECES = 64
-SMALLEST = 8_192  # bytes of a piece: a page of 4,096 that cannot be read is mended in a small file too
+SMALLEST = 4104  # bytes of a piece, or more: a damaged page of 4,096 leaves a gap that tells where it begins
 
 
 def parity_of(content: bytes) -> bytes:

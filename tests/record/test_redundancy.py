@@ -37,9 +37,18 @@ def test_the_parity_of_a_large_file_is_a_64th_of_it():
 def test_bytes_that_lie_together_are_mended(size, where, share, seed):
     content = random_bytes(size, seed)
     parity = parity_of(content)
-    spoiled = damaged(content, int(where * size), max(1, int(share * len(parity))))
+    most = len(parity) - 8  # a piece but for a word, at least the 4,096 bytes that are promised
+    assert most >= 4096
+    spoiled = damaged(content, int(where * size), max(1, int(share * most)))
     assert spoiled != content
     assert mended(spoiled, size, parity, lambda guess: guess == content) == content
+
+
+@pytest.mark.parametrize("begin", [0, 1, 4095, 4103, 8193, 12_000])
+def test_a_page_that_begins_anywhere_in_a_small_file_is_mended(begin):
+    content = random_bytes(16_386)
+    spoiled = damaged(content, begin, 4096)
+    assert mended(spoiled, len(content), parity_of(content), lambda guess: guess == content) == content
 
 
 @pytest.mark.parametrize("length", [1, 4096])

@@ -60,7 +60,7 @@ def stranger(tmp_path, monkeypatch):
         manifest = Manifest(task=task, algorithm="csac", seeds=(0,), steps=9, state="finished", steps_done=9)
         RunDirectory.create(path, manifest)
         (path / "policy").mkdir()
-        random_policy(contract()).save(path / "policy" / "seed_0.safetensors")
+        random_policy(contract()).save_layers(path / "policy" / "seed_0.safetensors")
         contract().save(path / "policy" / "contract.json")
         return path
 
