@@ -30,7 +30,7 @@ def test_a_node_that_is_lost_in_mid_run_loses_nothing(tmp_path, cluster, monkeyp
     monkeypatch.setattr("csac.studies.cluster.SECONDS_BETWEEN_LOOKS", 0.05)
     three = jobs(tmp_path / "ray", *(cell(seed, steps=STEPS) for seed in range(3)))
     nodes = [cluster.add_node(num_cpus=1, object_store_memory=100 * 2**20) for _ in range(2)]
-    messages, places = [], {}
+    messages, places, interrupted = [], {}, []
 
     def tell(message):
         messages.append(message)
@@ -39,15 +39,17 @@ def test_a_node_that_is_lost_in_mid_run_loses_nothing(tmp_path, cluster, monkeyp
         if isinstance(message, Advanced) and message.step >= 500 and len(cluster.worker_nodes) == 2 and nodes:
             (lost,) = [node for node in nodes if node.node_id.startswith(places[message.key][-1])]
             nodes.clear()
+            interrupted.append(message.key)
             cluster.remove_node(lost, allow_graceful=False)
 
     run_on_ray(three, tell, cluster.address, Request())
     assert {message.key: message.outcome for message in messages if isinstance(message, Ended)} == {
         job.cell.key: "complete" for job in three
     }
-    (again,) = [job for job in three if RunDirectory.open(job.path).manifest.history]
+    # Ray may have begun a second cell on that node, while the first was waiting to be heard: it goes on elsewhere too.
+    (again,) = [job for job in three if job.cell.key in interrupted]
     assert len(set(places[again.cell.key])) == 2
-    (entry,) = RunDirectory.open(again.path).manifest.history
+    entry, *_ = RunDirectory.open(again.path).manifest.history
     assert entry.step >= 360
     for job, alone in zip(three, jobs(tmp_path / "alone", *(job.cell for job in three)), strict=True):
         run_here([alone], lambda _: None)
