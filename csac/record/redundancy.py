@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 PIECES = 64
-SMALLEST = 4104  # bytes of a piece, or more: a damaged page of 4,096 leaves a gap that tells where it begins
+SMALLEST = 8192  # bytes of a piece, or more: a damaged page of 4,096 leaves more than it may hold by chance unharmed
 
 
 def parity_of(content: bytes) -> bytes:

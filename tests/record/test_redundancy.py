@@ -37,7 +37,7 @@ def test_the_parity_of_a_large_file_is_a_64th_of_it():
 def test_bytes_that_lie_together_are_mended(size, where, share, seed):
     content = random_bytes(size, seed)
     parity = parity_of(content)
-    most = len(parity) - 8  # a piece but for a word, at least the 4,096 bytes that are promised
+    most = len(parity) - 8  # a piece but for a word, more than the 4,096 bytes that are promised
     assert most >= 4096
     spoiled = damaged(content, int(where * size), max(1, int(share * most)))
     assert spoiled != content
