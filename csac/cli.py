@@ -353,7 +353,7 @@ def _tune(arguments: list[str]) -> int:
     algorithm = getattr(options, chosen.algorithm)
     from csac.record.run import StorageFailure
     from csac.studies.search_space import searched
-    from csac.studies.tune import Question
+    from csac.studies.shared_study import Question
     from csac.studies.tune_command import run_tune
     from csac.training.options import Options
 

@@ -171,6 +171,20 @@ def now() -> str:
     return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
+def is_locked(path: str | Path) -> bool:
+    """Whether a process holds the lock of this file, on this machine or on another that shares the folder."""
+    if fcntl is None:
+        return False
+    try:
+        with open(path) as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
 def is_run(path: str | Path) -> bool:
     """Whether there is a run in this directory, sound or not."""
     return (Path(path) / MANIFEST).exists()

@@ -15,15 +15,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_type_h
 from csac.algorithms import ALGORITHMS
 from csac.console.tables import short
 from csac.record.atomic import write_atomically
-from csac.record.run import LOCK, MANIFEST, RunDirectory, is_run
+from csac.record.run import LOCK, MANIFEST, RunDirectory, is_locked, is_run
 from csac.tasks.known import events_of
 from csac.tasks.perturbations import perturbations_of
 from csac.types import InputError
-
-try:
-    import fcntl
-except ImportError:  # Windows: there is no lock to ask for
-    fcntl = None
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -217,17 +212,8 @@ def similar(word: str, known: Iterable[str]) -> str:
 
 
 def is_in_use(path: Path) -> bool:
-    """Whether a process holds the lock of this run, on this machine or on another that shares the folder."""
-    if fcntl is None:
-        return False
-    try:
-        with open(path / LOCK) as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
+    """Whether a process holds the lock of this run."""
+    return is_locked(path / LOCK)
 
 
 def read_history(path: Path) -> dict[str, Any]:

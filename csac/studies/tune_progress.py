@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console, RenderableType
 
-    from csac.studies.tune import Attempt, Result, SharedStudy
+    from csac.studies.shared_study import Attempt, Result, SharedStudy
 
 BAR_WIDTH = 24
 

@@ -19,14 +19,14 @@ from csac.record.atomic import write_atomically
 from csac.record.plots import COLOURS, STYLE, save
 from csac.record.rendering import EMPTY, Cell, Row, Table, markdown, number, numeric
 from csac.studies.figures import FORMATS
-from csac.studies.tune import OBJECTIVE
+from csac.studies.shared_study import OBJECTIVE
 from csac.training.options import Options
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from csac.studies.tune import Question, Result, SharedStudy
+    from csac.studies.shared_study import Question, Result, SharedStudy
 
 FEWEST_FOR_IMPORTANCES = 50  # complete trials: the best tenth, which they rest on, has five of them then
 REPORT_SEEDS = 5  # of the command for the best configuration

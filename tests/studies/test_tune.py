@@ -24,7 +24,8 @@ from csac.record.rendering import markdown
 from csac.record.run import RunDirectory
 from csac.studies.job import Stopped
 from csac.studies.search_space import SPACES, searched, space_table
-from csac.studies.tune import Question, SharedStudy, tune
+from csac.studies.shared_study import Question, SharedStudy
+from csac.studies.tune import tune
 from csac.studies.tune_progress import TuneProgress
 from csac.studies.tune_report import FEWEST_FOR_IMPORTANCES, best_command, caveat, trials_table, write_report
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED, TUNING_EVALUATION_SEED

@@ -11,7 +11,8 @@ from csac.algorithms import SAC
 from csac.record.manifest import EvaluationPlan, Manifest
 from csac.record.run import RunDirectory, is_run
 from csac.studies.search_space import searched
-from csac.studies.tune import Attempt, Question, Result, SharedStudy, Watcher
+from csac.studies.shared_study import Attempt, Question, Result, SharedStudy
+from csac.studies.tune import Watcher
 from csac.training.interruptions import Interrupted
 
 Value = Callable[[Any, int, int], float]  # of an algorithm, a seed and a step
