@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equations import ONE, batch_of, linear, transition
 
 from csac.algorithms import sd3 as file
 from csac.algorithms.networks import MLP
 from csac.algorithms.sd3 import SD3, Pair, State, actor_loss, critic_loss, log_density, softmax_operator
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.types import InputError, Layer, Spec, Transition
+from csac.types import InputError, Spec, Transition
 
-ONE = Spec(1, 1)
 LINEAR: dict[str, Any] = {
     "actor_hidden_sizes": (),
     "critic_hidden_sizes": (),
@@ -30,23 +30,9 @@ LINEAR: dict[str, Any] = {
 }
 
 
-def linear(weight: list[list[float]], bias: list[float]) -> MLP:
-    return MLP((Layer(jnp.array(weight), jnp.array(bias)),))
-
-
 def always(action: float) -> MLP:
     """An actor whose action is this one everywhere."""
     return linear([[0.0]], [math.atanh(action)])
-
-
-def transition(observation=1.0, action=0.5, reward=2.0, next_observation=1.0, terminated=0.0, truncated=0.0):
-    observation, action, next_observation = (np.array([x], np.float32) for x in (observation, action, next_observation))
-    reward, terminated, truncated = (np.array(x, np.float32) for x in (reward, terminated, truncated))
-    return Transition(observation, action, reward, next_observation, terminated, truncated)
-
-
-def batch_of(*transitions: Transition) -> Transition:
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *transitions)
 
 
 @partial(jax.jit, static_argnums=0)
