@@ -128,16 +128,19 @@ def _work(job: Job, cores: int, messages: Any) -> Ended:
     import ray
 
     with _Cores(cores):
-        node = ray.get_runtime_context().get_node_id()
-        messages.put(Started(job.cell.key, f"{platform.node()} {node[:6]}"))
+        node, sent = ray.get_runtime_context().get_node_id(), []
 
         def tell(message: Message) -> None:
-            messages.put(message)
+            # Nobody waits until it was heard: Ray would lend the core of who waits to another cell.
+            sent.append(messages.actor.put.remote(message))
 
+        tell(Started(job.cell.key, f"{platform.node()} {node[:6]}"))
         try:
             return execute(job, tell)
         except Stopped:
             return Ended(job.cell.key, "stopped")
+        finally:
+            ray.wait(sent, num_returns=len(sent))
 
 
 class _Cores:
