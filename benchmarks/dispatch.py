@@ -6,6 +6,7 @@
 `asynchronous`  updates alone, with JAX's asynchronous dispatch on and off
 `training`      the same with HalfCheetah-v4, without evaluation
 `evaluation`    whole intervals of 5,000 steps: no evaluation, in line, and beside
+`copies`        updates alone, with and without XLA's region analysis of what it need not copy
 `first`         several updates in one dispatch: what the first costs more than those that follow it
 
 A ratio is that of two measurements of one round. Processes of one kind differ, so each repetition starts new ones.
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import statistics
 import time
 from itertools import count
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 WARMUP = 500
+REGIONS = "--xla_cpu_copy_insertion_use_region_analysis=true"
 Rates = dict[str, list[float]]
 
 
@@ -43,6 +46,7 @@ class Variant(NamedTuple):
     interval: int = 1  # updates in one dispatch
     seeds: int = 1  # side by side in one program
     evaluation: str | None = None  # None: no environment at all; else "off", "in line" or "beside"
+    flags: str = ""  # of XLA
 
 
 def suites() -> dict[str, dict[str, list[Variant]]]:
@@ -63,6 +67,10 @@ def suites() -> dict[str, dict[str, list[Variant]]]:
             ]
             for on in (True, False)
         },
+        "copies": {
+            title: [Variant("default", *setting), Variant("region", *setting, flags=REGIONS)]
+            for title, setting in alone.items()
+        },
         "first": {
             title: [Variant(f"{n} in one", *setting, interval=n) for n in (1, 2, 4, 8)]
             for title, setting in alone.items()
@@ -74,6 +82,7 @@ def work(connection: Connection, variant: Variant) -> None:
     """Make steps as told, (cores, steps), and answer (seconds, processor seconds); begin with the warm-up."""
     die_with_parent()
     move_to(variant.cores)
+    os.environ["XLA_FLAGS"] = variant.flags
     import jax
 
     jax.config.update("jax_platforms", "cpu")

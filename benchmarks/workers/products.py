@@ -49,4 +49,4 @@ def _multiplying(size: Product) -> Callable[[], jax.Array]:
         return jax.lax.fori_loop(0, TOGETHER, again, (left, jnp.zeros((len(left), right.shape[1]))))[1]
 
     multiply(left, right)
-    return lambda: multiply(left, right)
+    return lambda: multiply(left, right).block_until_ready()  # a call alone is only the dispatch
