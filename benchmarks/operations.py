@@ -66,7 +66,10 @@ def update_products(
     observation: int = OBSERVATION,
     action: int = ACTION,
 ) -> dict[Product, float]:
-    """Return how often one update needs each product: TD3's the mean over its delay, SD3's that of both its pairs."""
+    """Return how often one update needs each product: TD3's the mean over its delay, SD3's that of both its pairs.
+
+    CSAC's are those of the paper's Algorithm 1, whose reference is the actor itself: it needs what SAC needs.
+    """
     stochastic = Network((observation, *hidden, 2 * action))
     deterministic = Network((observation, *hidden, action))
     critic = Network((observation + action, *hidden, 1))
@@ -74,10 +77,7 @@ def update_products(
     if algorithm in ("csac", "sac"):
         counts = stochastic.forward(batch) + _times(2, critic.forward(batch))  # the target
         counts += _times(2, critic.learning(batch))
-        counts += stochastic.learning(batch) + _times(2, through_critic)
-        if algorithm == "csac":
-            counts += _times(2, stochastic.forward(batch))  # the reference, in the target and in the actor's loss
-        return dict(counts)
+        return dict(counts + stochastic.learning(batch) + _times(2, through_critic))
     if algorithm == "td3":
         always = deterministic.forward(batch) + _times(2, critic.forward(batch)) + _times(2, critic.learning(batch))
         delayed = deterministic.learning(batch) + through_critic

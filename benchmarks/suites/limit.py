@@ -53,10 +53,10 @@ SETTINGS = [
     *(Setting("update alone", name, cores=1) for name in ("csac", "sac", "td3", "sd3")),
     *(Setting("update alone", name) for name in ("csac", "sac", "td3", "sd3")),
     *(Setting("update alone", name, interval=10) for name in ("csac", "sac", "td3")),
-    Setting("training", "csac", cores=1),
+    Setting("training", "csac", cores=1, aim=78),
     Setting("training", "csac", aim=60),
     Setting("training", "csac", interval=10),
-    Setting("training", "csac", seeds=5, aim=72),
+    Setting("training", "csac", seeds=5, aim=75),
     Setting("training, evaluation on", "csac"),
     Setting("training, evaluation on", "csac", seeds=5),
 ]
