@@ -55,8 +55,10 @@ class Learner:
         begin = jax.jit(self._axis.map(self._one.begin), compiler_options={"xla_backend_optimization_level": 1})
         keys = [np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds]
         self._carry: Carry = begin(self._axis.stack(keys))
+        # JAX pairs what is donated with what comes out by order and shape. So the carry comes out first, and is kept
+        # whole where an algorithm does not read all of it: a shift by one would copy whole networks to and fro.
         self._explore, self._learn = (
-            jax.jit(self._axis.map(program, (0, 0, 0, None)), donate_argnums=0)
+            jax.jit(self._axis.map(program, (0, 0, 0, None)), donate_argnums=0, keep_unused=True)
             for program in (self._one.remember_and_explore, self._one.remember_and_learn)
         )
         self._explore_alone, self._act_alone = (
@@ -87,7 +89,7 @@ class Learner:
             program = self._learn
             self._updates_summed += self._cadence.updates_per_interval
         given = (self._axis.strip(self._waiting), self._axis.strip(outcome.observation), np.int32(step))
-        next_actions, self._carry = program(self._carry, *given)
+        self._carry, next_actions = program(self._carry, *given)
         self._waiting = np.zeros_like(self._waiting)  # JAX reads an argument where it lies, as long as the program runs
         return self._axis.restore(np.asarray(next_actions))
 
@@ -202,15 +204,15 @@ class OneSeed:
 
     def remember_and_explore(
         self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
-    ) -> tuple[jax.Array, Carry]:
-        """Add packed transitions [n, width]; return a uniformly random action."""
+    ) -> tuple[Carry, jax.Array]:
+        """Add packed transitions [n, width]; return what is carried on, and a uniformly random action."""
         carry = carry._replace(memory=carry.memory.add(rows, step - len(rows)))
-        return self.explore(carry, observation, step), carry
+        return carry, self.explore(carry, observation, step)
 
     def remember_and_learn(
         self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
-    ) -> tuple[jax.Array, Carry]:
-        """Add packed transitions [n, width], make all updates that are due; return the new policy's action."""
+    ) -> tuple[Carry, jax.Array]:
+        """Add packed transitions [n, width] and make all updates that are due; return also the new policy's action."""
         memory = carry.memory.add(rows, step - len(rows))
         draw_key, update_key, _ = _keys(carry.key, step)
         first = self._updates_before(step)
@@ -227,7 +229,7 @@ class OneSeed:
         else:
             state, sums = jax.lax.fori_loop(0, self.algorithm.cadence.updates_per_interval, update, learnt)
         action = self._act(state, carry.key, observation, step)
-        return action, Carry(self.packing.pack(state), memory, sums, carry.key)
+        return Carry(self.packing.pack(state), memory, sums, carry.key), action
 
     def _first_metrics(self, state: Any, memory: Any, key_data: jax.Array) -> dict[str, jax.Array]:
         key = jax.random.wrap_key_data(key_data)

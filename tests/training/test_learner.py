@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import pytest
 import safetensors.numpy
 import trainer  # noqa: F401  (its cache of compiled programs)
 
-from csac.algorithms import CSAC, TD3
+from csac.algorithms import ALGORITHMS, CSAC, TD3
 from csac.tasks.seeds import Steps
 from csac.training.checkpoint import SCHEMA_VERSION, Checkpoint, Checkpoints, Damaged
 from csac.training.learner import Learner
@@ -75,6 +76,20 @@ def test_what_was_saved_of_each_seed_is_taken_back(seeds):
             np.testing.assert_array_equal(ours, theirs)
     assert again.metrics() == learner.metrics()
     np.testing.assert_array_equal(advance(again, len(seeds), 11, 14), advance(learner, len(seeds), 11, 14))
+
+
+SETTINGS = [(name, {}) for name in ALGORITHMS] + [("csac", {"reference_policy": "algorithm1"})]
+
+
+@pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=str)
+def test_what_a_seed_carries_is_updated_in_the_buffer_where_it_lies(name, changes):
+    # An argument that JAX drops would shift all that follow: `algorithm1` never reads the reference that it keeps.
+    learner = Learner(ALGORITHMS[name](**changes), SPEC, [0], 5_000)
+    given = jax.eval_shape(lambda: (learner._carry, learner.waiting(0), np.zeros(3, np.float32), np.int32(1)))
+    program = learner._learn.lower(*given).as_text()
+    (signature,) = re.findall(r"func.func public @main\((.*)\) ->", program)
+    outputs = [int(place) for place in re.findall(r"tf.aliasing_output = (\d+)", signature)]
+    assert outputs == list(range(len(jax.tree.leaves(learner._carry))))
 
 
 @pytest.mark.parametrize("interval", [1, 3])
