@@ -1,4 +1,4 @@
-"""Presets as data: (preset, algorithm, task) -> hyperparameters. `paper` is the paper's tables, `strong` our critic."""
+"""Presets as data: (preset, algorithm, task) -> hyperparameters. `paper` is the paper's tables."""
 
 from __future__ import annotations
 
@@ -96,19 +96,7 @@ _PAPER_TASKS: Mapping[tuple[str, str], Mapping[str, Any]] = MappingProxyType(
     }
 )
 
-# One setting for all tasks: docs/algorithms/critics.md says why, and that it is not yet confirmed.
-_STRONG_CRITIC: Mapping[str, Any] = MappingProxyType({"critic_normalisation": "batch", "critic_learning_rate": 1e-3})
-
-_STRONG: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {
-        "csac": {**_STRONG_CRITIC, "entropy_weight": "auto"},
-        "sac": {**_STRONG_CRITIC, "temperature": "automatic"},
-    }
-)
-
-_TABLES: Mapping[str, Mapping[str, Mapping[str, Any]]] = MappingProxyType({"paper": _PAPER, "strong": _STRONG})
-
-PRESETS: tuple[str, ...] = tuple(_TABLES)
+PRESETS: tuple[str, ...] = ("paper",)
 
 
 def hyperparameters(preset: str, algorithm: str, task: str) -> dict[str, Any]:
@@ -122,16 +110,14 @@ def hyperparameters(preset: str, algorithm: str, task: str) -> dict[str, Any]:
     """
     if preset not in PRESETS:
         raise InputError(f"no preset is called {preset!r}: choose {' or '.join(PRESETS)}")
-    table = _TABLES[preset]
-    if algorithm not in table:
-        raise InputError(f"the preset {preset!r} has no {algorithm!r}: it has {' and '.join(table)}")
-    of_task = _PAPER_TASKS.get((algorithm, task.rpartition(":")[2]), {}) if preset == "paper" else {}
-    return {**table[algorithm], **of_task}
+    if algorithm not in _PAPER:
+        raise InputError(f"the preset {preset!r} has no {algorithm!r}: it has {' and '.join(_PAPER)}")
+    return {**_PAPER[algorithm], **_PAPER_TASKS.get((algorithm, task.rpartition(":")[2]), {})}
 
 
 def matching_preset(algorithm: str, task: str, values: Mapping[str, Any]) -> str | None:
     """Return the preset of which all hyperparameters are among these values, or None."""
     for preset in PRESETS:
-        if algorithm in _TABLES[preset] and hyperparameters(preset, algorithm, task).items() <= values.items():
+        if algorithm in _PAPER and hyperparameters(preset, algorithm, task).items() <= values.items():
             return preset
     return None

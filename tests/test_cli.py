@@ -139,7 +139,7 @@ def words(text):
         ("train X Y", "there is no place for 'Y' (csac train --help)"),
         ("train X --device tpu", "--device: 'tpu' is not one of 'cpu', 'gpu' (csac train --help)"),
         ("train X --algorithm dqn", "no algorithm is called 'dqn': choose csac or sac or td3 or sd3 or ppo"),
-        ("train X --preset papr", "no preset is called 'papr': choose paper or strong"),
+        ("train X --preset papr", "no preset is called 'papr': choose paper"),
         (
             "train X --temperature fixed",
             "--temperature is an option of sac, which --algorithm sac chooses (csac train --help)",

@@ -124,18 +124,3 @@ def test_a_run_is_of_the_preset_that_all_its_hyperparameters_follow():
     assert presets.matching_preset("csac", "Ant-v4", values) == "paper"
     assert presets.matching_preset("csac", "PyFlyt/QuadX-Waypoints-v1", values) is None  # the paper's tau is another
     assert presets.matching_preset("csac", "Ant-v4", dataclasses.asdict(ALGORITHMS["csac"]())) is None
-
-
-@pytest.mark.parametrize("task", ["Hopper-v4", "PyFlyt/QuadX-Waypoints-v1"])
-def test_strong_is_one_critic_for_both_actors_on_every_task(task):
-    csac, sac = (presets.hyperparameters("strong", algorithm, task) for algorithm in ("csac", "sac"))
-    assert csac == {"critic_normalisation": "batch", "critic_learning_rate": 1e-3, "entropy_weight": "auto"}
-    assert sac == {"critic_normalisation": "batch", "critic_learning_rate": 1e-3, "temperature": "automatic"}
-    for algorithm, given in (("csac", csac), ("sac", sac)):
-        values = dataclasses.asdict(ALGORITHMS[algorithm](**given))
-        assert presets.matching_preset(algorithm, task, values) == "strong"
-
-
-def test_strong_says_which_algorithms_it_has():
-    with pytest.raises(InputError, match=r"'strong' has no 'ppo': it has csac and sac"):
-        presets.hyperparameters("strong", "ppo", "Ant-v4")
