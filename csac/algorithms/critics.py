@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms.networks import MLP, make_mlp
+from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp
+from csac.algorithms.normalisation import Moments, batch_moments, fold
 from csac.algorithms.shapes import Action, Key, Observation, Scalar
 from csac.types import Metrics, Spec, Transition
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+
+    import optax
 
 Critics: TypeAlias = tuple[MLP, MLP]
+Normalisation: TypeAlias = Literal["none", "batch"]
+
+
+class Learnt(NamedTuple):
+    """The critics after a step of theirs."""
+
+    critics: Critics
+    optimiser: Any
+    folded: Critics  # as the actor's loss sees them, their normalisation folded in
+    metrics: Metrics
 
 
 def make_critic(key: Key, spec: Spec, hidden_sizes: Sequence[int]) -> MLP:
@@ -26,6 +40,11 @@ def make_critics(key: Key, spec: Spec, hidden_sizes: Sequence[int]) -> Critics:
     """Return two independent critics."""
     first_key, second_key = jax.random.split(key)
     return make_critic(first_key, spec, hidden_sizes), make_critic(second_key, spec, hidden_sizes)
+
+
+def make_targets(critics: Critics, normalisation: Normalisation) -> Critics | None:
+    """Return the target critics, copies to begin with; critics that are normalised do without (CrossQ)."""
+    return copy_tree(critics) if normalisation == "none" else None
 
 
 def q_value(critic: MLP, observation: Observation, action: Action) -> Scalar:
@@ -49,3 +68,66 @@ def critic_loss(critics: Critics, transition: Transition, target: Scalar) -> tup
     first, second = q_values(critics, transition.observation, transition.action)
     loss = (first - target) ** 2 + (second - target) ** 2
     return loss, {"critic_loss": loss, "q_mean": (first + second) / 2.0}
+
+
+def learn_critics(
+    optimiser: optax.GradientTransformation,
+    critics: Critics,
+    targets: Critics | None,
+    optimiser_state: Any,
+    batch: Transition,
+    noise: Action,
+    *,
+    critic_target: Callable[..., Scalar],
+    next_action: Callable[[Observation, Action], Action],
+) -> Learnt:
+    """Return the critics after one gradient step towards their targets on a batch.
+
+    Args:
+        optimiser: what makes a step of a gradient.
+        critics: those that learn.
+        targets: the target critics, or None where the critics are normalised and are their own targets.
+        optimiser_state: that of the optimiser for the critics.
+        batch: transitions with a leading axis.
+        noise: for the next actions, [batch, action].
+        critic_target: `critic_target(transition, noise, target_critics=...)`, of one example.
+        next_action: `next_action(next_observation, noise)`, at which the target asks the critics.
+    """
+    if targets is not None:
+        goals = jax.vmap(partial(critic_target, target_critics=targets))(batch, noise)
+        critics, optimiser_state, metrics = descend(optimiser, critic_loss, critics, optimiser_state, batch, goals)
+        return Learnt(critics, optimiser_state, critics, metrics)
+    loss = partial(normalised_critic_loss, critic_target=critic_target, next_action=next_action)
+    critics, optimiser_state, told = descend(optimiser, loss, critics, optimiser_state, batch, noise)
+    return Learnt(critics, optimiser_state, fold_critics(critics, told.pop("moments")), told)
+
+
+def normalised_critic_loss(
+    critics: Critics,
+    transition: Transition,
+    noise: Action,
+    *,
+    critic_target: Callable[..., Scalar],
+    next_action: Callable[[Observation, Action], Action],
+) -> tuple[Scalar, Metrics]:
+    """Return `critic_loss` of critics normalised over the batch, and what to log with the `moments` they were seen by.
+
+    The moments are those of the pairs (s, a) and (s', a') together, so that neither is strange to the critics. They are
+    their own targets (CrossQ, Fig. 3), through which no gradient passes.
+    """
+    pairs = (
+        jnp.concatenate([transition.observation, transition.action]),
+        jnp.concatenate([transition.next_observation, next_action(transition.next_observation, noise)]),
+    )
+    first, second = critics
+    moments = batch_moments(first, pairs), batch_moments(second, pairs)
+    folded = fold_critics(critics, moments)
+    target = critic_target(transition, noise, target_critics=jax.lax.stop_gradient(folded))
+    loss, metrics = critic_loss(folded, transition, jax.lax.stop_gradient(target))
+    return loss, {**metrics, "moments": moments}
+
+
+def fold_critics(critics: Critics, moments: tuple[Sequence[Moments], Sequence[Moments]]) -> Critics:
+    """Return both critics as plain MLPs into which the normalisation by these moments is folded."""
+    first, second = (fold(critic, its) for critic, its in zip(critics, moments, strict=True))
+    return first, second

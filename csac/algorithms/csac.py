@@ -10,13 +10,14 @@ import jax
 import optax
 
 from csac.algorithms.adaptation import LearntWeights, Weights, adapted, begin_weights, told, weights_now
-from csac.algorithms.critics import Critics, critic_loss, least_q_value, make_critics
-from csac.algorithms.distributions import bounded, kl, log_ratio, policy_at
+from csac.algorithms.critics import Critics, Normalisation, learn_critics, least_q_value, make_critics, make_targets
+from csac.algorithms.distributions import action_at, bounded, kl, log_ratio, policy_at
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
 from csac.algorithms.references import ReferencePolicy, reference_after, references_before
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
+from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
@@ -26,11 +27,12 @@ class State(NamedTuple):
     actor: MLP
     reference: MLP | None
     critics: Critics
-    target_critics: Critics
+    target_critics: Critics | None
     actor_optimiser: Any
     critic_optimiser: Any
     earlier_reference: MLP | None = None
     learnt_weights: LearntWeights | None = None
+    observations: Statistics | None = None
 
 
 FIRST_WEIGHTS = Weights(1.0, 0.5)  # of those that adapt: SAC's first temperature, and the paper's τ
@@ -83,6 +85,10 @@ class CSAC:
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
+    critic_normalisation: Normalisation = "none"
+    """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
+    normalise_observations: bool = False
+    """Whether observations are brought to mean 0 and standard deviation 1 by running statistics."""
     batch_size: Annotated[int, COUNT] = 256
     """Transitions in one update (the paper's M)."""
     replay_size: Annotated[int, COUNT] = 1_000_000
@@ -165,20 +171,22 @@ class CSAC:
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Take one gradient step on the critics, then one on the actor, then move weights and target critics."""
+        observations, batch = normalise_batch(state.observations, batch)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         weights = weights_now((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
         renews, kept = step % self.reference_period == 0, (state.reference, state.earlier_reference)
         references = references_before(self.reference_policy, *kept, state.actor, renews)
 
-        networks = {"actor": state.actor, "reference": references.critic, "target_critics": state.target_critics}
-        critic_target = partial(self.critic_target, weights=weights, **networks)
-        targets = jax.vmap(critic_target)(batch, target_noise)
-        optimiser = self._optimiser(self.critic_learning_rate)
-        critics, critic_optimiser, critic_metrics = descend(
-            optimiser, critic_loss, state.critics, state.critic_optimiser, batch, targets
+        policies = {"actor": state.actor, "reference": references.critic}
+        learnt = learn_critics(
+            self._optimiser(self.critic_learning_rate),
+            *(state.critics, state.target_critics, state.critic_optimiser),
+            *(batch, target_noise),
+            critic_target=partial(self.critic_target, weights=weights, **policies),
+            next_action=partial(action_at, state.actor),
         )
 
-        actor_loss = partial(self.actor_loss, reference=references.actor, critics=critics, weights=weights)
+        actor_loss = partial(self.actor_loss, reference=references.actor, critics=learnt.folded, weights=weights)
         optimiser = self._optimiser(self.actor_learning_rate)
         actor, actor_optimiser, actor_metrics = descend(
             optimiser, actor_loss, state.actor, state.actor_optimiser, batch.observation, actor_noise
@@ -187,18 +195,19 @@ class CSAC:
         new_state = State(
             actor=actor,
             reference=reference_after(self.reference_policy, references.actor, state.actor, self.reference_rate),
-            critics=critics,
-            target_critics=polyak(state.target_critics, critics, self.target_rate),
+            critics=learnt.critics,
+            target_critics=polyak(state.target_critics, learnt.critics, self.target_rate),
             actor_optimiser=actor_optimiser,
-            critic_optimiser=critic_optimiser,
+            critic_optimiser=learnt.optimiser,
             earlier_reference=references.critic if self.critic_reference == "earlier" else None,
             learnt_weights=adapted(
                 state.learnt_weights,
                 self.slack(actor_metrics, batch.action.shape[-1]),
                 self._optimiser(self.weight_learning_rate),
             ),
+            observations=observations,
         )
-        return new_state, {**critic_metrics, **actor_metrics, **told(weights, state.learnt_weights)}
+        return new_state, {**learnt.metrics, **actor_metrics, **told(weights, state.learnt_weights)}
 
     def slack(self, metrics: Metrics, dimensions: int) -> Weights:
         """Return by how much the entropy lies above its target, and the relative entropy below its own, in nats."""
@@ -226,7 +235,7 @@ class CSAC:
             actor=actor,
             reference=None if self.relative_entropy_form == "implicit" else copy_tree(actor),
             critics=critics,
-            target_critics=copy_tree(critics),
+            target_critics=make_targets(critics, self.critic_normalisation),
             actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
             critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
             earlier_reference=copy_tree(actor) if self.critic_reference == "earlier" else None,
@@ -235,16 +244,18 @@ class CSAC:
                 FIRST_WEIGHTS,
                 self._optimiser(self.weight_learning_rate),
             ),
+            observations=begin_statistics(spec.observation_size, self.normalise_observations),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return ã(s, ξ) to explore (Eq. actor), else tanh(mean)."""
-        policy = policy_at(state.actor, observation)
+        policy = policy_at(state.actor, normalise(state.observations, observation))
         return policy.sample(jax.random.normal(key, policy.mean.shape)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the actor's layers."""
-        return PolicyNetwork(PolicyParameters((state.actor.layers,)))
+        """Return the actor's layers, and what it sees observations by."""
+        normaliser = normaliser_of(state.observations)
+        return PolicyNetwork(PolicyParameters((state.actor.layers,), normaliser=normaliser))
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
         return make_optimiser(learning_rate, self.max_gradient_norm)

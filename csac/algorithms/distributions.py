@@ -105,6 +105,11 @@ def bounded(value: Scalar, bound: float) -> Scalar:
     return jnp.clip(value, -bound, bound) if bound > 0 else value
 
 
+def action_at(actor: Callable[[jax.Array], jax.Array], observation: Observation, noise: Action) -> Action:
+    """Return the action tanh(mean + std ξ) of an actor network at one observation."""
+    return policy_at(actor, observation).sample(noise)
+
+
 def policy_at(actor: Callable[[jax.Array], jax.Array], observation: Observation) -> TanhGaussian:
     """Return the distribution that an actor network gives at one observation."""
     return TanhGaussian.from_output(actor(observation))

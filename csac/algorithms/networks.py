@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
@@ -16,6 +17,8 @@ from csac.types import Layer, Metrics
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+BATCH = "batch"  # the axis of examples, for losses that look at a whole batch
+
 
 class MLP(eqx.Module):
     """A multilayer perceptron with ReLU or tanh between its layers, for one example."""
@@ -25,10 +28,13 @@ class MLP(eqx.Module):
 
     def __call__(self, inputs: Float[Array, " in"]) -> Float[Array, " out"]:
         """Return the last layer's outputs, which have no activation."""
-        activate = jax.nn.relu if self.activation == "relu" else jnp.tanh
         for layer in self.layers[:-1]:
-            inputs = activate(inputs @ layer.weight + layer.bias)
+            inputs = self.activate(inputs @ layer.weight + layer.bias)
         return inputs @ self.layers[-1].weight + self.layers[-1].bias
+
+    def activate(self, values: Float[Array, " width"]) -> Float[Array, " width"]:
+        """Return what a hidden layer passes on."""
+        return jax.nn.relu(values) if self.activation == "relu" else jnp.tanh(values)
 
 
 def make_mlp(key: Key, input_size: int, hidden_sizes: Sequence[int], output_size: int) -> MLP:
@@ -60,7 +66,9 @@ def make_orthogonal_mlp(
 
 
 def polyak(targets: Any, sources: Any, rate: float) -> Any:
-    """Return targets + rate (sources - targets), leaf by leaf."""
+    """Return targets + rate (sources - targets), leaf by leaf; None where there are no targets."""
+    if targets is None:
+        return None
     return jax.tree.map(lambda target, source: target + rate * (source - target), targets, sources)
 
 
@@ -91,15 +99,16 @@ def descend(
 
     Args:
         optimiser: what makes a step of a gradient.
-        loss: `loss(parameters, *example) -> (scalar, metrics)`, of one example.
+        loss: `loss(parameters, *example) -> (scalar, metrics)`, of one example. Examples lie along the axis `BATCH`.
         parameters: a tree of arrays.
         optimiser_state: that of the optimiser for these parameters.
         examples: trees whose leaves have a leading axis of examples.
     """
 
     def mean_loss(parameters: Any) -> tuple[Scalar, Metrics]:
-        losses, metrics = jax.vmap(loss, in_axes=(None, *(0 for _ in examples)))(parameters, *examples)
-        return jnp.mean(losses), jax.tree.map(jnp.mean, metrics)
+        in_axes = (None, *(0 for _ in examples))
+        losses, metrics = jax.vmap(loss, in_axes, axis_name=BATCH)(parameters, *examples)
+        return jnp.mean(losses), jax.tree.map(partial(jnp.mean, axis=0), metrics)
 
     gradients, metrics = jax.grad(mean_loss, has_aux=True)(parameters)
     updates, optimiser_state = optimiser.update(gradients, optimiser_state, parameters)

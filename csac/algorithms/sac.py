@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from csac.algorithms.critics import Critics, critic_loss, least_q_value, make_critics
-from csac.algorithms.distributions import policy_at
+from csac.algorithms.critics import Critics, Normalisation, learn_critics, least_q_value, make_critics, make_targets
+from csac.algorithms.distributions import action_at, policy_at
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.networks import MLP, begin_descent, descend, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
+from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
@@ -24,11 +25,12 @@ class State(NamedTuple):
 
     actor: MLP
     critics: Critics
-    target_critics: Critics
+    target_critics: Critics | None
     log_temperature: Scalar
     actor_optimiser: Any
     critic_optimiser: Any
     temperature_optimiser: Any
+    observations: Statistics | None = None
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,10 @@ class SAC:
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
+    critic_normalisation: Normalisation = "none"
+    """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
+    normalise_observations: bool = False
+    """Whether observations are brought to mean 0 and standard deviation 1 by running statistics."""
     batch_size: Annotated[int, COUNT] = 256
     """Transitions in one update."""
     replay_size: Annotated[int, COUNT] = 1_000_000
@@ -102,19 +108,19 @@ class SAC:
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Take one gradient step on the critics, the actor and the temperature, then move the target critics."""
+        observations, batch = normalise_batch(state.observations, batch)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.log_temperature)
 
-        critic_target = partial(
-            self.critic_target, actor=state.actor, target_critics=state.target_critics, temperature=temperature
-        )
-        targets = jax.vmap(critic_target)(batch, target_noise)
-        optimiser = self._optimiser(self.critic_learning_rate)
-        critics, critic_optimiser, critic_metrics = descend(
-            optimiser, critic_loss, state.critics, state.critic_optimiser, batch, targets
+        learnt = learn_critics(
+            self._optimiser(self.critic_learning_rate),
+            *(state.critics, state.target_critics, state.critic_optimiser),
+            *(batch, target_noise),
+            critic_target=partial(self.critic_target, actor=state.actor, temperature=temperature),
+            next_action=partial(action_at, state.actor),
         )
 
-        actor_loss = partial(self.actor_loss, critics=critics, temperature=temperature)
+        actor_loss = partial(self.actor_loss, critics=learnt.folded, temperature=temperature)
         optimiser = self._optimiser(self.actor_learning_rate)
         actor, actor_optimiser, actor_metrics = descend(
             optimiser, actor_loss, state.actor, state.actor_optimiser, batch.observation, actor_noise
@@ -132,14 +138,15 @@ class SAC:
 
         new_state = State(
             actor=actor,
-            critics=critics,
-            target_critics=polyak(state.target_critics, critics, self.target_rate),
+            critics=learnt.critics,
+            target_critics=polyak(state.target_critics, learnt.critics, self.target_rate),
             log_temperature=log_temperature,
             actor_optimiser=actor_optimiser,
-            critic_optimiser=critic_optimiser,
+            critic_optimiser=learnt.optimiser,
             temperature_optimiser=temperature_optimiser,
+            observations=observations,
         )
-        return new_state, {**critic_metrics, **actor_metrics, "temperature": temperature}
+        return new_state, {**learnt.metrics, **actor_metrics, "temperature": temperature}
 
     @property
     def cadence(self) -> Cadence:
@@ -160,21 +167,23 @@ class SAC:
         return State(
             actor=actor,
             critics=critics,
-            target_critics=copy_tree(critics),
+            target_critics=make_targets(critics, self.critic_normalisation),
             log_temperature=log_temperature,
             actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
             critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
             temperature_optimiser=begin_descent(self._optimiser(self.temperature_learning_rate), log_temperature),
+            observations=begin_statistics(spec.observation_size, self.normalise_observations),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return a sampled action to explore, else tanh(mean)."""
-        policy = policy_at(state.actor, observation)
+        policy = policy_at(state.actor, normalise(state.observations, observation))
         return policy.sample(jax.random.normal(key, policy.mean.shape)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the actor's layers."""
-        return PolicyNetwork(PolicyParameters((state.actor.layers,)))
+        """Return the actor's layers, and what it sees observations by."""
+        normaliser = normaliser_of(state.observations)
+        return PolicyNetwork(PolicyParameters((state.actor.layers,), normaliser=normaliser))
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
         return make_optimiser(learning_rate, self.max_gradient_norm)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from csac.algorithms.shapes import Scalar
+from csac.algorithms.shapes import Observation, Scalar
+from csac.types import Normaliser, Transition
 
 # Added to variances and to the spread of advantages, as in SB3 and CleanRL: what never varies is divided by little.
 EPSILON = 1e-8
+LIMIT = 10.0  # of normalised observations, in standard deviations
 
 
 class Statistics(NamedTuple):
@@ -37,3 +40,29 @@ class Statistics(NamedTuple):
         within = shares[0] * self.variance + shares[1] * jnp.var(differences, axis=0)
         variance = within + shares[0] * shares[1] * shift**2
         return Statistics(count, self.mean + shares[1] * shift, variance, jnp.sqrt(variance + EPSILON))
+
+
+def begin_statistics(size: int, wanted: bool) -> Statistics | None:
+    """Return the statistics of no observations, or None where none are wanted."""
+    return Statistics.create((size,)) if wanted else None
+
+
+def normalise(statistics: Statistics | None, observation: Observation) -> Observation:
+    """Return (observation - mean) / std within ±`LIMIT`, or the observation as it is where there are no statistics."""
+    if statistics is None:
+        return observation
+    return jnp.clip((observation - statistics.mean) / statistics.std, -LIMIT, LIMIT)
+
+
+def normalise_batch(statistics: Statistics | None, batch: Transition) -> tuple[Statistics | None, Transition]:
+    """Return the statistics with a batch's observations absorbed, and the batch as it is seen by these."""
+    if statistics is None:
+        return None, batch
+    statistics = statistics.absorb(batch.observation)
+    see = jax.vmap(partial(normalise, statistics))
+    return statistics, batch._replace(observation=see(batch.observation), next_observation=see(batch.next_observation))
+
+
+def normaliser_of(statistics: Statistics | None) -> Normaliser | None:
+    """Return what `normalise` does, as part of the policy that leaves."""
+    return None if statistics is None else Normaliser(statistics.mean, statistics.std, jnp.float32(LIMIT))

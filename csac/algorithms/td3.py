@@ -11,11 +11,20 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from csac.algorithms.critics import Critics, critic_loss, least_q_value, make_critics, q_value
+from csac.algorithms.critics import (
+    Critics,
+    Normalisation,
+    learn_critics,
+    least_q_value,
+    make_critics,
+    make_targets,
+    q_value,
+)
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
+from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
@@ -25,10 +34,11 @@ class State(NamedTuple):
     actor: MLP
     target_actor: MLP
     critics: Critics
-    target_critics: Critics
+    target_critics: Critics | None
     actor_optimiser: Any
     critic_optimiser: Any
     actor_loss: Scalar  # when the actor last moved, to be reported until it moves again
+    observations: Statistics | None = None
 
 
 @dataclass(frozen=True)
@@ -55,6 +65,10 @@ class TD3:
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
+    critic_normalisation: Normalisation = "none"
+    """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
+    normalise_observations: bool = False
+    """Whether observations are brought to mean 0 and standard deviation 1 by running statistics."""
     batch_size: Annotated[int, COUNT] = 256
     """Transitions in one update."""
     replay_size: Annotated[int, COUNT] = 1_000_000
@@ -93,23 +107,24 @@ class TD3:
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Take one gradient step on the critics; every `policy_delay`-th time move the actor, then the targets."""
+        observations, batch = normalise_batch(state.observations, batch)
         noise = jax.random.normal(key, batch.action.shape)
-        critic_target = partial(
-            self.critic_target, target_actor=state.target_actor, target_critics=state.target_critics
+        learnt = learn_critics(
+            self._optimiser(self.critic_learning_rate),
+            *(state.critics, state.target_critics, state.critic_optimiser),
+            *(batch, noise),
+            critic_target=partial(self.critic_target, target_actor=state.target_actor),
+            next_action=partial(self.smoothed_action, state.target_actor),
         )
-        targets = jax.vmap(critic_target)(batch, noise)
-        optimiser = self._optimiser(self.critic_learning_rate)
-        critics, critic_optimiser, metrics = descend(
-            optimiser, critic_loss, state.critics, state.critic_optimiser, batch, targets
-        )
-        state = state._replace(critics=critics, critic_optimiser=critic_optimiser)
+        state = state._replace(critics=learnt.critics, critic_optimiser=learnt.optimiser, observations=observations)
         is_due = (step + 1) % self.policy_delay == 0
-        state = jax.lax.cond(is_due, self.delayed_update, lambda state, _: state, state, batch.observation)
-        return state, {**metrics, "actor_loss": state.actor_loss}
+        given = (state, learnt.folded, batch.observation)
+        state = jax.lax.cond(is_due, self.delayed_update, lambda state, *_: state, *given)
+        return state, {**learnt.metrics, "actor_loss": state.actor_loss}
 
-    def delayed_update(self, state: State, observations: Float[Array, "batch observation"]) -> State:
+    def delayed_update(self, state: State, critics: Critics, observations: Float[Array, "batch observation"]) -> State:
         """Return the state after one gradient step on the actor, against the new critics, and one of the targets."""
-        actor_loss = partial(self.actor_loss, critics=state.critics)
+        actor_loss = partial(self.actor_loss, critics=critics)
         optimiser = self._optimiser(self.actor_learning_rate)
         actor, actor_optimiser, loss = descend(optimiser, actor_loss, state.actor, state.actor_optimiser, observations)
         return state._replace(
@@ -138,22 +153,24 @@ class TD3:
             actor=actor,
             target_actor=copy_tree(actor),
             critics=critics,
-            target_critics=copy_tree(critics),
+            target_critics=make_targets(critics, self.critic_normalisation),
             actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
             critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
             actor_loss=jnp.zeros(()),
+            observations=begin_statistics(spec.observation_size, self.normalise_observations),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return tanh(actor), with noise and clipped to [-1, 1] to explore."""
-        action = jnp.tanh(state.actor(observation))
+        action = jnp.tanh(state.actor(normalise(state.observations, observation)))
         if not explore:
             return action
         return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the actor's layers."""
-        return PolicyNetwork(PolicyParameters((state.actor.layers,)), head="tanh")
+        """Return the actor's layers, and what it sees observations by."""
+        normaliser = normaliser_of(state.observations)
+        return PolicyNetwork(PolicyParameters((state.actor.layers,), normaliser=normaliser), head="tanh")
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
         return make_optimiser(learning_rate, self.max_gradient_norm)

@@ -33,6 +33,8 @@ ADAPTIVE = CSAC(
     weight_learning_rate=0.01,
     critic_reference="earlier",
     reference_period=30,
+    critic_normalisation="batch",
+    normalise_observations=True,
     **SMALL,
 )
 SHORT: dict[str, Any] = {"evaluation_interval": 100, "evaluation_episodes": 2, "tensorboard": False}

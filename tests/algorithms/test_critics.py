@@ -1,0 +1,189 @@
+"""Critics whose layers are normalised over the batch: against numbers worked by hand, and against plain arrays."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from equations import ONE, batch_of, linear, transition
+
+from csac.algorithms import CSAC, SAC, TD3
+from csac.algorithms.critics import Critics, learn_critics, make_critics, normalised_critic_loss, q_values
+from csac.algorithms.networks import BATCH, begin_descent, make_optimiser
+from csac.algorithms.normalisation import EPSILON, Moments, batch_moments, fold, fold_layer, moments_of
+from csac.types import Layer, Spec, Transition
+
+SMALL: dict[str, Any] = {"actor_hidden_sizes": (5,), "critic_hidden_sizes": (8, 8), "batch_size": 16}
+NORMALISED = [
+    CSAC(critic_normalisation="batch", **SMALL),
+    SAC(critic_normalisation="batch", **SMALL),
+    TD3(critic_normalisation="batch", policy_delay=1, **SMALL),
+]
+NAMES = [algorithm.name for algorithm in NORMALISED]
+SPEC = Spec(3, 2)
+NOISE = jax.random.normal(jax.random.key(4), (16, 2))
+
+
+def transitions(key: int) -> Transition:
+    """Sixteen of them, none like another, one of them terminal; their states lie far from zero."""
+    keys = jax.random.split(jax.random.key(key), 4)
+    states = 3.0 + 2.0 * jax.random.normal(keys[0], (2, 16, 3))
+    actions = jnp.tanh(jax.random.normal(keys[1], (16, 2)))
+    terminated = jnp.zeros(16).at[3].set(1.0)
+    return Transition(states[0], actions, jax.random.normal(keys[2], (16,)), states[1], terminated, jnp.zeros(16))
+
+
+def test_the_moments_are_those_of_all_inputs_of_all_examples():
+    # 1, 3, 5, 7: mean 4, variance (9 + 1 + 1 + 9) / 4; the first two belong to one example, the others to the next.
+    moments = jax.vmap(moments_of, axis_name=BATCH)([jnp.array([[1.0], [5.0]]), jnp.array([[3.0], [7.0]])])
+    np.testing.assert_allclose(moments.mean, [[4.0], [4.0]])
+    np.testing.assert_allclose(moments.variance, [[5.0], [5.0]])
+
+
+def test_moments_about_zero():
+    # 1, 3, 5, 7: (1 + 9 + 25 + 49) / 4
+    values = [jnp.array([[1.0], [5.0]]), jnp.array([[3.0], [7.0]])]
+    moments = jax.vmap(partial(moments_of, centred=False), axis_name=BATCH)(values)
+    np.testing.assert_allclose(moments.mean, [[0.0], [0.0]])
+    np.testing.assert_allclose(moments.variance, [[21.0], [21.0]])
+
+
+def test_a_folded_layer_normalises_its_inputs():
+    # Standard deviations 2 and 0.5: (6 - 4) / 2 · 2 + (1 - 2) / 0.5 · 3 + 1 = 2 - 6 + 1
+    moments = Moments(jnp.array([4.0, 2.0]), jnp.array([4.0, 0.25]) - EPSILON)
+    weight, bias = fold_layer(Layer(jnp.array([[2.0], [3.0]]), jnp.array([1.0])), moments)
+    assert float((jnp.array([6.0, 1.0]) @ weight + bias)[0]) == pytest.approx(-3.0)
+
+
+def test_a_unit_that_is_silent_in_the_batch_is_not_blown_up():
+    weight, _ = fold_layer(Layer(jnp.ones((1, 1)), jnp.zeros(1)), Moments(jnp.zeros(1), jnp.zeros(1)))
+    assert float(weight[0, 0]) == pytest.approx(1 / math.sqrt(1e-3))
+
+
+def normalised_values(critic: Any, inputs: Any) -> Any:
+    """What one critic says of inputs [example, in], each layer's at mean 0, but for the last's, and mean square 1."""
+    for weight, bias in critic.layers[:-1]:
+        inputs = inputs - inputs.mean(0, keepdims=True)
+        inputs = inputs / jnp.sqrt((inputs**2).mean(0, keepdims=True) + EPSILON)
+        inputs = jnp.maximum(inputs @ weight + bias[None], 0.0)
+    weight, bias = critic.layers[-1]
+    return (inputs / jnp.sqrt((inputs**2).mean(0, keepdims=True) + EPSILON) @ weight + bias[None])[:, 0]
+
+
+def pairs_of(batch: Transition, next_actions: Any) -> Any:
+    """Both kinds of pairs, one below the other: what the critics are normalised over."""
+    now = jnp.concatenate([batch.observation, batch.action], axis=1)
+    return jnp.concatenate([now, jnp.concatenate([batch.next_observation, next_actions], axis=1)])
+
+
+def test_a_network_with_the_moments_folded_in_says_what_the_normalised_one_does():
+    (critic, _), batch = make_critics(jax.random.key(0), SPEC, (8, 8)), transitions(1)
+    inputs = pairs_of(batch, jnp.tanh(NOISE))
+    moments = jax.vmap(partial(batch_moments, critic), axis_name=BATCH)([inputs[:16], inputs[16:]])
+    one = jax.tree.map(lambda leaf: leaf[0], moments)
+    np.testing.assert_allclose(
+        jax.vmap(fold(critic, one))(inputs)[:, 0], normalised_values(critic, inputs), rtol=1e-4, atol=1e-5
+    )
+
+
+def soft_target(transition: Transition, noise: Any, *, target_critics: Critics) -> Any:
+    """A target that asks the critics at the next action."""
+    values = q_values(target_critics, transition.next_observation, jnp.tanh(noise))
+    return transition.reward + 0.9 * (1.0 - transition.terminated) * (jnp.minimum(*values) - noise.sum())
+
+
+def next_action(observation: Any, noise: Any) -> Any:
+    return jnp.tanh(noise)
+
+
+def test_loss_and_gradient_are_those_of_one_pass_over_both_batches():
+    critics, batch = make_critics(jax.random.key(0), SPEC, (8, 8)), transitions(1)
+
+    def ours(critics):
+        loss = partial(normalised_critic_loss, critic_target=soft_target, next_action=next_action)
+        losses, metrics = jax.vmap(loss, (None, 0, 0), axis_name=BATCH)(critics, batch, NOISE)
+        return losses.mean(), metrics["q_mean"].mean()
+
+    def theirs(critics):
+        inputs = pairs_of(batch, jnp.tanh(NOISE))
+        first, second = (normalised_values(critic, inputs) for critic in critics)
+        future = jnp.minimum(first[16:], second[16:]) - NOISE.sum(1)
+        target = jax.lax.stop_gradient(batch.reward + 0.9 * (1.0 - batch.terminated) * future)
+        losses = (first[:16] - target) ** 2 + (second[:16] - target) ** 2
+        return losses.mean(), (first[:16] + second[:16]).mean() / 2.0
+
+    (our_loss, our_mean), our_gradient = jax.value_and_grad(ours, has_aux=True)(critics)
+    (their_loss, their_mean), their_gradient = jax.value_and_grad(theirs, has_aux=True)(critics)
+    np.testing.assert_allclose([our_loss, our_mean], [their_loss, their_mean], rtol=1e-5)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-3, atol=2e-5), our_gradient, their_gradient)
+
+
+def test_the_critics_of_the_actors_loss_are_the_new_ones_by_the_moments_of_the_step():
+    optimiser, batch = make_optimiser(0.1), transitions(1)
+    critics = make_critics(jax.random.key(0), SPEC, (8, 8))
+    given = (optimiser, critics, None, begin_descent(optimiser, critics), batch, NOISE)
+    learnt = learn_critics(*given, critic_target=soft_target, next_action=next_action)
+    assert set(learnt.metrics) == {"critic_loss", "q_mean"}
+
+    inputs = pairs_of(batch, jnp.tanh(NOISE))
+    for old, new, folded in zip(critics, learnt.critics, learnt.folded, strict=True):
+        moments = jax.vmap(partial(batch_moments, old), axis_name=BATCH)([inputs[:16], inputs[16:]])
+        expected = fold(new, jax.tree.map(lambda leaf: leaf[0], moments))
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), folded, expected)
+        assert not np.allclose(new.layers[1].weight, old.layers[1].weight)
+
+
+@partial(jax.jit, static_argnums=0)
+def update(algorithm, state, batch: Transition, key: int = 0):
+    return algorithm.update(state, batch, jax.random.key(key), 0)
+
+
+def test_a_linear_critic_by_hand():
+    # The actor's action is 0, without noise. Pairs (s, a): (1, 0.5), (3, -0.5) and next (1, 0), (3, 0).
+    # Of a last layer's inputs only the scale is normalised: their mean squares are 5 and 0.125. With Q = 2 ŝ + â - 1
+    # for both critics, ŝ = s / √5 and â = a / √0.125: Q = 1.308641 and 0.269067; Q' = -0.105573 at (1, 0). Targets
+    # with γ = 0.5: 1.947214 and 2 (terminal). Losses 2 (0.638572² + 1.730933²) / 2 = 3.403903, mean of Q 0.788854.
+    critic = linear([[2.0], [1.0]], [-1.0])
+    algorithm = TD3(
+        critic_normalisation="batch", target_noise=0.0, discount=0.5, actor_hidden_sizes=(), critic_hidden_sizes=()
+    )
+    still = linear([[0.0]], [0.0])
+    state = algorithm.init(jax.random.key(0), ONE, 100)
+    state = state._replace(critics=(critic, critic), actor=still, target_actor=still)
+    batch = batch_of(
+        transition(observation=1.0, action=0.5, next_observation=1.0),
+        transition(observation=3.0, action=-0.5, next_observation=3.0, terminated=1.0),
+    )
+    _, metrics = update(algorithm, state, batch)
+    assert float(metrics["q_mean"]) == pytest.approx(0.788854, rel=1e-2)
+    assert float(metrics["critic_loss"]) == pytest.approx(3.403903, rel=1e-2)  # ε is 1 % of the smaller variance
+
+
+@pytest.mark.parametrize("algorithm", NORMALISED, ids=NAMES)
+def test_normalised_critics_have_no_targets_and_keep_no_statistics(algorithm):
+    state = algorithm.init(jax.random.key(0), SPEC, 100)
+    assert state.target_critics is None
+    state, metrics = update(algorithm, state, transitions(1))
+    assert state.target_critics is None
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, metrics)))
+    plain = type(algorithm)(**{**vars(algorithm), "critic_normalisation": "none"}).init(jax.random.key(0), SPEC, 100)
+    jax.tree.map(np.testing.assert_array_equal, plain.critics, algorithm.init(jax.random.key(0), SPEC, 100).critics)
+    assert plain.target_critics is not None
+
+
+@pytest.mark.parametrize("algorithm", NORMALISED, ids=NAMES)
+def test_seeds_side_by_side_are_normalised_apart(algorithm):
+    keys = jax.random.split(jax.random.key(0), 2)
+    states = [algorithm.init(key, SPEC, 100) for key in keys]
+    batches = [transitions(1), jax.tree.map(lambda leaf: 5.0 * leaf, transitions(2))]
+    together = jax.vmap(algorithm.update, in_axes=(0, 0, None, None))
+    _, metrics = together(*(jax.tree.map(lambda *x: jnp.stack(x), *both) for both in (states, batches)), keys[0], 0)
+    for seed in (0, 1):
+        _, alone = algorithm.update(states[seed], batches[seed], keys[0], 0)
+        for name, value in alone.items():
+            np.testing.assert_allclose(metrics[name][seed], value, rtol=1e-4, atol=1e-5)
