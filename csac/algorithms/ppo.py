@@ -16,7 +16,7 @@ from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSIT
 from csac.algorithms.memory import Rollout
 from csac.algorithms.networks import MLP, begin_descent, descend, make_optimiser, make_orthogonal_mlp
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar, Scalars
-from csac.algorithms.statistics import EPSILON, Statistics
+from csac.algorithms.statistics import EPSILON, Statistics, normalise
 from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
@@ -206,10 +206,8 @@ class PPO:
 
     def normalise(self, statistics: Statistics, observation: Observation) -> Observation:
         """Return (observation - mean) / std, clipped, or the observation as it is."""
-        if not self.normalise_observations:
-            return observation
-        normalised = (observation - statistics.mean) / statistics.std
-        return jnp.clip(normalised, -self.normalisation_limit, self.normalisation_limit)
+        seen_by = statistics if self.normalise_observations else None
+        return normalise(seen_by, observation, self.normalisation_limit)
 
     def scale(self, statistics: Statistics, reward: Scalars) -> Scalars:
         """Return reward / std of the discounted return, clipped, or the reward as it is."""

@@ -47,11 +47,11 @@ def begin_statistics(size: int, wanted: bool) -> Statistics | None:
     return Statistics.create((size,)) if wanted else None
 
 
-def normalise(statistics: Statistics | None, observation: Observation) -> Observation:
-    """Return (observation - mean) / std within ±`LIMIT`, or the observation as it is where there are no statistics."""
+def normalise(statistics: Statistics | None, observation: Observation, limit: float = LIMIT) -> Observation:
+    """Return (observation - mean) / std within ± limit, or the observation as it is where there are no statistics."""
     if statistics is None:
         return observation
-    return jnp.clip((observation - statistics.mean) / statistics.std, -LIMIT, LIMIT)
+    return jnp.clip((observation - statistics.mean) / statistics.std, -limit, limit)
 
 
 def normalise_batch(statistics: Statistics | None, batch: Transition) -> tuple[Statistics | None, Transition]:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equations import ONE, batch_of, linear, transition
+from equations import LINEAR, ONE, batch_of, linear, transition
 
 from csac.algorithms import sd3 as file
 from csac.algorithms.networks import MLP
@@ -19,15 +19,7 @@ from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.types import InputError, Spec, Transition
 
-LINEAR: dict[str, Any] = {
-    "actor_hidden_sizes": (),
-    "critic_hidden_sizes": (),
-    "discount": 0.5,
-    "target_rate": 0.5,
-    "actor_learning_rate": 0.1,
-    "critic_learning_rate": 0.1,
-    "noise_samples": 3,
-}
+SETTINGS: dict[str, Any] = {**LINEAR, "noise_samples": 3}
 
 
 def always(action: float) -> MLP:
@@ -136,7 +128,7 @@ def pair(algorithm: SD3, target_value: float) -> Pair:
     )
 
 
-ONE_BY_ONE = SD3(batch_size=1, target_noise=0.0, **LINEAR)
+ONE_BY_ONE = SD3(batch_size=1, target_noise=0.0, **SETTINGS)
 
 
 def test_each_pair_learns_in_turn_from_its_own_batch():
@@ -168,7 +160,7 @@ def test_the_second_pair_sees_the_new_target_of_the_first():
 
 
 def test_an_update_is_given_a_batch_for_each_pair():
-    algorithm = SD3(batch_size=32, **LINEAR)
+    algorithm = SD3(batch_size=32, **SETTINGS)
     assert algorithm.cadence.transitions_per_update == 64
     assert SD3().cadence.transitions_per_update == 512
 
@@ -176,7 +168,7 @@ def test_an_update_is_given_a_batch_for_each_pair():
 def test_targets_in_groups_are_in_their_places(monkeypatch):
     """Groups of 4 and a batch of 7. After terminal steps y = r, and Q(s, a) = s = r leaves no error."""
     monkeypatch.setattr(file, "EXAMPLES_AT_ONCE", 4)
-    algorithm = SD3(batch_size=7, **LINEAR)
+    algorithm = SD3(batch_size=7, **SETTINGS)
     made = pair(algorithm, 0.0)._replace(critic=linear([[1.0], [0.0]], [0.0]))
     batch = batch_of(*[transition(observation=x, reward=x, terminated=1.0) for x in range(14)])
     _, metrics = update(algorithm, State(made, made), batch)
@@ -191,7 +183,7 @@ def act(algorithm: SD3, state: State, keys: jax.Array, explore: bool) -> np.ndar
 @pytest.mark.parametrize(("first_value", "second_value", "expected"), [(1.0, 0.5, 0.4), (0.5, 1.0, -0.6)])
 def test_the_actor_acts_whose_own_critic_values_it_more(first_value, second_value, expected):
     # Each critic would value the other's action at ±100: that is not asked.
-    algorithm = SD3(**LINEAR)
+    algorithm = SD3(**SETTINGS)
     first, second = (pair(algorithm, 0.0) for _ in range(2))
     state = State(
         first._replace(actor=always(0.4), critic=linear([[0.0], [-100.0]], [first_value + 40.0])),
@@ -205,7 +197,7 @@ def test_the_actor_acts_whose_own_critic_values_it_more(first_value, second_valu
 
 
 def test_of_actions_valued_the_same_the_first_is_taken():
-    algorithm, indifferent = SD3(**LINEAR), linear([[0.0], [0.0]], [1.0])
+    algorithm, indifferent = SD3(**SETTINGS), linear([[0.0], [0.0]], [1.0])
     both = pair(algorithm, 0.0)._replace(critic=indifferent)
     state = State(both._replace(actor=always(0.4)), both._replace(actor=always(-0.6)))
     np.testing.assert_allclose(act(algorithm, state, jax.random.split(jax.random.key(1), 2), False), 0.4, rtol=1e-5)
@@ -213,7 +205,7 @@ def test_of_actions_valued_the_same_the_first_is_taken():
 
 def test_exploration_stays_within_the_bounds():
     # At 0.95 the bound is half a standard deviation away: 31 % of the noise goes past it.
-    algorithm = SD3(**LINEAR)
+    algorithm = SD3(**SETTINGS)
     both = pair(algorithm, 0.0)._replace(actor=always(0.95))
     explored = act(algorithm, State(both, both), jax.random.split(jax.random.key(1), 4000), True)
     assert explored.max() == 1.0

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equations import ONE, batch_of, linear, transition
+from equations import LINEAR, ONE, batch_of, linear, transition
 
 from csac.algorithms.critics import critic_loss
 from csac.algorithms.networks import MLP
@@ -18,15 +18,6 @@ from csac.algorithms.td3 import TD3
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.types import InputError, Spec, Transition
-
-LINEAR: dict[str, Any] = {
-    "actor_hidden_sizes": (),
-    "critic_hidden_sizes": (),
-    "discount": 0.5,
-    "target_rate": 0.5,
-    "actor_learning_rate": 0.1,
-    "critic_learning_rate": 0.1,
-}
 
 
 def always(action: float) -> MLP:
