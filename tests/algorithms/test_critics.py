@@ -181,9 +181,9 @@ def test_seeds_side_by_side_are_normalised_apart(algorithm):
     keys = jax.random.split(jax.random.key(0), 2)
     states = [algorithm.init(key, SPEC, 100) for key in keys]
     batches = [transitions(1), jax.tree.map(lambda leaf: 5.0 * leaf, transitions(2))]
-    together = jax.vmap(algorithm.update, in_axes=(0, 0, None, None))
-    _, metrics = together(*(jax.tree.map(lambda *x: jnp.stack(x), *both) for both in (states, batches)), keys[0], 0)
+    together = jax.jit(jax.vmap(partial(update, algorithm)))
+    _, metrics = together(*(jax.tree.map(lambda *x: jnp.stack(x), *both) for both in (states, batches)))
     for seed in (0, 1):
-        _, alone = algorithm.update(states[seed], batches[seed], keys[0], 0)
+        _, alone = update(algorithm, states[seed], batches[seed])
         for name, value in alone.items():
             np.testing.assert_allclose(metrics[name][seed], value, rtol=1e-4, atol=1e-5)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import tempfile
 from typing import TYPE_CHECKING, Any, NamedTuple
 from unittest.mock import patch
 
-import jax
 from plans import settings
 
 from csac.training import group, messages
@@ -15,12 +13,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from csac.types import Algorithm
-
-# XLA would take most of the time of these tests: compile each program once for all of them.
-_PROGRAMS = tempfile.TemporaryDirectory()
-jax.config.update("jax_compilation_cache_dir", _PROGRAMS.name)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 class Outcome(NamedTuple):
