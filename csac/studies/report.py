@@ -11,7 +11,7 @@ from csac.record.rendering import Cell, Row, Table
 from csac.studies import paper, sections
 from csac.studies.arms import gather, with_rows
 from csac.studies.cells import complete
-from csac.studies.claims import comparisons, decide
+from csac.studies.claims import VERDICTS, comparisons, decide
 from csac.studies.parts import Heading, Items, Paragraph, write
 from csac.studies.sections import Scope, plain
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 _VERDICTS = (
     "Reproduced: the 95 % bootstrap interval of the probability that a seed of the first is better than one of the "
-    "second lies above one half; not reproduced: it lies below; else not yet decidable. Each claim is held against "
-    "both variants of CSAC; no correction is made for the number of claims."
+    "second lies above one half; not reproduced: it lies below; else not yet decidable. No correction is made for the "
+    "number of claims."
 )
 
 _SECTIONS: Mapping[str, Callable[[Sequence[Arm], Scope], Iterator[Part]]] = {
@@ -101,15 +101,21 @@ def _count(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def _claims(study: Study, arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
-    decisions = [decide(one, study.scale == 1) for one in comparisons(study.name, study.analyses, arms)]
-    if not decisions:
+    """How the paper's claims stand, for each variant of CSAC; those of which a side was not measured are counted."""
+    found = comparisons(study, arms)
+    measured = [one for one in found if len(one.ours) and len(one.others)]
+    if not measured:
         return
     yield Heading(scope.titled("The paper's claims"))
-    counts = Counter(one.verdict for one in decisions)
-    told = [f"{counts[verdict]} {verdict}" for verdict in ("reproduced", "not reproduced", "not yet decidable")]
-    yield Paragraph(f"{', '.join(told)}.", f"{len(decisions)} claims:")
-    rows = [Row((Cell(one.claim), Cell(one.verdict), Cell(one.why))) for one in decisions]
-    yield Table(("claim", "verdict", "because"), tuple(rows))
+    for variant in dict.fromkeys(one.variant for one in measured):
+        decisions = [decide(one) for one in measured if one.variant == variant]
+        counts = Counter(one.verdict for one in decisions)
+        told = [f"{counts[verdict]} {verdict}" for verdict in VERDICTS]
+        rows = [Row((Cell(one.claim), Cell(one.verdict), Cell(one.why))) for one in decisions]
+        yield Paragraph(f"{', '.join(told)}.", f"{variant}, {len(decisions)} claims:")
+        yield Table((f"{variant} has or shows", "verdict", "because"), tuple(rows))
+    if len(found) > len(measured):
+        yield Paragraph(f"Of {len(found) - len(measured)} more nothing was measured, or not both sides.")
     yield Paragraph(_VERDICTS)
 
 
