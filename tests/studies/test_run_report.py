@@ -160,11 +160,12 @@ def test_equal_runs_with_equal_seeds_stand_side_by_side():
     assert "| SAC, runs/b | 10.00 |" in text
 
 
-def test_a_run_without_evaluations_is_told():
+def test_a_run_without_evaluations_is_told(capsys):
     make_run_of("runs/a", [])
     text = report("runs/a")
     assert "| runs/a | Hopper-v4 | sac |" in text
     assert "## Learning curves" not in text
+    assert "note: there is no evaluation yet in these runs" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
