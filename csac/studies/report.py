@@ -7,18 +7,20 @@ import shlex
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+from csac.record.plots import NO_LOOKS
 from csac.record.rendering import Cell, Row, Table
 from csac.studies import paper, sections
 from csac.studies.arms import gather, with_rows
 from csac.studies.cells import complete
 from csac.studies.claims import VERDICTS, comparisons, decide
 from csac.studies.parts import Heading, Items, Paragraph, write
-from csac.studies.sections import Scope, plain
+from csac.studies.sections import Scope, plain, report_looks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from csac.record.plots import Look
     from csac.studies.arms import Arm
     from csac.studies.parts import Part
     from csac.studies.results import Source
@@ -45,7 +47,11 @@ def write_report(studies: Sequence[Study], source: Source, directory: Path, comm
 
     `commands` have made it. Raises InputError where it cannot be written.
     """
-    parts = [part for study in studies for part in _parts(study, gather(study, source), commands)]
+    parts: list[Part] = []
+    looks: Mapping[str, Look] = NO_LOOKS
+    for study in studies:
+        looks = report_looks([method.label for method in study.methods], looks)
+        parts += _parts(study, gather(study, source), commands, looks)
     path = directory / "report.html"
     write(path, studies[0].title if len(studies) == 1 else "Studies", parts)
     return path
@@ -69,8 +75,8 @@ def train_command(arm: Arm) -> str:
     return shlex.join(words)
 
 
-def _parts(study: Study, arms: list[Arm], commands: Sequence[str]) -> Iterator[Part]:
-    scope, shown = Scope(study.name, study.scale), with_rows(arms)
+def _parts(study: Study, arms: list[Arm], commands: Sequence[str], looks: Mapping[str, Look]) -> Iterator[Part]:
+    scope, shown = Scope(study.name, study.scale, looks), with_rows(arms)
     yield Heading(study.title, 1)
     if study.scale < 1:
         told = f"Every run is shortened to {study.scale:g} of its steps."

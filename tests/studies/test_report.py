@@ -7,6 +7,7 @@ import numpy as np
 import plotly.graph_objects
 import pytest
 from made import MadeRecords
+from matplotlib.figure import Figure
 
 from csac.studies import paper
 from csac.studies.arms import Arm, gather
@@ -340,6 +341,97 @@ def test_labels_cannot_break_the_page(tmp_path):
     page, _ = page_of([study], tmp_path)
     assert "<script>alert(1)" not in page
     assert evil in "".join(Reader(page).text)
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """The figures that are drawn as PNG, in order."""
+    drawn = []
+    save = Figure.savefig
+    monkeypatch.setattr(
+        Figure,
+        "savefig",
+        lambda self, *a, **k: (drawn.append(self) if k["format"] == "png" else None, save(self, *a, **k)),
+    )
+    return drawn
+
+
+def colours(figure):
+    """The colour of each label in a drawn picture, without its seeds."""
+    return {line.get_label().split(" (5")[0]: line.get_color() for line in figure.legends[0].get_lines()}
+
+
+def test_a_method_has_one_colour_in_the_whole_report(tmp_path, figures):
+    """Also where another before it has nothing to show, in the pictures and on the page."""
+
+    def returns(cell, step):
+        is_default = cell.algorithm == "csac" and cell.hyperparameters["reference_policy"] != "algorithm1"
+        return None if is_default and cell.task == "Walker2d-v4" else made(cell, step)
+
+    study = NAMED["mujoco"][0].narrowed(["HalfCheetah-v4", "Walker2d-v4"])
+    path = write_report([replace(study, analyses=("curves",))], MadeRecords(returns), tmp_path, [])
+    first, second = map(colours, figures)
+    assert [label for label in first if label not in second] == ["CSAC (default)"]
+    assert second.items() <= first.items()
+    plots = Reader(path.read_text()).plots
+    on_page = [{t["legendgroup"]: t["line"]["color"] for t in plot["data"] if "name" in t} for plot in plots]
+    assert on_page == [first, second]
+
+
+def test_swept_methods_keep_the_colour_that_they_have_in_another_study(tmp_path, figures):
+    first, second = NAMED["mujoco"][0].narrowed(["Walker2d-v4"]), NAMED["ablation"][0]
+    first = replace(first, methods=first.methods[::-1], analyses=("curves",))
+    write_report([first, replace(second, analyses=("returns",))], MadeRecords(made), tmp_path, [])
+    curves, over_tau = map(colours, figures)
+    assert list(over_tau) == ["CSAC (paper)", "CSAC (default)"]
+    assert over_tau.items() <= curves.items()
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("ablation", "lines: ± one standard deviation over seeds · 5 seeds"),
+        ("efficiency", "bars: median seed · lines: range of the seeds · 5 seeds"),
+        ("quadx", "lines: ± one standard deviation over seeds · 5 seeds"),
+    ],
+)
+def test_pictures_say_what_their_vertical_lines_are(tmp_path, figures, name, told):
+    (study,) = NAMED[name]
+    page, _ = page_of([study.narrowed(tasks=study.tasks[:1])], tmp_path)
+    drawn = [text.get_text() for figure in figures for text in (*figure.texts, *figure.axes[0].texts)]
+    assert drawn.count(told) == 1
+    assert " ".join(Reader(page).text).count(told) == 1
+
+
+def test_one_seed_has_no_vertical_lines(tmp_path):
+    (study,) = NAMED["quadx"]
+    page, _ = page_of([study.narrowed(seeds=1)], tmp_path)
+    told = " ".join(Reader(page).text)
+    assert "<small>1 seed</small>" in page
+    assert "lines: ±" not in told
+
+
+def test_success_is_a_share(tmp_path, figures):
+    class Some(MadeRecords):
+        def record(self, cell):
+            record = super().record(cell)
+            assert record
+            record.evaluations["success"] = cell.seed < 3  # 0.6 ± 0.55
+            return record
+
+    study = NAMED["panda"][0].narrowed(algorithms=["sac"])
+    path = write_report([replace(study, analyses=("success",))], Some(made), tmp_path, [])
+    (plot,) = Reader(path.read_text()).plots
+    assert plot["layout"]["yaxis"]["range"] == [-0.05, 1.05]
+    assert figures[0].axes[0].get_ylim() == pytest.approx((-0.05, 1.05))
+    assert (min(plot["data"][0]["y"]), max(plot["data"][0]["y"])) == pytest.approx((0.0523, 1.0), abs=1e-4)
+
+
+def test_the_axis_of_steps_has_room_for_its_last_number(tmp_path, figures):
+    page, _ = page_of([mujoco(algorithms=["sac"])], tmp_path)
+    (plot,) = Reader(page).plots
+    assert plot["layout"]["xaxis"]["range"] == [0, 1_015_000]
+    assert figures[0].axes[0].get_xlim() == pytest.approx((0, 1_015_000))
 
 
 def test_friction_stands_side_by_side(whole):

@@ -1,5 +1,6 @@
 """`csac report`: runs side by side, as a report and as a table of a page."""
 
+import re
 import shlex
 from pathlib import Path
 
@@ -150,6 +151,15 @@ def test_a_report_tells_of_perturbations_success_and_what_failed():
     assert "## Success" in text
     assert "| success | 1,000.0 ± 0.0 |" in text
     assert {path.suffix for path in Path("out").iterdir()} == {".html", ".md", ".png", ".svg"}
+
+
+def test_an_arm_has_one_colour_on_all_tasks():
+    make_run_of("runs/a", [[10.0]], algorithm="csac")
+    for task in ("Hopper-v4", "Ant-v4"):
+        make_run_of(f"runs/{task}", [[20.0]], task=task)
+    report("runs")
+    page = Path("out/report.html").read_text()
+    assert len(set(re.findall(r'"name":"SAC \(1 seed\)".*?"color":"(#\w+)"', page))) == 1
 
 
 def test_equal_runs_with_equal_seeds_stand_side_by_side():
