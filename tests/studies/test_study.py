@@ -1,3 +1,4 @@
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -85,14 +86,19 @@ def test_studies_share_what_they_have_in_common():
     assert len(keys["robustness"]) == 3 * 3 * 5
 
 
-def test_the_page_on_clusters_says_how_many_steps_there_are():
+def test_the_page_on_clusters_says_what_all_of_it_costs():
     steps, cells = Counter[str](), cells_of(WHOLE)
     for one in cells:
-        steps[one.algorithm] += one.steps // 10**6
+        steps[one.algorithm.upper()] += one.steps // 10**6
     page = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text()
-    assert f"| CSAC | {steps['csac']} |\n| SAC | {steps['sac']} |" in page
-    assert {steps[name] for name in ("ppo", "td3", "sd3")} == {35}
-    assert f"| together | {sum(steps.values())}, in {len(cells)} cells |" in page
+    rows = re.findall(r"^\| (\w+) \| (\d+) \| ([\d.]+) \| (\d+) \|$", page, re.MULTILINE)
+    assert {name: int(million) for name, million, *_ in rows} == steps
+    hours = {name: int(million) * 10 * float(minutes) / 60 for name, million, minutes, _ in rows}
+    assert {name: int(told) for name, *_, told in rows} == {name: round(own) for name, own in hours.items()}
+    assert f"| together, {len(cells)} cells | {sum(steps.values())} | | {sum(hours.values()):,.0f} |" in page
+    for cores in (2, 16):
+        some, fewer = sum(hours.values()) / cores, (sum(hours.values()) - hours["SD3"]) / cores
+        assert f"{cores} cores | {some:.0f} hours | {fewer:.0f} hours |" in page
 
 
 def test_smoke_has_something_of_every_study():
