@@ -12,8 +12,9 @@ from csac.studies import paper, sections
 from csac.studies.arms import gather, with_rows
 from csac.studies.cells import complete
 from csac.studies.claims import comparisons, decide
-from csac.studies.parts import Heading, Items, Paragraph, write
+from csac.studies.parts import Heading, Paragraph, write
 from csac.studies.sections import Scope, plain
+from csac.studies.standing import cells_so_far, wall_times
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -75,29 +76,17 @@ def _parts(study: Study, arms: list[Arm], commands: Sequence[str]) -> Iterator[P
     if study.scale < 1:
         told = f"Every run is shortened to {study.scale:g} of its steps."
         yield Paragraph("Runs that are shorter than the paper's neither confirm nor refute it.", told)
-    yield from _count(arms)
+    yield from cells_so_far(arms)
     if shown:
-        yield from _claims(study, arms, scope)
         for analysis in study.analyses:
             yield from _SECTIONS[analysis](shown, scope)
+        yield from _claims(study, arms, scope)
     yield from _hyperparameters(study)
     published = any(method.published for method in study.methods)
     yield from sections.provenance(arms, paper.INFERRED if published else ())
+    yield from wall_times(arms)
     runs = [train_command(arm) for arm in arms if arm.manifests]
     yield from sections.commands(commands, runs, "Each arm by itself, all its seeds in one run:")
-
-
-def _count(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Say how much of the study there is, and what is missing."""
-    done = sum(len(arm.manifests) for arm in arms)
-    failed = sum(len(arm.failures) for arm in arms)
-    missing = sum(len(arm.missing) for arm in arms)
-    text = f"{done} of {done + failed + missing} cells are complete"
-    yield Paragraph(text + f", {failed} failed" * bool(failed) + f", {missing} are not over" * bool(missing) + ".")
-    lines = [f"{_name(arm)}, seed {seed} failed: {reason}" for arm in arms for seed, reason in arm.failures.items()]
-    lines += [f"{_name(arm)}: no seed {', '.join(map(str, arm.missing))} yet" for arm in arms if arm.missing]
-    if lines:
-        yield Items(tuple(lines))
 
 
 def _claims(study: Study, arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
@@ -127,10 +116,6 @@ def _hyperparameters(study: Study) -> Iterator[Part]:
     yield Table((f"on {task}", *(method.label for method in study.methods)), tuple(rows))
     if study.scale < 1:
         yield Paragraph("Warm-up is a tenth of a shortened run at most; runs are evaluated twenty times at least.")
-
-
-def _name(arm: Arm) -> str:
-    return ", ".join([f"{arm.label} on {arm.task}", *arm.condition])
 
 
 def _option(name: str, value: Any) -> list[str]:
