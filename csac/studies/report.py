@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from csac.record.rendering import Cell, Row, Table
 from csac.studies import paper, sections
+from csac.studies.aggregates import over_tasks
 from csac.studies.arms import gather, with_rows
 from csac.studies.cells import complete
 from csac.studies.claims import comparisons, decide
@@ -80,6 +81,8 @@ def _parts(study: Study, arms: list[Arm], commands: Sequence[str]) -> Iterator[P
     if shown:
         for analysis in study.analyses:
             yield from _SECTIONS[analysis](shown, scope)
+            if analysis == "returns":
+                yield from over_tasks(arms, scope)
         yield from _claims(study, arms, scope)
     yield from _hyperparameters(study)
     published = any(method.published for method in study.methods)

@@ -22,6 +22,7 @@ from csac.record.run import RunDirectory, find_runs, is_run
 from csac.record.summaries import case_names, compare, last_rows
 from csac.record.summary_tables import case_comparison_table, comparison_table
 from csac.studies import sections
+from csac.studies.aggregates import over_tasks
 from csac.studies.arms import Arm, Time, by_condition, with_rows
 from csac.studies.figures import tells_of_success
 from csac.studies.parts import Heading, Items, Paragraph, write
@@ -197,6 +198,7 @@ def _parts(
         yield from sections.curves(plainly, scope)
     if shown:
         yield from sections.returns(shown, scope)
+        yield from over_tasks(arms, scope)
     if perturbed := [arm for arm in shown if arm.condition]:
         yield from sections.robustness(perturbed, scope)
     if any(tells_of_success(arm.rows) for arm in shown):
