@@ -219,7 +219,7 @@ def _holes(arms: Sequence[Arm], block: Block, label: str) -> str:
         there = {seed for arm in arms if (arm.label, arm.task) == (label, task) for seed in _scores(arm, end)}
         found[task] = [str(seed) for seed in block.seeds if seed not in there]
     if all(len(missing) == len(block.seeds) for missing in found.values()):
-        return "none"
+        return "without any"
     lacking = [
         f"{task} seed{'s' * (len(missing) > 1)} {', '.join(missing)}" for task, missing in found.items() if missing
     ]

@@ -14,7 +14,8 @@ from csac.studies.arms import gather, with_rows
 from csac.studies.cells import complete
 from csac.studies.claims import comparisons, decide
 from csac.studies.parts import Heading, Paragraph, write
-from csac.studies.sections import Scope, plain
+from csac.studies.sections import Scope
+from csac.studies.settings import hyperparameters
 from csac.studies.standing import cells_so_far, wall_times
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def _parts(study: Study, arms: list[Arm], commands: Sequence[str]) -> Iterator[P
             if analysis == "returns":
                 yield from over_tasks(arms, scope)
         yield from _claims(study, arms, scope)
-    yield from _hyperparameters(study)
+    yield from hyperparameters(study)
     published = any(method.published for method in study.methods)
     yield from sections.provenance(arms, paper.INFERRED if published else ())
     yield from wall_times(arms)
@@ -103,22 +104,6 @@ def _claims(study: Study, arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
     rows = [Row((Cell(one.claim), Cell(one.verdict), Cell(one.why))) for one in decisions]
     yield Table(("claim", "verdict", "because"), tuple(rows))
     yield Paragraph(_VERDICTS)
-
-
-def _hyperparameters(study: Study) -> Iterator[Part]:
-    yield Heading("Hyperparameters")
-    task = study.tasks[0]
-    names: dict[str, dict[str, Any]] = {}
-    for method in study.methods:
-        for name, value in method.hyperparameters_on(task).items():
-            names.setdefault(name, {})[method.label] = value
-    rows = [
-        Row((Cell(name), *(Cell(plain(values.get(method.label))) for method in study.methods)))
-        for name, values in names.items()
-    ]
-    yield Table((f"on {task}", *(method.label for method in study.methods)), tuple(rows))
-    if study.scale < 1:
-        yield Paragraph("Warm-up is a tenth of a shortened run at most; runs are evaluated twenty times at least.")
 
 
 def _option(name: str, value: Any) -> list[str]:

@@ -52,7 +52,7 @@ def wall_times(arms: Sequence[Arm]) -> Iterator[Part]:
     yield _grid(known, _median)
     yield Paragraph(_MEDIANS)
     if lines := [line for arm in known for line in _disturbed(arm, known)]:
-        yield Paragraph("another process had the machine too, or that task or seed is slower.", "Stands out:")
+        yield Paragraph("Another process had the machine too, or that task or seed is slower.", "These stand out.")
         yield Items(tuple(lines))
 
 

@@ -84,7 +84,7 @@ def test_what_is_missing_is_told():
     arms += [arm("SAC", "Third", {}, missing=[0, 1, 2])]
     text = told(over_tasks(arms, Scope("it")))
     assert "2 of 3 methods, 2 of 3 tasks, 2 of 3 seeds." in text
-    assert "Not complete on these: SD3 (none). Not complete for these methods: Third, seed 2." in text
+    assert "Not complete on these: SD3 (without any). Not complete for these methods: Third, seed 2." in text
 
 
 # The numbers.
