@@ -10,10 +10,10 @@ import os
 import re
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 import tyro
-from tyro.conf import DisallowNone
+from tyro.conf import DisallowNone, Positional
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from csac.types import InputError
@@ -32,6 +32,23 @@ _COMPLAINTS = (
     (r"Error parsing (--\S+): Could not find valid parse for arguments: (.*)", r"\1 does not take \2"),
     (r"Error parsing (--\S+): (.*)", r"\1: \2"),
     (r"Error parsing \S+: (.*)", r"\1"),
+)
+
+# What papers and other libraries call our options.
+_CALLED_OTHERWISE = MappingProxyType(
+    {
+        "--tau": ("--relative-entropy-weight", "--target-rate"),
+        "--sigma": ("--entropy-weight",),
+        "--alpha": ("--entropy-weight",),
+        "--ent-coef": ("--entropy-weight",),
+        "--gamma": ("--discount",),
+        "--polyak": ("--target-rate",),
+        "--learning-starts": ("--warmup-steps",),
+        "--buffer-size": ("--replay-size",),
+        "--train-freq": ("--update-interval",),
+        "--gradient-steps": ("--updates-per-step",),
+        "--total-timesteps": ("--steps",),
+    }
 )
 
 
@@ -147,8 +164,14 @@ def _one_line(complaint: str) -> str:
     text = " ".join(sections[1 if len(sections) > 1 else 0].split())
     for pattern, template in _COMPLAINTS:
         if match := re.fullmatch(pattern, text):
-            return match.expand(template)
+            return _with_choices_in_order(match.expand(template))
     return text
+
+
+def _with_choices_in_order(text: str) -> str:
+    """Put what may be chosen in an order, which tyro does not, without None, which leaving the option out chooses."""
+    told, between, choices = text.partition(" is not one of ")
+    return told + between + ", ".join(sorted({*choices.split(", ")} - {"'None'"})) if between else text
 
 
 def _unknown(argument: str, command: type[Any], elsewhere: Mapping[str, type[Any]]) -> str:
@@ -158,17 +181,23 @@ def _unknown(argument: str, command: type[Any], elsewhere: Mapping[str, type[Any
     for name, kind in elsewhere.items():
         if option in _options(kind):
             return f"{option} is an option of {name}, which --algorithm {name} chooses"
-    return f"there is no option {option}{nearest(option, _options(command))}"
+    known = _options(command)
+    meant = [name for name in _CALLED_OTHERWISE.get(option, ()) if name in known]
+    return f"there is no option {option}" + (f"; it is {' or '.join(meant)} here" if meant else nearest(option, known))
 
 
 def _options(kind: type[Any]) -> list[str]:
     """Return the options that tyro makes of a dataclass; those of a dataclass within have no prefix."""
     names: list[str] = []
+    annotations = get_type_hints(kind, include_extras=True)
     for item in dataclasses.fields(kind):
         if dataclasses.is_dataclass(item.default):
             names += _options(type(item.default))
-        else:
-            names.append("--" + item.name.replace("_", "-"))
+            continue
+        extras = getattr(annotations[item.name], "__metadata__", ())
+        if Positional[Any].__metadata__[0] not in extras:
+            own = next((extra.name for extra in extras if isinstance(getattr(extra, "name", None), str)), item.name)
+            names.append("--" + own.replace("_", "-"))
     return names
 
 

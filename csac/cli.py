@@ -279,12 +279,15 @@ def _latency(arguments: list[str]) -> int:
         raise InputError("give the folder of an artefact (csac export writes one)")
     from csac.console.latencies import latency_table
     from csac.console.tables import make_console
+    from csac.deploy.artefact import open_artefact
     from csac.evaluation.latency import measure
     from csac.record.csv_tables import check_new
 
     console, measured = make_console(), {}
     if options.plot:
         check_new(options.plot, "picture", ".png")
+    for path in options.artefacts:
+        open_artefact(path)  # or refuse it before any is measured
     for path in options.artefacts:
         console.print(f"measuring {path}", soft_wrap=True)  # once: what moves on a terminal takes time from a core
         measured[str(path)] = measure(path, options.calls, options.rate, options.seconds)
@@ -303,10 +306,13 @@ def _runs(arguments: list[str]) -> int:
     from csac.record.run import find_runs
 
     is_default = options.directory == Path("runs")
-    runs = [] if is_default and not options.directory.exists() else find_runs(options.directory)
+    damaged: list[InputError] = []
+    runs = [] if is_default and not options.directory.exists() else find_runs(options.directory, damaged.append)
     if runs:
         print_runs(make_console(), runs)
-    else:
+    for error in damaged:
+        _say(f"damaged: {error}")
+    if not runs and not damaged:
         _say(f"no runs in {options.directory} yet; csac train HalfCheetah-v4 starts one")
     return 0
 
@@ -329,6 +335,8 @@ def _report(arguments: list[str]) -> int:
         command = shlex.join(["csac", "report", *arguments])
         reports.write_run_report(comparison, path, options.title, [command])
         _say(f"{path}\n{path.with_suffix('.md')}")
+    if not any(len(run.rows) for run in runs):
+        _say("note: there is no evaluation yet in these runs, so there is little in it")
     return 0
 
 

@@ -41,7 +41,7 @@ class Train(Options):
     start_from: Annotated[str | None, arg(name="from", metavar="DIR[@STEP]", help_behavior_hint="(default: none)")] = (
         None
     )
-    """Begin with a copy of that run's checkpoint; what is not given here is as it was there."""
+    """Begin with a copy of that run's checkpoint; what is learnt and how it is evaluated are as there, if not given."""
     events: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: the task's own)")] = None
     """More names in the info of an evaluation episode's last step: each becomes a column and a curve of its own."""
     env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"

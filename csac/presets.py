@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,8 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from csac.types import Algorithm
 
 # The paper's "Common hyper-parameter settings of compared approaches": its columns CSAC and SAC are equal.
 _PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
@@ -115,9 +118,11 @@ def hyperparameters(preset: str, algorithm: str, task: str) -> dict[str, Any]:
     return {**_PAPER[algorithm], **_PAPER_TASKS.get((algorithm, task.rpartition(":")[2]), {})}
 
 
-def matching_preset(algorithm: str, task: str, values: Mapping[str, Any]) -> str | None:
-    """Return the preset of which all hyperparameters are among these values, or None."""
+def matching_preset(algorithm: type[Algorithm], task: str, values: Mapping[str, Any]) -> str | None:
+    """Return the preset that gives an algorithm just these hyperparameters, the others as by default, or None."""
     for preset in PRESETS:
-        if algorithm in _PAPER and hyperparameters(preset, algorithm, task).items() <= values.items():
-            return preset
+        if algorithm.name in _PAPER:
+            preset_values = hyperparameters(preset, algorithm.name, task)
+            if dataclasses.asdict(algorithm(**preset_values)) == values:  # pyright: ignore[reportArgumentType, reportCallIssue]
+                return preset
     return None

@@ -135,6 +135,18 @@ def words(text):
         ("train X --groups x", "--groups: 'x' is not a number (csac train --help)"),
         ("train X --discount x", "--discount: 'x' is not a number (csac train --help)"),
         ("train X --sedes 3", "there is no option --sedes; did you mean --seeds or --steps? (csac train --help)"),
+        (
+            "train X --tau 1",
+            "there is no option --tau; it is --relative-entropy-weight or --target-rate here (csac train --help)",
+        ),
+        ("train X --algorithm td3 --sigma 1", "there is no option --sigma (csac train --help)"),
+        ("train X --form DIR", "there is no option --form; did you mean --from? (csac train --help)"),
+        ("evaluate X --runs 1", "there is no option --runs (csac evaluate --help)"),
+        (
+            "study run smoke --engine x",
+            "--engine: 'x' is not one of 'local', 'processes', 'ray' (csac study run --help)",
+        ),
+        ("latency nowhere", "nowhere does not exist; give the folder of an artefact (csac export writes one)"),
         ("train X --no_such_thing=3", "there is no option --no-such-thing (csac train --help)"),
         ("train X Y", "there is no place for 'Y' (csac train --help)"),
         ("train X --device tpu", "--device: 'tpu' is not one of 'cpu', 'gpu' (csac train --help)"),
@@ -490,6 +502,18 @@ def test_runs_lists_it(trained, capsys):
     assert csac(f"runs {trained[1].parent}") == 0
 
     assert words(capsys.readouterr().out)[1] == f"probes:Endless-v0 csac 2 40 / 40 finished 10.00 {trained[1]}"
+
+
+def test_runs_tells_of_one_that_is_damaged(tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "evaluations.csv").touch()
+    (tmp_path / "run" / "manifest.json").write_bytes(b'{"schema_version": 1, "ta')
+
+    assert csac(f"runs {tmp_path}") == 0
+
+    told = capsys.readouterr().out
+    assert told.startswith("damaged: ")
+    assert "manifest.json is broken" in told
 
 
 def test_runs_without_any_says_how_to_start_one(capsys):

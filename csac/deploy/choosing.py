@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Integral
 from pathlib import Path
 from typing import get_args
 
@@ -55,6 +56,8 @@ def choose_seed(run: RunDirectory, seed: int | None = None) -> int:
         raise InputError(f"{run.path} holds no policies yet: its first evaluation writes them")
     if seed is None:
         return _best_seed(run, _without_failed(run, seeds))
+    if isinstance(seed, bool) or not isinstance(seed, Integral):
+        raise InputError(f"seed is the label of one, a whole number, not {seed!r:.40}")
     if seed not in seeds:
         raise InputError(f"{run.path} has no policy of seed {seed}; it has those of {_listed(seeds)}")
     return seed

@@ -210,7 +210,8 @@ def read_file(path: Path) -> bytes:
 
 def read_json(path: Path) -> Any:
     """Return what a JSON file holds. Raises InputError where it cannot be read, or is none."""
+    content = read_file(path)
     try:
-        return json.loads(read_file(path).decode())
+        return json.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid JSON ({error}): restore it from a copy") from error

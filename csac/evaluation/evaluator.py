@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from csac.checks import check_whole
 from csac.deploy.policy import Policy, noise_generator
+from csac.record.manifest import SEED_LIMIT
 from csac.tasks.environment import Environment
 from csac.tasks.known import events_of
 from csac.tasks.perturbations import constant_perturbations, values_at
@@ -74,7 +76,7 @@ class Evaluator:
         events: names in the last step's `info` to keep of each episode.
 
     Raises:
-        InputError: fewer than one episode.
+        InputError: episodes or seeds that there cannot be.
     """
 
     def __init__(
@@ -85,7 +87,7 @@ class Evaluator:
         first_seed: int = EVALUATION_SEED,
         events: Sequence[str] = (),
     ) -> None:
-        _check_episodes(episodes)
+        _check_episodes(episodes, first_seed)
         self._task, self._environment_arguments = task, environment_arguments
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
         self._environments: list[Environment] = []
@@ -275,7 +277,7 @@ def evaluate_episodes(
             evaluator.close()
     if not callable(getattr(policy, "predict", None)):
         raise InputError(f"a {type(policy).__name__} has no predict: give a policy as csac.load returns it")
-    _check_episodes(episodes)
+    _check_episodes(episodes, first_seed)
     environment = Environment(task, environment_arguments)
     try:
         played = []
@@ -303,9 +305,9 @@ def _play(policy: Any, episode: _Episode, deterministic: bool, events: Sequence[
     return episode.result(events)
 
 
-def _check_episodes(episodes: int) -> None:
-    if episodes < 1:
-        raise InputError(f"{episodes} evaluation episodes: run at least one")
+def _check_episodes(episodes: int, first_seed: int) -> None:
+    check_whole("episodes", episodes, 1, SEED_LIMIT)
+    check_whole("first_seed", first_seed, 0, SEED_LIMIT - episodes)
 
 
 def _check_contract(policy: Policy, environment: Environment) -> None:

@@ -20,6 +20,9 @@ FEWEST_FOR_INTERVAL_BAND = 5  # seeds: of three, a t-interval is so high that no
 Spread = Literal["95 % t-interval", "± standard deviation"]
 INTERVAL: Spread = "95 % t-interval"
 DEVIATION: Spread = "± standard deviation"
+Limits = tuple[float, float]
+NEXT = " · "  # between two things that are to be known to read a picture
+SHARE: Limits = (0.0, 1.0)  # of all episodes
 
 
 class Curve(NamedTuple):
@@ -55,12 +58,14 @@ class Curve(NamedTuple):
         return f"{self.label} ({len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
 
-def curves_of(runs: Sequence[tuple[str, np.ndarray]], spread: Spread = INTERVAL) -> list[Curve]:
+def curves_of(
+    runs: Sequence[tuple[str, np.ndarray]], spread: Spread = INTERVAL, within: Limits | None = None
+) -> list[Curve]:
     """Return the curve of each run, given as `(label, rows of evaluations.csv)`; one without returns has none.
 
-    `spread` is what the band shows from five seeds on.
+    `spread` is what the band shows from five seeds on; it ends at the limits `within` which every value lies.
     """
-    return [_curve(label, rows, spread) for label, rows in runs if not np.isnan(rows["return"]).all()]
+    return [_curve(label, rows, spread, within) for label, rows in runs if not np.isnan(rows["return"]).all()]
 
 
 def note(curves: Sequence[Curve]) -> str:
@@ -74,11 +79,17 @@ def note(curves: Sequence[Curve]) -> str:
     bands += dict.fromkeys(curve.band for curve in curves if curve.has_band and not curve.shows_seeds)
     if bands:
         parts.append("band: " + f", from {FEWEST_FOR_INTERVAL_BAND} seeds ".join(bands))
-    return " · ".join(parts)
+    return NEXT.join(parts)
 
 
-def limits(curves: Sequence[Curve]) -> tuple[float, float]:
-    """Return how far an axis goes: to show all seeds, and of the bands no more than a quarter beyond."""
+def limits(curves: Sequence[Curve], within: Limits | None = None) -> Limits:
+    """Return how far an axis goes: to show all seeds, and of the bands no more than a quarter beyond.
+
+    Where all values lie `within` limits, it shows these.
+    """
+    if within:
+        margin = 0.05 * (within[1] - within[0])
+        return within[0] - margin, within[1] + margin
     lowest = min(float(np.nanmin(curve.returns)) for curve in curves)
     highest = max(float(np.nanmax(curve.returns)) for curve in curves)
     reach = 0.25 * (highest - lowest) or 1.0
@@ -89,7 +100,12 @@ def limits(curves: Sequence[Curve]) -> tuple[float, float]:
     return max(min(low, lowest) - margin, lowest - reach), min(max(high, highest) + margin, highest + reach)
 
 
-def _curve(label: str, rows: np.ndarray, spread: Spread) -> Curve:
+def last_step(curves: Sequence[Curve]) -> float:
+    """Return how far the axis of steps goes: a little further than the last evaluation, so that its number fits."""
+    return 1.015 * max((float(curve.steps.max()) for curve in curves), default=0.0) or 1.0
+
+
+def _curve(label: str, rows: np.ndarray, spread: Spread, within: Limits | None) -> Curve:
     steps, seeds, returns = evaluation_matrix(rows)
     mean, low, high = mean_and_interval(returns)
     if len(seeds) < FEWEST_FOR_INTERVAL_BAND:
@@ -97,6 +113,8 @@ def _curve(label: str, rows: np.ndarray, spread: Spread) -> Curve:
     elif spread == DEVIATION:
         deviation = _deviation(returns, mean)
         low, high = mean - deviation, mean + deviation
+    if within:
+        low, high = np.clip(low, *within), np.clip(high, *within)
     return Curve(label, steps, seeds, returns, mean, low, high, spread)
 
 

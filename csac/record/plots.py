@@ -6,24 +6,27 @@
 from __future__ import annotations
 
 import io
+import itertools
+import math
 import os
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from csac.record.atomic import write_atomically
-from csac.record.curves import INTERVAL, curves_of, limits, note
+from csac.record.curves import INTERVAL, NEXT, curves_of, last_step, limits, note
 from csac.record.rendering import short
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-    from csac.record.curves import Curve, Spread
+    from csac.record.curves import Curve, Limits, Spread
 
 
 @contextmanager
@@ -48,12 +51,19 @@ with _without_a_backend():
 # Okabe and Ito's colours, distinct to colour-blind eyes; yellow is left out, too pale for a line.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#444444")
 PADDING = 0.1  # inches around everything
-LEGEND_CHARACTERS = 100  # that fit side by side below the axes
+WIDTH, PANELS_WIDTH = 5.0, 7.5  # inches of one panel, and of several: in a column of 3.4 inches text is still 7 points
+PIXELS = 1200  # from side to side
+LINE = 0.2  # inches from line to line of a legend or a title
+TITLE_FONT: Mapping[str, Any] = MappingProxyType({"fontsize": 13, "fontweight": "bold"})
+LEGEND: Mapping[str, Any] = MappingProxyType({"frameon": False, "borderpad": 0.1, "columnspacing": 1.2})
+NOTE_FONT: Mapping[str, Any] = MappingProxyType({"fontsize": 9, "color": "#777777", "linespacing": 1.2})
 RETURN = "return per evaluation episode"
 Format = Literal["png", "pdf", "svg"]
 LineStyle = Literal["-", "--", "-.", ":"]
 Look = tuple[str, LineStyle]
 LINE_STYLES: tuple[LineStyle, ...] = ("-", "--", "-.", ":")
+LOOKS: tuple[Look, ...] = tuple((colour, style) for style in LINE_STYLES for colour in COLOURS)
+NO_LOOKS: Mapping[str, Look] = MappingProxyType({})
 STYLE = {
     "font.size": 10.0,
     "axes.titlesize": 13.0,
@@ -115,71 +125,98 @@ def learning_curves(
     formats: Sequence[Format] = ("png",),
     quantity: str = RETURN,
     spread: Spread = INTERVAL,
+    within: Limits | None = None,
+    looks: Mapping[str, Look] = NO_LOOKS,
 ) -> None:
-    """Draw a `learning_curve` in each panel, side by side on one scale; a label looks the same in all of them."""
-    shown = [curves_of(panel.runs, spread) for panel in panels]
+    """Draw a `learning_curve` in each panel, side by side on one scale; a label looks the same in all of them.
+
+    No band leaves the limits `within` which every value lies. `looks` are those that labels have elsewhere.
+    """
+    shown = [curves_of(panel.runs, spread, within) for panel in panels]
     found = [curve for curves in shown for curve in curves]
-    looks = looks_of([label for panel in panels for label, _ in panel.runs])
-    with picture(7.5, 4.8 if len(panels) == 1 else 3.9, columns=len(panels)) as figure:
+    looks = looks_of([label for panel in panels for label, _ in panel.runs], looks)
+    with picture(3.2 if len(panels) == 1 else 3.5, columns=len(panels)) as figure:
         for axes, curves in zip(figure.axes, shown, strict=True):
             for curve in curves:
                 _draw_curve(axes, curve, looks[curve.label])
-            _dress(axes, curves, ticks=8 if len(panels) == 1 else 4)
+            _dress(axes, curves, ticks=6 if len(panels) == 1 else 4)
         figure.axes[0].set_ylabel(quantity)
         if found:
-            figure.axes[0].set_ylim(*limits(found))
+            figure.axes[0].set_ylim(*limits(found, within))
+        draw_legend(figure, {curve.legend: looks[curve.label] for curve in found})
         head(figure, title, [panel.title for panel in panels], note(found))
         for axes, panel in zip(figure.axes, panels, strict=True):
             _draw_marks(axes, panel.marks)
-        draw_legend(figure, {curve.legend: looks[curve.label] for curve in found})
         save(figure, path, formats)
 
 
 @contextmanager
-def picture(width: float, height: float, columns: int = 1, sharey: bool = True) -> Iterator[Figure]:
-    """Give a figure of so many inches and axes side by side, in the style of all pictures, whatever the user's own."""
+def picture(height: float, columns: int = 1, sharey: bool = True) -> Iterator[Figure]:
+    """Give a figure with axes side by side, in the style of all pictures, whatever the user's own.
+
+    It is `height` inches high; its title, the words below it and its legend make it higher.
+    """
     with matplotlib.style.context(["default", STYLE]):
-        figure = Figure(figsize=(width, height), layout="constrained")
+        width = WIDTH if columns == 1 else PANELS_WIDTH
+        figure = Figure(figsize=(width, height), dpi=PIXELS / width, layout="constrained")
         FigureCanvasAgg(figure)  # drawn by it whatever window the user has chosen
         figure.subplots(1, columns, sharey=sharey)
         yield figure
 
 
-def looks_of(labels: Sequence[str]) -> dict[str, Look]:
-    """Return the colour and the line style of each label; the style changes once the colours are used up."""
-    return {
-        label: (COLOURS[index % len(COLOURS)], LINE_STYLES[index // len(COLOURS) % len(LINE_STYLES)])
-        for index, label in enumerate(dict.fromkeys(labels))
-    }
+def looks_of(labels: Iterable[str], known: Mapping[str, Look] = NO_LOOKS) -> dict[str, Look]:
+    """Return the colour and the line style of each label: the look it has already, or the first that is free.
+
+    The style changes once the colours are used up.
+    """
+    labels = dict.fromkeys(labels)
+    taken = {known[label] for label in labels if label in known}
+    free = itertools.chain((look for look in LOOKS if look not in taken), itertools.cycle(LOOKS))
+    return {label: known[label] if label in known else next(free) for label in labels}
 
 
 def head(figure: Figure, title: str, titles: Sequence[str] = ("",), text: str = "") -> None:
     """Put a title above all axes, one above each, and small below the first what is to be known to read them."""
+    figure.draw_without_rendering()  # which lays the axes out
+    room = figure.get_figwidth() - 2 * PADDING
+    if len(titles) == 1:
+        room = figure.axes[0].get_position().width * figure.get_figwidth()
+    title = _broken(figure, title, " ", room, TITLE_FONT)
+    text = _broken(figure, text, NEXT, room, NOTE_FONT)
+    lines = text.count("\n") + 1 if text else 0
+    _make_higher(figure, LINE * (title.count("\n") + lines))
     if len(titles) == 1:
         axes = figure.axes[0]
-        axes.set_title(title, pad=24 if text else 12)
+        axes.set_title(title, pad=12 + 12 * lines)
         if text:
-            axes.text(0, 1.025, text, transform=axes.transAxes, fontsize=9, color="#777777")
+            axes.annotate(text, (0, 1), (0, 6), xycoords="axes fraction", textcoords="offset points", **NOTE_FONT)
         return
     for axes, panel in zip(figure.axes, titles, strict=True):
         axes.set_title(panel, fontsize=10, pad=6)
     left = 0.012
-    figure.suptitle(title + "\n" * bool(text), x=left, ha="left", fontsize=13, fontweight="bold")
+    figure.suptitle(title + "\n" * lines, x=left, ha="left", **TITLE_FONT)
     if text:
-        top = 1 - (PADDING + 20 / 72) / figure.get_figheight()  # the layout puts the title so far from the edge
-        figure.text(left, top, text, va="top", fontsize=9, color="#777777")
+        above = PADDING + (20 + 16 * title.count("\n")) / 72  # where the layout puts the last line of the title
+        figure.text(left, 1 - above / figure.get_figheight(), text, va="top", **NOTE_FONT)
 
 
 def draw_legend(figure: Figure, looks: Mapping[str, Look], more: Sequence[Artist] = ()) -> None:
-    """Put the legend below the axes, where it covers no curve, in as many columns as the longest label allows."""
+    """Put the legend below the axes, where it covers no curve, in as few lines as it fits into.
+
+    The picture grows by its lines.
+    """
     handles = [
         Line2D([], [], color=colour, linestyle=line_style, linewidth=2.2, label=text)
         for text, (colour, line_style) in looks.items()
     ]
     handles = [*handles, *more]
-    if handles:
-        columns = min(len(handles), max(1, LEGEND_CHARACTERS // (max(map(len, looks)) + 6)))
-        figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
+    for lines in range(1, len(handles) + 1):
+        columns = math.ceil(len(handles) / lines)
+        legend = figure.legend(handles=handles, loc="outside lower center", ncols=columns, **LEGEND)
+        if columns == 1 or legend.get_window_extent().width <= (figure.get_figwidth() - 2 * PADDING) * figure.dpi:
+            _make_higher(figure, LINE * lines)
+            return
+        legend.remove()
 
 
 def save(figure: Figure, path: str | Path, formats: Sequence[Format]) -> None:
@@ -209,7 +246,40 @@ def _dress(axes: Axes, curves: Sequence[Curve], ticks: int) -> None:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, "no evaluations yet", transform=axes.transAxes, ha="center", color="#777777")
         return
-    axes.set_xlim(0, max(axes.dataLim.x1, 1) * 1.015)
+    axes.set_xlim(0, last_step(curves))
+
+
+def _make_higher(figure: Figure, inches: float) -> None:
+    figure.set_figheight(figure.get_figheight() + inches)
+
+
+def _broken(figure: Figure, text: str, between: str, inches: float, font: Mapping[str, Any]) -> str:
+    """Return a text in as few lines as fit into so many inches, none much longer than another."""
+    narrowest: dict[int, str] = {}
+    for characters in range(len(text) + 1):
+        lines = _lines(text, between, characters)
+        narrowest.setdefault(len(lines), "\n".join(lines))
+    texts = [narrowest[count] for count in sorted(narrowest)]
+    return next((each for each in texts if _width(figure, each, font) <= inches), texts[-1])
+
+
+def _width(figure: Figure, text: str, font: Mapping[str, Any]) -> float:
+    """Return how many inches a text takes."""
+    artist = figure.text(0, 0, text, **font)
+    width = artist.get_window_extent().width
+    artist.remove()
+    return width / figure.dpi
+
+
+def _lines(text: str, between: str, characters: float) -> list[str]:
+    """Return the lines of a text; one ends only where `between` stands."""
+    lines: list[str] = []
+    for part in text.split(between):
+        if lines and len(lines[-1] + between + part) <= characters:
+            lines[-1] += between + part
+        else:
+            lines.append(part)
+    return lines
 
 
 def _draw_marks(axes: Axes, marks: Sequence[tuple[int, str]]) -> None:
@@ -222,5 +292,5 @@ def _draw_marks(axes: Axes, marks: Sequence[tuple[int, str]]) -> None:
 def _write(figure: Figure, path: Path, kind: Format) -> None:
     data = io.BytesIO()
     nothing = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[kind]  # that would differ from file to file
-    figure.savefig(data, format=kind, dpi=160, metadata={nothing: None})
+    figure.savefig(data, format=kind, dpi=PIXELS / figure.get_figwidth(), metadata={nothing: None})
     write_atomically(path, data.getvalue())

@@ -23,7 +23,7 @@ except ImportError:  # Windows: nothing keeps two processes apart there
     fcntl = None
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from csac.record.manifest import Manifest
 
@@ -190,17 +190,24 @@ def is_run(path: str | Path) -> bool:
     return (Path(path) / MANIFEST).exists()
 
 
-def find_runs(directory: str | Path) -> list[RunDirectory]:
-    """Every readable run in `directory` and below, sorted by path. Raises InputError where there is no directory."""
+def find_runs(directory: str | Path, on_damaged: Callable[[InputError], None] | None = None) -> list[RunDirectory]:
+    """Return every readable run in `directory` and below, sorted by path; `on_damaged` is told why another is not.
+
+    Raises:
+        InputError: there is no such directory.
+    """
     directory = Path(directory)
     if not directory.is_dir():
         raise InputError(f"there is no directory {directory}; give one that holds runs")
     runs = []
     for folder, below, files in os.walk(directory):
         if MANIFEST in files:
-            with suppress(InputError):
+            try:
                 runs.append(RunDirectory.open(folder))
                 below.clear()
+            except InputError as error:
+                if on_damaged and "evaluations.csv" in files:  # else it is the manifest of something else
+                    on_damaged(error)
     return sorted(runs, key=lambda run: run.path)
 
 

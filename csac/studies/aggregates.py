@@ -22,7 +22,7 @@ from csac.record.statistics import (
     stratified_bootstrap_interval,
 )
 from csac.studies import paper
-from csac.studies.parts import Figure, Heading, Paragraph
+from csac.studies.parts import Heading, Paragraph
 from csac.studies.profiles import Profile, Profiles
 from csac.studies.sections import described
 
@@ -117,7 +117,7 @@ def _over_tasks(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
     if table := improvements_table(shares, _baselines(arms, block)):
         yield table
     title = ", ".join(filter(None, ("Performance profile", changes)))
-    yield Figure(scope.file("performance-profile", changes), scope.titled(title), profiles(shares))
+    yield scope.figure("performance-profile", changes, profiles(shares), title)
 
 
 def means_table(shares: Mapping[str, np.ndarray], title: str) -> Table:

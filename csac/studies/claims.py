@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from csac.record.curve_measures import recovery, steps_to_reach
+from csac.record.curve_measures import drawdown, recovery, steps_to_reach
 from csac.record.statistics import (
     FEWEST_FOR_BOOTSTRAP,
     evaluation_matrix,
@@ -21,9 +23,13 @@ from csac.tasks.perturbations import by_step, perturbations_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from csac.record.curve_measures import Recovery
     from csac.studies.arms import Arm
+    from csac.studies.study import Study
 
 Verdict = Literal["reproduced", "not reproduced", "not yet decidable"]
+VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
+NEARLY_ALL = 0.95  # of an evaluation's episodes: the paper's "nearly 100 %"
 EVEN = 0.5  # the probability at which neither of two methods is better
 
 
@@ -33,6 +39,10 @@ class Comparison(NamedTuple):
     claim: str
     ours: np.ndarray
     others: np.ndarray
+    variant: str = ""
+    """The variant of CSAC that it is about."""
+    is_whole: bool = True
+    """Whether the runs of both are as long as the paper's."""
 
 
 class Decision(NamedTuple):
@@ -43,38 +53,33 @@ class Decision(NamedTuple):
     why: str
 
 
-def decide(comparison: Comparison, is_whole: bool = True) -> Decision:
-    """Return what the seeds say of a claim.
+def decide(comparison: Comparison) -> Decision:
+    """Return what the seeds say of a claim of which both sides were measured.
 
     It is reproduced where the 95 % interval of the probability that a seed of ours is above one of the others lies
     above one half, not reproduced where it lies below, and else not yet decidable; below five seeds there is none. Runs
     that are not whole decide nothing, and it is only said what holds of them.
     """
-    ours, others = comparison.ours, comparison.others
+    claim, ours, others, *_ = comparison
     fewest = min(len(ours), len(others))
-    if not fewest:
-        return Decision(comparison.claim, "not yet decidable", "not measured")
     probability, bounds = probability_of_improvement(ours, others), improvement_interval(ours, others)
     told = f"better in {probability:.0%} of the pairs of seeds"
     if bounds is None:
         few = f"{fewest} seed{'s' * (fewest > 1)}: no interval below {FEWEST_FOR_BOOTSTRAP}"
-        return Decision(comparison.claim, "not yet decidable", f"{told}; {few}")
+        return Decision(claim, "not yet decidable", f"{told}; {few}")
     low, high = bounds
     verdict: Verdict = "reproduced" if low > EVEN else "not reproduced" if high < EVEN else "not yet decidable"
     told += f", 95 % interval {low:.0%} to {high:.0%}"
-    if not is_whole:
+    if not comparison.is_whole:
         words = {"reproduced": "it holds", "not reproduced": "it does not hold", "not yet decidable": "it is open"}
-        return Decision(comparison.claim, "not yet decidable", f"of the shortened runs {words[verdict]}: {told}")
-    return Decision(comparison.claim, verdict, told)
+        return Decision(claim, "not yet decidable", f"of the shortened runs {words[verdict]}: {told}")
+    return Decision(claim, verdict, told)
 
 
-def comparisons(name: str, analyses: Sequence[str], arms: Sequence[Arm]) -> list[Comparison]:
-    """Return what the paper claims of a study: of each variant of CSAC that was run."""
-    found: list[Comparison] = []
-    for kind in analyses:
-        if kind in _KINDS and name != "reference":
-            found += _KINDS[kind](arms)
-    return found
+def comparisons(study: Study, arms: Sequence[Arm]) -> list[Comparison]:
+    """Return what the paper claims of a study, held against each variant of CSAC that was run."""
+    kinds = () if study.name == "reference" else study.analyses
+    return [comparison for kind in kinds if kind in _KINDS for comparison in _KINDS[kind](arms)]
 
 
 def lower_boundary(arms: Sequence[Arm]) -> float:
@@ -98,19 +103,29 @@ def _returns(arms: Sequence[Arm]) -> Iterator[Comparison]:
         for arm, other in _pairs(own):
             name = other.published or ""
             if name in published and published["CSAC"].mean > published[name].mean:
-                claim = f"{task}: {arm.label} has a higher maximum average return than {name}"
-                yield Comparison(claim, arm.best()[0], other.best()[0])
+                yield _better(f"{task}: a higher maximum average return than {name}", arm, other, _best)
+            if name == "SAC" and name in published:
+                yield from _stability(task, arm, other)
+
+
+def _stability(task: str, arm: Arm, other: Arm) -> Iterator[Comparison]:
+    """What "more stable" is taken to be: less of a fall while learning, and less between seeds."""
+    yield _better(f"{task}: a smaller largest fall of a learning curve than {other.published}", arm, other, _steadiness)
+    published = paper.RETURNS[task]
+    if published["CSAC"].std < published["SAC"].std:
+        claim = f"{task}: maximum average returns of the seeds nearer to their median than {other.published}'s"
+        yield _better(claim, arm, other, lambda one: -np.abs(_best(one) - np.median(_best(one))))
 
 
 def _weights(arms: Sequence[Arm]) -> Iterator[Comparison]:
     """The weight that the paper finds best against each other weight, within each variant."""
     values = [(arm, arm.hyperparameters["relative_entropy_weight"]) for arm in arms]
     for best in (arm for arm, value in values if value == paper.BEST_TAU):
-        variant = best.label.partition(", ")[0]
         for other, value in values:
-            if other.label.partition(", ")[0] == variant and value != paper.BEST_TAU:
-                claim = f"{variant}: tau {paper.BEST_TAU:g} has a higher maximum average return than tau {value:g}"
-                yield Comparison(claim, best.best()[0], other.best()[0])
+            if _variant(other) == _variant(best) and value != paper.BEST_TAU:
+                yield _better(
+                    f"tau {paper.BEST_TAU:g}: a higher maximum average return than {value:g}", best, other, _best
+                )
 
 
 def _efficiency(arms: Sequence[Arm]) -> Iterator[Comparison]:
@@ -119,54 +134,91 @@ def _efficiency(arms: Sequence[Arm]) -> Iterator[Comparison]:
         for arm, other in _pairs(own):
             name = other.published or ""
             if name in published and published["CSAC"] < published[name]:
-                claim = f"{task}: {arm.label} needs fewer interactions than {name} to reach the lower boundary"
-                yield Comparison(claim, *(_sooner(one, threshold) for one in (arm, other)))
-
-
-def _sooner(arm: Arm, threshold: float) -> np.ndarray:
-    """Steps with a minus, so that more is better; seeds that do not get there are all alike, behind all that do."""
-    if not len(arm.rows):
-        return np.zeros(0)
-    steps = interactions(arm, threshold)
-    return -np.where(np.isinf(steps), arm.rows["step"].max() + 1, steps)
+                claim = f"{task}: fewer interactions than {name} to reach the lower boundary"
+                yield _better(claim, arm, other, partial(_sooner, threshold=threshold))
 
 
 def _robustness(arms: Sequence[Arm]) -> Iterator[Comparison]:
-    measures: tuple[tuple[str, Callable], ...] = (
+    measures: tuple[tuple[str, Callable[[Recovery], float]], ...] = (
         ("loses less of its return", lambda one: -one.relative_drop),
         ("comes back sooner", lambda one: -min(one.steps_to_regain, 1e12)),
         ("ends higher", lambda one: one.final),
     )
-    for condition in dict.fromkeys(arm.condition for arm in arms):
+    for condition in dict.fromkeys(arm.condition for arm in arms if _is_of_the_paper(arm)):
         for arm, other in _pairs([arm for arm in arms if arm.condition == condition]):
-            for words, value in measures:
-                ours, others = ([value(one) for one in _recoveries(each)] for each in (arm, other))
-                claim = f"{', '.join(condition)}: {arm.label} {words} than {other.label}"
-                yield Comparison(claim, np.array(ours), np.array(others))
+            if other.published == "SAC":
+                for words, value in measures:
+                    claim = f"{', '.join(condition)}: {words} than {other.published}"
+                    yield _better(claim, arm, other, lambda one, value=value: _of_recoveries(one, value))
 
 
-def _recoveries(arm: Arm) -> list:
-    (step, _), *_ = by_step(perturbations_of(arm.condition))
-    return [one for one in recovery(arm.rows, step).values() if not np.isnan(one.drop)] if len(arm.rows) else []
+def _is_of_the_paper(arm: Arm) -> bool:
+    changes = perturbations_of(arm.condition)
+    return (
+        arm.task == paper.FRICTION_TASK
+        and len(changes) == 1
+        and changes[0].kind == "friction"
+        and changes[0].value in paper.FRICTION_FACTORS
+    )
 
 
 def _cases(arms: Sequence[Arm]) -> Iterator[Comparison]:
     for arm, other in _pairs(arms):
-        if other.published is None:
-            continue
         for name, published in paper.CASES.items():
+            told = published.get(other.published or "")
+            if told is None:
+                continue
             fewer = name != "env_complete"
-            ours, theirs = published["CSAC"].mean, published[other.published].mean
-            if (ours < theirs) == fewer:
-                words = f"{'fewer' if fewer else 'more'} rollouts with {name}"
-                samples = (-_shares(each, name) if fewer else _shares(each, name) for each in (arm, other))
-                yield Comparison(f"{arm.label} has {words} than {other.label}", *samples)
+            if (published["CSAC"].mean < told.mean) == fewer:
+                claim = f"{'fewer' if fewer else 'more'} rollouts with {name} than {other.published}"
+                yield _better(claim, arm, other, partial(_shares, name=name, sign=-1 if fewer else 1))
 
 
-def _shares(arm: Arm, name: str) -> np.ndarray:
+def _success(arms: Sequence[Arm]) -> Iterator[Comparison]:
+    for arm, other in _pairs([arm for arm in arms if arm.task == paper.SUCCESS_TASK]):
+        if other.published in paper.SUCCESS_STEPS:
+            claim = f"{arm.task}: success in {NEARLY_ALL:.0%} of an evaluation's episodes sooner than {other.published}"
+            yield _better(claim, arm, other, _sooner_success)
+
+
+def _better(claim: str, arm: Arm, other: Arm, value: Callable[[Arm], np.ndarray]) -> Comparison:
+    """Return a claim of `value` [seed] of two arms; of an arm without rows there is none."""
+    ours, others = (value(one) if len(one.rows) else np.zeros(0) for one in (arm, other))
+    steps = paper.STEPS.get(arm.task, np.inf)
+    is_whole = all(manifest.steps >= steps for one in (arm, other) for manifest in one.manifests)
+    return Comparison(claim, ours, others, _variant(arm), is_whole)
+
+
+def _best(arm: Arm) -> np.ndarray:
+    return arm.best()[0]
+
+
+def _steadiness(arm: Arm) -> np.ndarray:
+    _, _, returns = evaluation_matrix(arm.rows)
+    return np.array([-drawdown(line) for line in returns])
+
+
+def _sooner(arm: Arm, threshold: float) -> np.ndarray:
+    """Steps with a minus, so that more is better; seeds that do not get there are all alike, behind all that do."""
+    steps = interactions(arm, threshold)
+    return -np.where(np.isinf(steps), arm.rows["step"].max() + 1, steps)
+
+
+def _sooner_success(arm: Arm) -> np.ndarray:
+    rows = arm.rows.copy()
+    rows["return"] = np.nan_to_num(rows["success"], nan=0.0)
+    return _sooner(replace(arm, evaluations=[rows]), NEARLY_ALL)
+
+
+def _of_recoveries(arm: Arm, value: Callable[[Recovery], float]) -> np.ndarray:
+    (step, _), *_ = by_step(perturbations_of(arm.condition))
+    return np.array([value(one) for one in recovery(arm.rows, step).values() if not np.isnan(one.drop)])
+
+
+def _shares(arm: Arm, name: str, sign: int) -> np.ndarray:
     rows = arm.rollouts
     found = [case for case in cases(rows) if case.name == name] if len(rows) else []
-    return np.array(list(found[0].by_seed.values())) if found else np.zeros(0)
+    return sign * np.array(list(found[0].by_seed.values())) if found else np.zeros(0)
 
 
 def _pairs(arms: Sequence[Arm]) -> Iterator[tuple[Arm, Arm]]:
@@ -176,9 +228,14 @@ def _pairs(arms: Sequence[Arm]) -> Iterator[tuple[Arm, Arm]]:
             yield arm, other
 
 
+def _variant(arm: Arm) -> str:
+    return arm.label.partition(", ")[0]
+
+
 _KINDS: dict[str, Callable[[Sequence[Arm]], Iterator[Comparison]]] = {
     "returns": _returns,
     "efficiency": _efficiency,
     "robustness": _robustness,
     "cases": _cases,
+    "success": _success,
 }

@@ -322,6 +322,8 @@ def report(options: Report) -> int:
         [shlex.join(["csac", "study", command, *chosen, *results]) for command in ("run", "report")],
     )
     _say(console, f"{path}\n{path.with_suffix('.md')}")
+    if not any(source.record(cell) for cell in cells_of(studies)):
+        _say(console, f"note: no cell is over yet in {options.results or options.directory}, so there is little in it")
     return 0
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.ticker import FuncFormatter, NullLocator
 
-from csac.record.curves import DEVIATION
+from csac.record.curves import DEVIATION, NEXT, SHARE
 from csac.record.plots import (
+    NO_LOOKS,
     RETURN,
     Format,
     Panel,
@@ -24,19 +26,21 @@ from csac.record.statistics import FEWEST_FOR_INTERVAL, is_case
 from csac.studies.profiles import Profiles
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-    from csac.record.curves import Spread
+    from csac.record.curves import Limits, Spread
+    from csac.record.plots import Look
     from csac.record.summaries import OverSeeds
 
 FORMATS: tuple[Format, ...] = ("png", "svg")
 NOT_REACHED = "not reached"
 PUBLISHED = "the paper"
-LABEL_CHARACTERS = 75  # that fit side by side below bars
+LABEL_CHARACTERS = 56  # that fit side by side below bars, each label in lines of its share
+TO_EITHER_SIDE, RANGE = "± one standard deviation over seeds", "range of the seeds"
 
 
 class Curves(NamedTuple):
@@ -45,10 +49,15 @@ class Curves(NamedTuple):
     panels: tuple[Panel, ...]
     quantity: str = RETURN
     spread: Spread = DEVIATION
+    within: Limits | None = None
+    looks: Mapping[str, Look] = NO_LOOKS
+    """Those of the whole report."""
 
     def save(self, path: Path, title: str) -> None:
         """Draw it, in each format."""
-        learning_curves(self.panels, path, title, FORMATS, self.quantity, self.spread)
+        learning_curves(
+            self.panels, path, title, FORMATS, self.quantity, self.spread, within=self.within, looks=self.looks
+        )
 
 
 class Bar(NamedTuple):
@@ -75,6 +84,10 @@ class Bars(NamedTuple):
     quantity: str
     missing: str = ""
     """What is written where there is no bar."""
+    note: str = ""
+    """What is to be known to read it."""
+    looks: Mapping[str, Look] = NO_LOOKS
+    """Those of the whole report."""
 
     @property
     def labels(self) -> list[str]:
@@ -84,18 +97,24 @@ class Bars(NamedTuple):
     @property
     def needs_legend(self) -> bool:
         """Whether there is no room for the labels below the bars."""
-        return len(self.panels) > 1 or sum(map(len, self.labels)) > LABEL_CHARACTERS
+        words = [word for label in self.labels for word in label.split()]
+        return len(self.panels) > 1 or max(map(len, words), default=0) > self._label_width
+
+    @property
+    def _label_width(self) -> int:
+        return LABEL_CHARACTERS // max(1, len(self.labels))
 
     def save(self, path: Path, title: str) -> None:
         """Draw it, in each format."""
-        looks = looks_of(self.labels)
-        with picture(7.5, 3.6, len(self.panels), sharey=False) as figure:
+        looks = looks_of(self.labels, self.looks)
+        with picture(2.9, len(self.panels), sharey=False) as figure:
             published: list[Artist] = []
             for axes, panel in zip(figure.axes, self.panels, strict=True):
                 for position, bar in enumerate(panel.bars):
                     _draw_bar(axes, position, bar, looks[bar.label][0], self.missing)
                 published += _draw_published(axes, panel.bars)
-                axes.set_xticks(range(len(panel.bars)), [bar.label for bar in panel.bars])
+                labels = [textwrap.fill(bar.label, self._label_width, break_long_words=False) for bar in panel.bars]
+                axes.set_xticks(range(len(panel.bars)), labels)
                 if self.needs_legend:
                     axes.xaxis.set_major_locator(NullLocator())
                 axes.set_xlim(-0.6, len(panel.bars) - 0.4)
@@ -103,11 +122,9 @@ class Bars(NamedTuple):
                 axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
                 axes.grid(visible=False, axis="x")
             figure.axes[0].set_ylabel(self.quantity)
-            head(figure, title, [panel.title for panel in self.panels])
-            if self.needs_legend:
-                draw_legend(figure, {label: (colour, "-") for label, (colour, _) in looks.items()}, published[:1])
-            elif published:
-                figure.axes[0].legend(frameon=False, loc="best")
+            solid: dict[str, Look] = {label: (colour, "-") for label, (colour, _) in looks.items()}
+            draw_legend(figure, solid if self.needs_legend else {}, published[:1])
+            head(figure, title, [panel.title for panel in self.panels], self.note)
             save(figure, path, FORMATS)
 
 
@@ -127,11 +144,15 @@ class Trend(NamedTuple):
     lines: tuple[Line, ...]
     name: str
     quantity: str
+    note: str = ""
+    """What is to be known to read it."""
+    looks: Mapping[str, Look] = NO_LOOKS
+    """Those of the whole report."""
 
     def save(self, path: Path, title: str) -> None:
         """Draw it, in each format."""
-        looks = looks_of([line.label for line in self.lines])
-        with picture(7.5, 4.2) as figure:
+        looks = looks_of([line.label for line in self.lines], self.looks)
+        with picture(3.0) as figure:
             axes = figure.axes[0]
             for index, line in enumerate(self.lines):
                 colour, style = looks[line.label]
@@ -145,8 +166,8 @@ class Trend(NamedTuple):
             axes.set_xlabel(self.name)
             axes.set_ylabel(self.quantity)
             axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace("-", "−")))
-            head(figure, title)
             draw_legend(figure, looks)
+            head(figure, title, text=self.note)
             save(figure, path, FORMATS)
 
 
@@ -158,9 +179,10 @@ def nudge(index: int, lines: int) -> float:
     return 1.06 ** (index - (lines - 1) / 2)
 
 
-def success_panel(runs: Sequence[tuple[str, np.ndarray]]) -> Panel:
+def success_curves(runs: Sequence[tuple[str, np.ndarray]], marks: Sequence[tuple[int, str]] = ()) -> Curves:
     """Return the curves of the share of successful episodes; one that says nothing of success had none."""
-    return Panel([(label, _as_success(rows)) for label, rows in runs if tells_of_success(rows)])
+    panel = Panel([(label, _as_success(rows)) for label, rows in runs if tells_of_success(rows)], marks=marks)
+    return Curves((panel,), "share of episodes with success", within=SHARE)
 
 
 def tells_of_success(rows: np.ndarray) -> bool:
@@ -172,6 +194,13 @@ def bar_over_seeds(label: str, over: OverSeeds, published: float, factor: float 
     """Return a bar for a mean and the standard deviation to either side, as far down as 0."""
     mean, std = factor * over.mean, factor * over.std
     return Bar(label, mean, max(mean - std, 0.0) if np.isfinite(std) else np.nan, mean + std, published)
+
+
+def seeds_note(lines: str, seeds: Sequence[int]) -> str:
+    """Say what the vertical lines of a picture are, and how many seeds each of its methods has; one has no line."""
+    fewest, most = min(seeds, default=0), max(seeds, default=0)
+    told = f"{most} seed{'s' * (most != 1)}" if fewest == most else f"{fewest} to {most} seeds"
+    return NEXT.join([f"lines: {lines}"] * (most > 1) + [told])
 
 
 def reach(values: np.ndarray) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from csac.record.curves import curves_of, limits, note
+from csac.record.curves import curves_of, last_step, limits, note
 from csac.record.plots import looks_of
 from csac.record.rendering import number
 from csac.studies.figures import PUBLISHED, Bars, Curves, nudge
@@ -47,31 +47,37 @@ def plots(drawing: Drawing) -> list[Plot]:
 
 def note_of(drawing: Drawing) -> str:
     """Return what is to be known to read a figure."""
-    if isinstance(drawing, Profiles):
-        return drawing.note
     if not isinstance(drawing, Curves):
-        return ""
-    return note([curve for panel in drawing.panels for curve in curves_of(panel.runs, drawing.spread)])
+        return drawing.note
+    return note([curve for curves in _shown(drawing) for curve in curves])
 
 
 def _curves(drawing: Curves) -> list[Plot]:
-    looks = looks_of([label for panel in drawing.panels for label, _ in panel.runs])
-    shown = [curves_of(panel.runs, drawing.spread) for panel in drawing.panels]
+    looks = looks_of([label for panel in drawing.panels for label, _ in panel.runs], drawing.looks)
+    shown = _shown(drawing)
     found = [curve for curves in shown for curve in curves]
-    scale = {"range": _plain(limits(found))} if found else {}
+    scale = {"range": _plain(limits(found, drawing.within))} if found else {}
     return [
         Plot(
             panel.title,
             [trace for curve in curves for trace in _traces(curve, looks[curve.label])],
             {
                 "hovermode": "x unified",
-                "xaxis": {"title": {"text": "environment steps per seed"}, "tickformat": "~s", "rangemode": "tozero"},
+                "xaxis": {
+                    "title": {"text": "environment steps per seed"},
+                    "tickformat": "~s",
+                    "range": _plain([0, last_step(curves)]),
+                },
                 "yaxis": {"title": {"text": drawing.quantity}, **scale},
                 **_marks(panel),
             },
         )
         for panel, curves in zip(drawing.panels, shown, strict=True)
     ]
+
+
+def _shown(drawing: Curves) -> list[list[Curve]]:
+    return [curves_of(panel.runs, drawing.spread, drawing.within) for panel in drawing.panels]
 
 
 def _traces(curve: Curve, look: Look) -> list[dict[str, Any]]:
@@ -131,7 +137,7 @@ def _marks(panel: Panel) -> dict[str, Any]:
 
 
 def _bars(drawing: Bars) -> list[Plot]:
-    looks = looks_of(drawing.labels)
+    looks = looks_of(drawing.labels, drawing.looks)
     return [
         Plot(
             panel.title,
@@ -189,7 +195,8 @@ def _has_published(panel: BarPanel) -> bool:
 
 
 def _trend(drawing: Trend) -> Plot:
-    looks, lines = looks_of([line.label for line in drawing.lines]), drawing.lines
+    lines = drawing.lines
+    looks = looks_of([line.label for line in lines], drawing.looks)
     values = sorted({value for line in lines for value in line.x})
     axis = {"type": "log", "tickvals": values, "ticktext": [f"{value:g}" for value in values]}
     return Plot(
@@ -221,7 +228,7 @@ def _line(line: Line, look: Look, factor: float) -> dict[str, Any]:
 
 
 def _profiles(drawing: Profiles) -> Plot:
-    looks, traces = looks_of([profile.label for profile in drawing.profiles]), []
+    looks, traces = looks_of([profile.label for profile in drawing.profiles], drawing.looks), []
     scores = _plain(drawing.scores)
     for label, share, low, high in drawing.profiles:
         colour, style = looks[label]

@@ -28,7 +28,7 @@ MUJOCO = Study(
     "Learning curves and maximum average returns on four MuJoCo tasks",
     tasks=tuple(paper.MAXIMUM_AVERAGE_RETURNS),
     methods=ALL,
-    steps_on=MappingProxyType({"Hopper-v4": 2_000_000}),  # inferred: PPO needs 1.64M there to reach the lower boundary
+    steps_on=MappingProxyType({"Hopper-v4": paper.STEPS["Hopper-v4"]}),
 )
 
 ABLATION = Study(
@@ -54,7 +54,7 @@ EFFICIENCY = replace(
 ROBUSTNESS = Study(
     "robustness",
     "More friction in mid-training on HalfCheetah",
-    tasks=("HalfCheetah-v4",),
+    tasks=(paper.FRICTION_TASK,),
     methods=(CSAC_PAPER, CSAC_DEFAULT, SAC),
     conditions=tuple((f"friction={factor:g}@{paper.FRICTION_STEP}",) for factor in paper.FRICTION_FACTORS),
     analyses=("robustness",),
@@ -72,7 +72,7 @@ QUADX = Study(
 PANDA = Study(
     "panda",
     "A robot arm that reaches for a point",
-    tasks=("PandaReach-v3",),
+    tasks=(paper.SUCCESS_TASK,),
     methods=ALL,
     analyses=("curves", "returns", "success"),
 )

@@ -57,6 +57,9 @@ ROBOT_RETURNS: Mapping[str, Mapping[str, Published]] = MappingProxyType(
 
 RETURNS: Mapping[str, Mapping[str, Published]] = MappingProxyType({**MAXIMUM_AVERAGE_RETURNS, **ROBOT_RETURNS})
 
+# Steps of a run on each task: see INFERRED. PPO needs 1.64M on Hopper to reach the lower boundary.
+STEPS: Mapping[str, int] = MappingProxyType({**dict.fromkeys(RETURNS, 1_000_000), "Hopper-v4": 2_000_000})
+
 # Table "Number of interactions required to reach the lower bound of maximum average return", there in 10^4 steps.
 INTERACTIONS: Mapping[str, Mapping[str, int]] = MappingProxyType(
     {
@@ -74,7 +77,10 @@ INTERACTIONS: Mapping[str, Mapping[str, int]] = MappingProxyType(
 TAUS = (0.005, 0.05, 0.5, 5.0, 50.0)
 BEST_TAU = 0.5
 
+COLUMNS = (*METHODS, *(f"tau {tau:g}" for tau in TAUS))  # what a method of a study may stand beside
+
 # Section "Evaluation of robustness in HalfCheetah task".
+FRICTION_TASK = "HalfCheetah-v4"
 FRICTION_FACTORS = (1.5, 2.0, 2.5)
 FRICTION_STEP = 300_000
 
@@ -89,6 +95,7 @@ CASES: Mapping[str, Mapping[str, Published]] = MappingProxyType(
 )
 
 # Section "Evaluation of effectiveness in robotic arm": success is near 100 % by these steps.
+SUCCESS_TASK = "PandaReach-v3"
 SUCCESS_STEPS: Mapping[str, int] = MappingProxyType({"CSAC": 600_000, "SAC": 800_000})
 
 # Table "Common hyper-parameter settings of compared approaches"; None is the paper's "/".

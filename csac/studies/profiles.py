@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from matplotlib.ticker import PercentFormatter
 
-from csac.record.plots import draw_legend, head, looks_of, picture, save
+from csac.record.plots import NO_LOOKS, draw_legend, head, looks_of, picture, save
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
+
+    from csac.record.plots import Look
 
 SHARE = "share of runs above that score"
 BAND = "band: 95 % bootstrap interval"
@@ -30,6 +33,7 @@ class Profiles(NamedTuple):
     profiles: tuple[Profile, ...]
     scores: tuple[float, ...]
     quantity: str
+    looks: Mapping[str, Look] = NO_LOOKS
 
     @property
     def note(self) -> str:
@@ -38,8 +42,8 @@ class Profiles(NamedTuple):
 
     def save(self, path: Path, title: str) -> None:
         """Draw them, as PNG and SVG."""
-        looks = looks_of([profile.label for profile in self.profiles])
-        with picture(7.5, 4.2) as figure:
+        looks = looks_of([profile.label for profile in self.profiles], self.looks)
+        with picture(4.2) as figure:
             axes = figure.axes[0]
             for label, share, low, high in self.profiles:
                 colour, style = looks[label]

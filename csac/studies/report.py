@@ -7,14 +7,15 @@ import shlex
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+from csac.record.plots import NO_LOOKS
 from csac.record.rendering import Cell, Row, Table
 from csac.studies import paper, sections
 from csac.studies.aggregates import over_tasks
 from csac.studies.arms import gather, with_rows
 from csac.studies.cells import complete
-from csac.studies.claims import comparisons, decide
+from csac.studies.claims import VERDICTS, comparisons, decide
 from csac.studies.parts import Heading, Paragraph, write
-from csac.studies.sections import Scope
+from csac.studies.sections import Scope, report_looks
 from csac.studies.settings import hyperparameters
 from csac.studies.standing import cells_so_far, wall_times
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from csac.record.plots import Look
     from csac.studies.arms import Arm
     from csac.studies.parts import Part
     from csac.studies.results import Source
@@ -29,8 +31,8 @@ if TYPE_CHECKING:
 
 _VERDICTS = (
     "Reproduced: the 95 % bootstrap interval of the probability that a seed of the first is better than one of the "
-    "second lies above one half; not reproduced: it lies below; else not yet decidable. Each claim is held against "
-    "both variants of CSAC; no correction is made for the number of claims."
+    "second lies above one half; not reproduced: it lies below; else not yet decidable. No correction is made for the "
+    "number of claims."
 )
 
 _SECTIONS: Mapping[str, Callable[[Sequence[Arm], Scope], Iterator[Part]]] = {
@@ -48,7 +50,11 @@ def write_report(studies: Sequence[Study], source: Source, directory: Path, comm
 
     `commands` have made it. Raises InputError where it cannot be written.
     """
-    parts = [part for study in studies for part in _parts(study, gather(study, source), commands)]
+    parts: list[Part] = []
+    looks: Mapping[str, Look] = NO_LOOKS
+    for study in studies:
+        looks = report_looks([method.label for method in study.methods], looks)
+        parts += _parts(study, gather(study, source), commands, looks)
     path = directory / "report.html"
     write(path, studies[0].title if len(studies) == 1 else "Studies", parts)
     return path
@@ -72,8 +78,8 @@ def train_command(arm: Arm) -> str:
     return shlex.join(words)
 
 
-def _parts(study: Study, arms: list[Arm], commands: Sequence[str]) -> Iterator[Part]:
-    scope, shown = Scope(study.name, study.scale), with_rows(arms)
+def _parts(study: Study, arms: list[Arm], commands: Sequence[str], looks: Mapping[str, Look]) -> Iterator[Part]:
+    scope, shown = Scope(study.name, study.scale, looks), with_rows(arms)
     yield Heading(study.title, 1)
     if study.scale < 1:
         told = f"Every run is shortened to {study.scale:g} of its steps."
@@ -94,15 +100,21 @@ def _parts(study: Study, arms: list[Arm], commands: Sequence[str]) -> Iterator[P
 
 
 def _claims(study: Study, arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
-    decisions = [decide(one, study.scale == 1) for one in comparisons(study.name, study.analyses, arms)]
-    if not decisions:
+    """How the paper's claims stand, for each variant of CSAC; those of which a side was not measured are counted."""
+    found = comparisons(study, arms)
+    measured = [one for one in found if len(one.ours) and len(one.others)]
+    if not measured:
         return
     yield Heading(scope.titled("The paper's claims"))
-    counts = Counter(one.verdict for one in decisions)
-    told = [f"{counts[verdict]} {verdict}" for verdict in ("reproduced", "not reproduced", "not yet decidable")]
-    yield Paragraph(f"{', '.join(told)}.", f"{len(decisions)} claims:")
-    rows = [Row((Cell(one.claim), Cell(one.verdict), Cell(one.why))) for one in decisions]
-    yield Table(("claim", "verdict", "because"), tuple(rows))
+    for variant in dict.fromkeys(one.variant for one in measured):
+        decisions = [decide(one) for one in measured if one.variant == variant]
+        counts = Counter(one.verdict for one in decisions)
+        told = [f"{counts[verdict]} {verdict}" for verdict in VERDICTS]
+        rows = [Row((Cell(one.claim), Cell(one.verdict), Cell(one.why))) for one in decisions]
+        yield Paragraph(f"{', '.join(told)}.", f"{variant}, {len(decisions)} claims:")
+        yield Table((f"{variant} has or shows", "verdict", "because"), tuple(rows))
+    if len(found) > len(measured):
+        yield Paragraph(f"Of {len(found) - len(measured)} more nothing was measured, or not both sides.")
     yield Paragraph(_VERDICTS)
 
 

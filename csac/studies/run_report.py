@@ -26,7 +26,7 @@ from csac.studies.aggregates import over_tasks
 from csac.studies.arms import Arm, Time, by_condition, with_rows
 from csac.studies.figures import tells_of_success
 from csac.studies.parts import Heading, Items, Paragraph, write
-from csac.studies.sections import Scope, described, marks_of, plain
+from csac.studies.sections import Scope, described, marks_of, plain, report_looks
 from csac.studies.standing import wall_times
 from csac.tasks.perturbations import perturbations_of
 from csac.types import InputError
@@ -130,7 +130,8 @@ def write_run_report(comparison: Comparison, path: Path, title: str | None, comm
         raise InputError(f"the report is a page: name it {path.with_suffix('.html')}")
     arms = comparison.arms()
     title = title or ", ".join(dict.fromkeys(arm.task for arm in arms if arm.task)) or "Runs"
-    write(path, title, list(_parts(comparison, arms, Scope(path.stem), title, commands)))
+    scope = Scope(path.stem, looks=report_looks([arm.label for arm in arms]))
+    write(path, title, list(_parts(comparison, arms, scope, title, commands)))
 
 
 def write_table(comparison: Comparison, page: Path, name: str, kind: TableName) -> None:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from csac.console.tables import duration
-from csac.record.plots import Panel
+from csac.record.curves import NEXT
+from csac.record.plots import NO_LOOKS, Panel, looks_of
 from csac.record.rendering import Cell, Row, Table, number, numeric, short
 from csac.record.summaries import case_names, compare, recoveries
 from csac.record.summaries import cases as cases_of
@@ -24,6 +25,8 @@ from csac.studies.arms import by_condition, tasks_of
 from csac.studies.claims import interactions, lower_boundary
 from csac.studies.figures import (
     NOT_REACHED,
+    RANGE,
+    TO_EITHER_SIDE,
     Bar,
     BarPanel,
     Bars,
@@ -32,7 +35,8 @@ from csac.studies.figures import (
     Trend,
     bar_over_seeds,
     reach,
-    success_panel,
+    seeds_note,
+    success_curves,
     tells_of_success,
 )
 from csac.studies.parts import Commands, Figure, Heading, Items, Paragraph
@@ -40,10 +44,12 @@ from csac.studies.stability import stability_table
 from csac.tasks.perturbations import by_step, perturbations_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from csac.record.manifest import Manifest
+    from csac.record.plots import Look
     from csac.studies.arms import Arm
+    from csac.studies.figures import Drawing
     from csac.studies.parts import Part
 
 MOST_CURVES = 7  # that are told apart in one picture
@@ -51,16 +57,18 @@ MOST_PANELS = 3  # side by side
 SYMBOLS = {"relative_entropy_weight": "tau", "entropy_weight": "sigma"}
 _BOUNDARY = (
     "The boundary is the lowest maximum average return, as measured here, of the methods that the paper has too. A "
-    "seed that does not get there has needed more steps than its run has. Lines on the bars: the range of the seeds."
+    "seed that does not get there has needed more steps than its run has."
 )
 _SMOOTHING = "Curves are not smoothed: each point is the mean over the episodes of one evaluation."
 
 
 class Scope(NamedTuple):
-    """What all titles and files of a report say of it: its name, and how much its runs are shortened."""
+    """What its titles, files and pictures share in a report: its name, how much its runs are shortened, its looks."""
 
     name: str
     scale: float = 1.0
+    looks: Mapping[str, Look] = NO_LOOKS
+    """The look of each label in every picture."""
 
     def titled(self, text: str) -> str:
         """Return a title that says the scale."""
@@ -72,9 +80,15 @@ class Scope(NamedTuple):
         scale = ["scale", f"{self.scale:g}"] if self.scale < 1 else []
         return "-".join([self.name, *words, *scale]).lower()
 
-    def figure(self, kind: str, text: str, drawing: Any) -> Figure:
-        """Return a figure about `text`."""
-        return Figure(self.file(kind, text), self.titled(text), drawing)
+    def figure(self, kind: str, text: str, drawing: Drawing, title: str = "") -> Figure:
+        """Return a figure about `text`, which is its title too where it is given none."""
+        return Figure(self.file(kind, text), self.titled(title or text), drawing._replace(looks=self.looks))
+
+
+def report_looks(labels: Sequence[str], known: Mapping[str, Look] = NO_LOOKS) -> dict[str, Look]:
+    """Return the looks of the labels of a report, of what stands before their first commas, and those known already."""
+    looks = {**known, **looks_of(labels, known)}
+    return {**looks, **looks_of(map(_variant, labels), looks)}
 
 
 def curves(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
@@ -120,11 +134,12 @@ def efficiency(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
         threshold = lower_boundary(own)
         if math.isnan(threshold):
             continue
-        published, rows, bars = paper.INTERACTIONS.get(task, {}), [], []
+        published, rows, bars, seeds = paper.INTERACTIONS.get(task, {}), [], [], []
         for arm in own:
             steps = interactions(arm, threshold)
             median, told = float(np.median(steps)), float(published.get(arm.published or "", math.nan))
             reached = int(np.isfinite(steps).sum())
+            seeds.append(len(steps))
             cells = (
                 numeric(told, f"{told:,.0f}"),
                 numeric(median, NOT_REACHED if math.isinf(median) else f"{median:,.0f}"),
@@ -134,11 +149,9 @@ def efficiency(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
             bars.append(Bar(arm.label, median, *reach(steps), told if scope.scale == 1 else math.nan))
         title = f"{task}, return {number(threshold)}"
         yield Table(("method", "the paper", "measured, median seed", "reached"), tuple(rows), scope.titled(title))
-        yield Figure(
-            scope.file("interactions", task),
-            scope.titled(title),
-            Bars((BarPanel(tuple(bars)),), "environment steps", NOT_REACHED),
-        )
+        note = f"bars: median seed{NEXT}{seeds_note(RANGE, seeds)}"
+        drawing = Bars((BarPanel(tuple(bars)),), "environment steps", NOT_REACHED, note)
+        yield scope.figure("interactions", task, drawing, title)
     yield Paragraph(_BOUNDARY)
 
 
@@ -155,7 +168,7 @@ def robustness(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
             number_of_it = f" {start // MOST_PANELS + 1}" * (len(conditions) > MOST_PANELS)
             if len(some) > 1:
                 panels = [panel._replace(title=", ".join(text for _, text in panel.marks)) for panel in panels]
-            yield Figure(scope.file(kind, f"{task}{number_of_it}"), scope.titled(title), Curves(tuple(panels)))
+            yield scope.figure(kind, f"{task}{number_of_it}", Curves(tuple(panels)), title)
         for (_, condition), each in conditions:
             perturbed = by_step(perturbations_of(condition))
             for index, (step, text) in enumerate(perturbed):
@@ -183,7 +196,8 @@ def cases(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
         for start in range(0, len(panels), MOST_PANELS):
             some = panels[start : start + MOST_PANELS]
             title = f"{task}, {', '.join(panel.title for panel in some)}"
-            yield scope.figure("cases", title, Bars(tuple(some), f"per {ROLLOUTS:,} rollouts"))
+            note = seeds_note(TO_EITHER_SIDE, [len(np.unique(rows["seed"])) for _, rows in told])
+            yield scope.figure("cases", title, Bars(tuple(some), f"per {ROLLOUTS:,} rollouts", note=note))
         yield table._replace(title=scope.titled(task))
     if any(arm.published for arm in arms):
         rows = [
@@ -191,16 +205,14 @@ def cases(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
             for name, published in paper.CASES.items()
         ]
         yield Table((f"per {paper.ROLLOUTS:,} rollouts", *paper.METHODS), tuple(rows), "The paper")
-    yield Paragraph("Lines on the bars: the standard deviation over seeds to either side.")
 
 
 def success(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
     """Curves of the share of successful episodes."""
     yield Heading(scope.titled("Success"))
     for (task, condition), own in by_condition([arm for arm in arms if tells_of_success(arm.rows)]).items():
-        panel = success_panel(_runs(own))._replace(marks=marks_of(condition))
         title = f"{described(task, condition)}, success"
-        yield scope.figure("success", title, Curves((panel,), "share of episodes with success"))
+        yield scope.figure("success", title, success_curves(_runs(own), marks_of(condition)))
     if any(arm.published for arm in arms):
         told = ", ".join(f"{name} by {short(steps)} steps" for name, steps in paper.SUCCESS_STEPS.items())
         yield Paragraph(f"In the paper success is near 100 % for {told}.")
@@ -263,34 +275,57 @@ def _runs(arms: Sequence[Arm]) -> list[tuple[str, np.ndarray]]:
 
 
 def _pictures(arms: Sequence[Arm]) -> list[tuple[str, list[Arm]]]:
-    """Return the arms picture by picture: all in one, or by variant where they would be too many."""
-    groups = _variants(arms)
-    if len(arms) <= MOST_CURVES or min(map(len, groups.values())) == 1:
+    """Return the arms picture by picture: all in one, or where they would be too many the variants of CSAC in several.
+
+    Whatever else learns is in each of them, beside CSAC.
+    """
+    ours = [arm for arm in arms if arm.algorithm == "csac"]
+    others = [arm for arm in arms if arm.algorithm != "csac"]
+    if not ours:
+        ours, others = others, ours
+    room = MOST_CURVES - len(others)
+    if len(arms) <= MOST_CURVES or room < 1:
         return [("", list(arms))]
-    return list(groups.items())
+    groups = _variants(ours)
+    if min(map(len, groups.values())) == 1:
+        groups = {"": ours}
+    pictures = []
+    for name, own in groups.items():
+        count = math.ceil(len(own) / room)
+        for index, places in enumerate(np.array_split(np.arange(len(own)), count), start=1):
+            text = " ".join(filter(None, (name, f"{index} of {count}" * (count > 1))))
+            pictures.append((text, [*(own[place] for place in places), *others]))
+    return pictures
 
 
 def _variants(arms: Sequence[Arm]) -> dict[str, list[Arm]]:
     """Return the arms by what stands before the first comma of their labels."""
     groups: dict[str, list[Arm]] = {}
     for arm in arms:
-        groups.setdefault(arm.label.partition(", ")[0], []).append(arm)
+        groups.setdefault(_variant(arm.label), []).append(arm)
     return groups
+
+
+def _variant(label: str) -> str:
+    return label.partition(", ")[0]
 
 
 def _trends(arms: Sequence[Arm]) -> Iterator[tuple[str, Trend]]:
     """Return the maximum average returns over a hyperparameter, where variants differ in that number alone."""
     swept: dict[str, list[Line]] = {}
+    seeds: dict[str, list[int]] = {}
     for variant, own in _variants(arms).items():
         names = {name for arm in own for name in arm.hyperparameters}
         differing = [name for name in names if len({plain(arm.hyperparameters.get(name)) for arm in own}) > 1]
         if len(differing) == 1 and all(_is_positive(arm.hyperparameters.get(differing[0])) for arm in own):
             own = sorted(own, key=lambda arm: arm.hyperparameters[differing[0]])
             swept.setdefault(differing[0], []).append(_line(variant, differing[0], own))
+            seeds.setdefault(differing[0], []).extend(arm.maximum().seeds for arm in own)
     for name, lines in swept.items():
         symbol = SYMBOLS.get(name)
         told = f"{symbol} ({name.replace('_', ' ')})" if symbol else name.replace("_", " ")
-        yield symbol or name.replace("_", " "), Trend(tuple(lines), told, "maximum average return")
+        note = seeds_note(TO_EITHER_SIDE, seeds[name])
+        yield symbol or name.replace("_", " "), Trend(tuple(lines), told, "maximum average return", note)
 
 
 def _line(label: str, name: str, arms: Sequence[Arm]) -> Line:

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.presets import hyperparameters as preset_of
+from csac.studies import paper
 from csac.studies.cells import Cell, complete, similar
-from csac.tasks.known import check_events
+from csac.tasks.known import adapter_of, check_events
+from csac.tasks.making import registered
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.types import InputError
 
@@ -190,11 +192,17 @@ def _study(name: str, told: dict[str, Any]) -> Study:
     for key in ("seeds", "steps", "evaluation_interval", "evaluation_episodes"):
         if key in values and values[key] < 1:
             raise InputError(f"{key} must be at least 1, not {values[key]}")
-    if values.get("first_seed", 0) < 0:
-        raise InputError(f"first_seed must be 0 or more, not {values['first_seed']}")
+    for key in ("first_seed", "rollouts"):
+        if values.get(key, 0) < 0:
+            raise InputError(f"{key} must be 0 or more, not {values[key]}")
     check_events(values.get("events", ()))
-    for task in values.get("steps_on", {}):
+    for task in values["tasks"]:
+        if ":" not in task and adapter_of(task) is None:  # others may be known to the machines that train alone
+            registered(task)
+    for task, steps in values.get("steps_on", {}).items():
         _some([task], values["tasks"], "steps_on: the study has no task")
+        if steps < 1:
+            raise InputError(f"steps_on.{task} must be at least 1, not {steps}")
     _some(values.get("analyses", ()), ANALYSES, "analyses: there is no")
     labels = [method.label for method in values["methods"]]
     if twice := next((label for label in labels if labels.count(label) > 1), None):
@@ -214,6 +222,8 @@ def _swept(told: dict[str, Any]) -> list[Method]:
     if "algorithm" not in told:
         raise InputError("a method needs an algorithm")
     values = {key: _METHOD_KEYS[key](key, value) for key, value in told.items()}
+    if (published := values.get("published")) is not None:
+        _some([published], paper.COLUMNS, "published: the paper has no")
     sweep, given = values.pop("sweep", {}), values.get("hyperparameters", {})
     for name, several in sweep.items():
         if not isinstance(several, list) or not several:

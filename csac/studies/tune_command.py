@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
+from csac.checks import check_whole
 from csac.console.tables import Fitted, make_console, program
 from csac.studies.job import Stopped
 from csac.studies.shared_study import Question, SharedStudy, import_optuna
 from csac.studies.tune import MOST_TRIALS, tune
 from csac.studies.tune_progress import TuneProgress
 from csac.tasks.environment import Environment
-from csac.training.options import check_whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -30,10 +30,10 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
     adapter = known.adapter_of(task)
     _silence_mujoco()
     with _gymnasium_silenced(), quietly() if adapter or "pybullet" in sys.modules else nullcontext():
-        registered = _registered(task) if isinstance(task, str) else None
+        id_there = registered(task) if isinstance(task, str) else None
         try:
-            if registered is not None:
-                environment = gymnasium.make(registered, disable_env_checker=True, **arguments)
+            if id_there is not None:
+                environment = gymnasium.make(id_there, disable_env_checker=True, **arguments)
                 environment = adapter.wrap(environment) if adapter and adapter.wrap else environment
             else:
                 environment = task(**arguments)  # pyright: ignore[reportCallIssue]
@@ -59,8 +59,8 @@ def _check_task(task: object) -> None:
         raise InputError(f"a task is a Gymnasium id or a function that makes an environment, not {task!r}")
 
 
-def _registered(task: str) -> str:
-    """Return the registered id, after importing its module where one is named."""
+def registered(task: str) -> str:
+    """Return the registered id of a task, after importing its module where one is named. Raises InputError."""
     module, _, name = task.rpartition(":")
     if module:
         try:

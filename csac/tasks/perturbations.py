@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ from csac.tasks.physics import NOISES, PHYSICS
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
 KINDS = (*PHYSICS, *NOISES)
 
@@ -84,6 +85,8 @@ def perturbations_of(given: str | Perturbation | Iterable[str | Perturbation]) -
         InputError: one is not what it should be, or two of one kind have the same step.
     """
     several = (given,) if isinstance(given, str | Perturbation) else given
+    if not isinstance(several, Iterable):
+        raise InputError(f"perturbations are a list such as [{_EXAMPLE!r}], not {given!r:.40}")
     parsed = [Perturbation.parse(item) if isinstance(item, str) else item for item in several]
     for item in parsed:
         if not isinstance(item, Perturbation):

@@ -7,8 +7,7 @@ import difflib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
-import numpy as np
-
+from csac.checks import check_whole
 from csac.record.manifest import SEED_LIMIT, STEPS_LIMIT
 from csac.types import InputError
 
@@ -101,17 +100,3 @@ def checked_options(given: PlanOptions) -> tuple[Options, dict[str, Any]]:
     names = {item.name for item in dataclasses.fields(Options)}
     simple: Any = {name: value for name, value in given.items() if name in names}
     return Options(**simple), {name: value for name, value in given.items() if name not in names}
-
-
-def check_whole(name: str, value: object, least: int, most: int) -> None:
-    """Raise InputError for what is not a whole number between these two."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"{name} must be a whole number of {_least(least)}, not {value!r:.40}")
-    if value > most:
-        raise InputError(
-            f"{name} must be at most {most:,}, not {value:.3g}" if value < 1e300 else f"{name} is too large"
-        )
-
-
-def _least(least: int) -> str:
-    return "at least 1" if least == 1 else f"{least} or more"

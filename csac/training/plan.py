@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.algorithms import ALGORITHMS
+from csac.checks import check_arguments, check_whole
 from csac.presets import matching_preset
 from csac.record.manifest import CheckpointPlan, EvaluationPlan, Manifest
 from csac.record.run import RunDirectory, default_directory, is_run
@@ -19,7 +20,7 @@ from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.seeds import EVALUATION_SEED, FIRST_TRAINING_SEED
 from csac.tasks.trust import remember
 from csac.training.devices import choose_device
-from csac.training.options import Options, check_whole, checked_options
+from csac.training.options import Options, checked_options
 from csac.training.resume import Source, planned_perturbations
 from csac.training.scheduler import choose_evaluation_processes, choose_groups, split_seeds
 from csac.types import InputError
@@ -63,7 +64,7 @@ class Plan(Options):
             perturbations=tuple(map(str, self.perturbations)),
             algorithm=self.algorithm.name,
             hyperparameters=hyperparameters,
-            preset=matching_preset(self.algorithm.name, self.task_name, hyperparameters),
+            preset=matching_preset(type(self.algorithm), self.task_name, hyperparameters),
             seeds=tuple(self.labels),
             groups=self.groups,
             steps=self.steps,
@@ -111,6 +112,7 @@ def make_plan(
     choose_device(options.device)
     if others.get("evaluation_processes") and not may_evaluate_beside:
         raise InputError("stop_when is asked before training goes on: leave out evaluation_processes")
+    check_arguments("environment_arguments", others.get("environment_arguments"))
     arguments = dict(others.get("environment_arguments") or {})
     asked = others.get("perturbations")
     continued = before.run.manifest if before.run else None

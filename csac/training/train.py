@@ -9,6 +9,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from csac.checks import check_callable
 from csac.processes import end_if_unguarded
 from csac.record.run import RunDirectory
 from csac.record.wandb import WandbLog, import_wandb, logs_to_wandb
@@ -102,6 +103,8 @@ def train(
     """
     end_if_unguarded()
     check_algorithm(algorithm)
+    check_callable("on_evaluation", on_evaluation)
+    check_callable("stop_when", stop_when)
     if wandb:
         import_wandb()
     watchers = Watchers(reporter, tensorboard, wandb, on_evaluation, stop_when)

@@ -114,6 +114,19 @@ def test_a_failed_seed_is_not_chosen(tmp_path):
     assert same(load(tmp_path, seed=2), policies[2])
 
 
+def test_a_seed_is_a_whole_number(tmp_path):
+    save_run(tmp_path, EVALUATIONS)
+    with pytest.raises(InputError, match="seed is the label of one, a whole number, not '0'"):
+        load(tmp_path, seed="0")  # pyright: ignore[reportArgumentType]
+
+
+def test_a_contract_that_is_gone_is_told_as_gone(tmp_path):
+    save_run(tmp_path, EVALUATIONS)
+    (tmp_path / "policy" / "contract.json").unlink()
+    with pytest.raises(InputError, match=r"contract\.json cannot be read: No such file"):
+        load(tmp_path)
+
+
 def test_where_every_seed_failed_none_is_chosen(tmp_path):
     policies = save_run(tmp_path, EVALUATIONS, failures={seed: f"step {seed}: reward is nan" for seed in range(3)})
     with pytest.raises(InputError, match=r"every seed of .* failed \(seed 0 at step 0: reward is nan\): train again"):

@@ -287,14 +287,23 @@ def test_a_policy_of_another_task_is_refused():
         evaluate(policy_for(Lottery), Goal)
 
 
-@pytest.mark.parametrize("episodes", [0, -1])
-def test_at_least_one_episode_is_asked_for(episodes):
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"episodes": 0}, "episodes must be a whole number of at least 1, not 0"),
+        ({"episodes": -1}, "episodes must be a whole number of at least 1, not -1"),
+        ({"episodes": 2.5}, "episodes must be a whole number of at least 1, not 2.5"),
+        ({"episodes": "3"}, "episodes must be a whole number of at least 1, not '3'"),
+        ({"episodes": 1, "first_seed": -5}, "first_seed must be a whole number of 0 or more, not -5"),
+    ],
+)
+def test_episodes_and_seeds_are_whole_numbers(given, message):
     policy = policy_for(Lottery)
-    with pytest.raises(InputError, match="run at least one"):
-        Evaluator(Lottery, episodes=episodes)
+    with pytest.raises(InputError, match=message):
+        Evaluator(Lottery, **given)
     for evaluated in (policy, Foreign(policy)):
-        with pytest.raises(InputError, match="run at least one"):
-            evaluate(evaluated, Lottery, episodes=episodes)
+        with pytest.raises(InputError, match=message):
+            evaluate(evaluated, Lottery, **given)
 
 
 class Foreign:

@@ -6,8 +6,9 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
-from csac.record.plots import learning_curve
+from csac.record.plots import Panel, learning_curve, learning_curves, looks_of
 
 
 def evaluations(seeds=3, points=20, interval=5000, height=1000.0, generator_seed=0):
@@ -84,7 +85,7 @@ def test_two_seeds_have_no_band(tmp_path, figures):
 def test_a_picture_of_few_and_many_seeds_says_which_band_is_which(tmp_path, figures):
     learning_curve([("few", evaluations(3)), ("many", evaluations(5))], tmp_path / "curve.png")
     note = "line: mean over seeds · thin: single seeds · band: their range, from 5 seeds 95 % t-interval"
-    assert figures[0].axes[0].texts[0].get_text() == note
+    assert figures[0].axes[0].texts[0].get_text().replace("\n", " · ") == note
 
 
 def test_one_seed_has_neither_band_nor_thin_lines(tmp_path, figures):
@@ -103,6 +104,54 @@ def test_every_run_is_in_the_legend_under_its_own_label_and_look(tmp_path, figur
     box = legend.get_window_extent()
     assert box.x0 >= 0
     assert box.x1 <= figures[0].bbox.x1
+
+
+LABELS = [f"CSAC (default), tau {tau:g}" for tau in (0.005, 0.05, 0.5, 5, 50, 500, 5000)]
+TITLE = "PyFlyt/QuadX-Waypoints-v1: CSAC's reference policies, friction x 2.5 after step 300,000"
+
+
+@pytest.mark.parametrize("columns", [1, 3])
+def test_all_text_is_in_the_picture(tmp_path, figures, columns):
+    runs = [(label, evaluations(5 if index else 3, height=12_000)) for index, label in enumerate(LABELS)]
+    learning_curves([Panel(runs, f"friction x {column}") for column in range(columns)], tmp_path / "a.png", TITLE)
+    (figure,) = figures
+    shown = {" ".join(text.get_text().split()): text.get_window_extent() for text in figure.findobj(Text)}
+    title, note = shown[TITLE], next(box for text, box in shown.items() if text.startswith("line: mean over seeds"))
+    for box in [title, note, shown["return per evaluation episode"], figure.legends[0].get_window_extent()]:
+        assert 0 <= box.x0 < box.x1 <= 1200
+        assert 0 <= box.y0 < box.y1 <= figure.bbox.y1
+    two_lines = 2 * 13 / 72 * figure.dpi
+    assert title.y1 - two_lines > note.y1 > note.y0 > figure.axes[0].get_window_extent().y1
+    assert figure.axes[0].get_window_extent().height > 0.3 * figure.bbox.height
+
+
+def test_text_can_be_read_in_a_column(tmp_path, figures):
+    """Of 3.4 inches: no smaller than 6 points, and the picture still has its pixels."""
+    path = tmp_path / "curve.png"
+    learning_curve([("csac", evaluations())], path, "Ant-v4")
+    (axes,) = figures[0].axes
+    texts = [axes.title, axes.xaxis.label, *axes.texts, *axes.get_xticklabels(), *figures[0].legends[0].get_texts()]
+    assert min(text.get_fontsize() for text in texts) * 3.4 / figures[0].get_figwidth() > 6
+    assert int.from_bytes(path.read_bytes()[16:20]) == 1200  # the width, as the PNG's header has it
+
+
+def test_a_label_has_one_look_wherever_it_is_drawn(tmp_path, figures):
+    looks = looks_of(["a", "b", "c"])
+    assert looks_of(["c", "a"], looks) == {"c": looks["c"], "a": looks["a"]}
+    assert looks_of(["new", "b", "newer"], looks) == {"new": looks["a"], "b": looks["b"], "newer": looks["c"]}
+    assert len(set(looks_of(map(str, range(28))).values())) == 28
+    learning_curves([Panel([("c", evaluations())])], tmp_path / "curve.png", looks=looks)
+    assert figures[0].legends[0].get_lines()[0].get_color() == looks["c"][0]
+
+
+def test_a_band_stays_within_the_limits_of_what_is_drawn(tmp_path, figures):
+    rows = evaluations(seeds=5, points=2)
+    rows["return"] = [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0]  # 0.6 ± 0.68 and 0.8 ± 0.56
+    learning_curves([Panel([("csac", rows)])], tmp_path / "curve.png", within=(0.0, 1.0))
+    axes = figures[0].axes[0]
+    assert band(axes, 5000) == (0.0, 1.0)
+    assert band(axes, 10_000) == pytest.approx((0.8 - 0.5553, 1.0), abs=1e-4)  # t(0.975, 4) * 0.4472 / sqrt(5)
+    assert axes.get_ylim() == pytest.approx((-0.05, 1.05))
 
 
 def test_a_wide_band_does_not_flatten_the_curves(tmp_path, figures):

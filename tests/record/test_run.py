@@ -213,6 +213,16 @@ def test_runs_are_found_below_sorted_without_what_they_hold_or_what_is_not_ours(
     assert [run.path for run in find_runs(str(tmp_path / "a"))] == [tmp_path / "a"]
 
 
+def test_a_damaged_run_is_told_and_what_is_below_it_found(tmp_path):
+    for name in ("a", "a/below"):
+        RunDirectory.create(tmp_path / name, MANIFEST)
+        (tmp_path / name / "evaluations.csv").touch()
+    (tmp_path / "a" / "manifest.json").write_bytes(b"")
+    told = []
+    assert [run.path for run in find_runs(tmp_path, told.append)] == [tmp_path / "a" / "below"]
+    assert [str(tmp_path / "a" / "manifest.json") in str(error) for error in told] == [True]
+
+
 def test_looking_for_runs_where_there_is_no_directory(tmp_path):
     with pytest.raises(InputError, match="there is no directory"):
         find_runs(tmp_path / "nowhere")

@@ -112,10 +112,10 @@ def test_rollouts_are_asked_of_the_cells_that_need_them(engine):
 
 
 def test_a_cell_that_fails_is_an_exit_code_and_a_reason(tmp_path, capsys):
-    write(tmp_path / "wrong.toml", TINY.replace("Hopper-v4", "Hoppper-v4").replace("seeds = 2", "seeds = 1"))
+    write(tmp_path / "wrong.toml", TINY.replace("Hopper-v4", "nowhere:Hop-v4").replace("seeds = 2", "seeds = 1"))
     assert csac("study run wrong.toml --engine local") == 3
     last = capsys.readouterr().out.splitlines()[-2:]
-    assert last[0].startswith("failed: SAC on Hoppper-v4, seed 0: no task is called Hoppper-v4")
+    assert last[0].startswith("failed: SAC on nowhere:Hop-v4, seed 0: nowhere:Hop-v4: the module nowhere")
     assert last[1] == "1 cells: 1 failed"
 
 

@@ -141,6 +141,11 @@ def test_it_is_seen_in_light_and_dark_wide_and_narrow(opened, tmp_path, scheme, 
     assert (tmp_path / "page.png").stat().st_size > 100_000
 
 
+def test_the_last_number_of_an_axis_is_shown(opened):
+    page = opened(viewport={"width": 400, "height": 900})
+    assert drawn(page, "HalfCheetah-v4").locator(".xtick text").all_text_contents()[-1] == "1M"
+
+
 def test_on_paper_the_still_pictures_stand_in_place_of_the_plots(opened):
     page = opened(color_scheme="dark")
     assert page.locator("figure img").first.is_hidden()

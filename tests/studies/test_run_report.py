@@ -1,5 +1,6 @@
 """`csac report`: runs side by side, as a report and as a table of a page."""
 
+import re
 import shlex
 from pathlib import Path
 
@@ -152,6 +153,15 @@ def test_a_report_tells_of_perturbations_success_and_what_failed():
     assert {path.suffix for path in Path("out").iterdir()} == {".html", ".md", ".png", ".svg"}
 
 
+def test_an_arm_has_one_colour_on_all_tasks():
+    make_run_of("runs/a", [[10.0]], algorithm="csac")
+    for task in ("Hopper-v4", "Ant-v4"):
+        make_run_of(f"runs/{task}", [[20.0]], task=task)
+    report("runs")
+    page = Path("out/report.html").read_text()
+    assert len(set(re.findall(r'"name":"SAC \(1 seed\)".*?"color":"(#\w+)"', page))) == 1
+
+
 def test_equal_runs_with_equal_seeds_stand_side_by_side():
     for name in ("a", "b"):
         make_run_of(f"runs/{name}", [[10.0]])
@@ -160,11 +170,12 @@ def test_equal_runs_with_equal_seeds_stand_side_by_side():
     assert "| SAC, runs/b | 10.00 |" in text
 
 
-def test_a_run_without_evaluations_is_told():
+def test_a_run_without_evaluations_is_told(capsys):
     make_run_of("runs/a", [])
     text = report("runs/a")
     assert "| runs/a | Hopper-v4 | sac |" in text
     assert "## Learning curves" not in text
+    assert "note: there is no evaluation yet in these runs" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from csac.studies.cells import Cell
 from csac.studies.results import Record
 
 COLUMNS = ("seed", "step", "episode", "return", "length", "success", "out_of_bounds", "collision", "env_complete")
+COMMIT = "0123456789" * 4
 
 
 def rows(cell: Cell, value: Callable[[int], float], points: int = 20, episodes: int = 2) -> np.ndarray:
@@ -52,7 +53,7 @@ class MadeRecords:
             evaluation=EvaluationPlan(cell.evaluation_interval, cell.evaluation_episodes),
             machine=Machine("a processor"),
             versions={"csac": "0.1.0"},
-            commit="0123456",
+            commit=COMMIT,
             state="failed" if reason else "finished",
             failures={cell.seed: reason} if reason else {},
         )
@@ -72,7 +73,7 @@ def make_run_of(path: str | Path, returns: Sequence[Sequence[float]], **changes:
         "steps_done": 100,
         "state": "finished",
         "versions": {"csac": "0.1.0"},
-        "commit": "0123456",
+        "commit": COMMIT,
         "command": "csac train Hopper-v4 --seeds 1",
         **changes,
     }

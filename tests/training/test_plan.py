@@ -63,6 +63,21 @@ def test_a_name_or_a_class_is_no_algorithm(tmp_path, algorithm: Any, message):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"environment_arguments": 3}, "environment_arguments are keyword arguments such as"),
+        ({"perturbations": 3}, r"perturbations are a list such as \['friction=1.5@300000'\], not 3"),
+        ({"on_evaluation": 3}, "on_evaluation is a function that is called, not 3"),
+        ({"stop_when": "never"}, "stop_when is a function that is called, not 'never'"),
+    ],
+)
+def test_what_is_of_another_kind_is_refused_before_anything_is_made(tmp_path, given: Any, message):
+    with pytest.raises(InputError, match=message):
+        train(SAC(), "Pendulum-v1", steps=10, directory=tmp_path / "run", **given)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_batch_that_does_not_fit_is_refused_with_what_it_needs(tmp_path):
     with pytest.raises(InputError, match=r"needs about [\d,.]+ GiB of memory and [\d.]+ GiB are available"):
         train(SAC(batch_size=10**9, replay_size=2 * 10**9), "Pendulum-v1", steps=100, directory=tmp_path / "run")

@@ -1,0 +1,35 @@
+"""What a user gives, checked: what more than one room asks of it. Each raises InputError in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from csac.types import InputError
+
+
+def check_whole(name: str, value: object, least: int, most: int) -> None:
+    """Raise InputError for what is not a whole number between these two."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name} must be a whole number of {_least(least)}, not {value!r:.40}")
+    if value > most:
+        raise InputError(
+            f"{name} must be at most {most:,}, not {value:.3g}" if value < 1e300 else f"{name} is too large"
+        )
+
+
+def check_callable(name: str, value: object) -> None:
+    """Raise InputError for what is neither None nor can be called."""
+    if value is not None and not callable(value):
+        raise InputError(f"{name} is a function that is called, not {value!r:.40}")
+
+
+def check_arguments(name: str, value: object) -> None:
+    """Raise InputError for what is neither None nor keyword arguments."""
+    if value is not None and not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
+        raise InputError(f"{name} are keyword arguments such as {{'g': 9.0}}, not {value!r:.40}")
+
+
+def _least(least: int) -> str:
+    return "at least 1" if least == 1 else f"{least} or more"
