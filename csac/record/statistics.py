@@ -96,7 +96,7 @@ def stratified_bootstrap_interval(
     left out whole; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge
     of the Statistical Precipice".
     """
-    return _bootstrap_interval([scores], statistic, repetitions, seed, confidence)
+    return _scalars(_bootstrap_interval([scores], statistic, repetitions, seed, confidence))
 
 
 def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
@@ -116,7 +116,7 @@ def improvement_interval(
     scores: np.ndarray, others: np.ndarray, repetitions: int = 2000, seed: int = 0, confidence: float = 0.95
 ) -> tuple[float, float] | None:
     """Stratified bootstrap interval of `probability_of_improvement`; None where either has fewer than five seeds."""
-    return _bootstrap_interval([scores, others], probability_of_improvement, repetitions, seed, confidence)
+    return _scalars(_bootstrap_interval([scores, others], probability_of_improvement, repetitions, seed, confidence))
 
 
 def performance_profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
@@ -128,6 +128,17 @@ def performance_profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarra
     known = known[~np.isnan(known)]
     above = known[None, :] > np.asarray(thresholds)[:, None]
     return _divide(above.sum(axis=1), np.full(len(above), len(known)))
+
+
+def profile_interval(
+    scores: np.ndarray, thresholds: np.ndarray, repetitions: int = 2000, seed: int = 0, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Pointwise bootstrap interval `(low [t], high [t])` of `performance_profile`; None below five seeds."""
+
+    def profile(resampled: np.ndarray) -> np.ndarray:
+        return performance_profile(resampled, thresholds)
+
+    return _bootstrap_interval([scores], profile, repetitions, seed, confidence)
 
 
 def dispersion_across(returns: np.ndarray) -> float:
@@ -177,9 +188,13 @@ def best_returns(rows: np.ndarray) -> dict[int, float]:
 
 
 def _bootstrap_interval(
-    samples: Sequence[np.ndarray], statistic: Callable[..., float], repetitions: int, seed: int, confidence: float
-) -> tuple[float, float] | None:
-    """Percentile interval of `statistic(*samples)`, each sample [seed, ...] resampled for itself."""
+    samples: Sequence[np.ndarray],
+    statistic: Callable[..., float | np.ndarray],
+    repetitions: int,
+    seed: int,
+    confidence: float,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Percentile interval of each element of `statistic(*samples)`, each sample [seed, ...] resampled for itself."""
     arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
     arrays = [array[~np.isnan(array).any(axis=tuple(range(1, array.ndim)))] for array in arrays]
     if min(map(len, arrays)) < FEWEST_FOR_BOOTSTRAP:
@@ -189,9 +204,13 @@ def _bootstrap_interval(
     def resampled(array: np.ndarray) -> np.ndarray:
         return np.take_along_axis(array, generator.integers(len(array), size=array.shape), axis=0)
 
-    values = [statistic(*map(resampled, arrays)) for _ in range(repetitions)]
-    low, high = np.quantile(values, [0.5 - confidence / 2, 0.5 + confidence / 2])
-    return float(low), float(high)
+    values = np.array([statistic(*map(resampled, arrays)) for _ in range(repetitions)])
+    low, high = np.quantile(values, [0.5 - confidence / 2, 0.5 + confidence / 2], axis=0)
+    return low, high
+
+
+def _scalars(bounds: tuple[np.ndarray, np.ndarray] | None) -> tuple[float, float] | None:
+    return bounds and (float(bounds[0]), float(bounds[1]))
 
 
 def _divide(numerator: np.ndarray, count: np.ndarray) -> np.ndarray:

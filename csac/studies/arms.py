@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
@@ -22,6 +22,16 @@ if TYPE_CHECKING:
     from csac.studies.study import Study
 
 
+class Time(NamedTuple):
+    """How long one run took: `steps` environment steps of each of its seeds."""
+
+    seconds: float
+    steps: int
+    seeds: tuple[int, ...]
+    interrupted: bool | None = None
+    """Whether it was ever stopped and resumed, None where that is not known."""
+
+
 @dataclass
 class Arm:
     """Seeds that belong together: what one method has given on one task under one condition, without what failed."""
@@ -35,7 +45,7 @@ class Arm:
     published: str | None = None
     """The paper's column that stands beside it."""
     manifests: list[Manifest] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
+    times: list[Time] = field(default_factory=list)
     """How long each of its runs took, as far as that is known."""
     evaluations: list[np.ndarray] = field(default_factory=list)
     tests: list[np.ndarray] = field(default_factory=list)
@@ -106,7 +116,9 @@ def tasks_of(arms: Sequence[Arm]) -> dict[str, list[Arm]]:
 
 def _add(arm: Arm, record: Record) -> None:
     arm.manifests.append(record.manifest)
-    arm.seconds += [record.seconds] * bool(record.seconds)
+    if record.seconds:
+        one = record.manifest
+        arm.times.append(Time(record.seconds, one.steps, tuple(one.seeds), record.interrupted))
     arm.evaluations.append(record.evaluations)
     arm.tests += [] if record.rollouts is None else [record.rollouts]
 

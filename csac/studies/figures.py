@@ -23,6 +23,7 @@ from csac.record.plots import (
 )
 from csac.record.rendering import short
 from csac.record.statistics import FEWEST_FOR_INTERVAL, is_case
+from csac.studies.profiles import Profiles
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -170,7 +171,7 @@ class Trend(NamedTuple):
             save(figure, path, FORMATS)
 
 
-Drawing = Curves | Bars | Trend
+Drawing = Curves | Bars | Trend | Profiles
 
 
 def nudge(index: int, lines: int) -> float:

@@ -14,6 +14,7 @@ from csac.record.curves import curves_of, last_step, limits, note
 from csac.record.plots import looks_of
 from csac.record.rendering import number
 from csac.studies.figures import PUBLISHED, Bars, Curves, nudge
+from csac.studies.profiles import SHARE, Profiles
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -39,6 +40,8 @@ def plots(drawing: Drawing) -> list[Plot]:
     """Return the plots of a figure, one for each panel."""
     if isinstance(drawing, Curves):
         return _curves(drawing)
+    if isinstance(drawing, Profiles):
+        return [_profiles(drawing)]
     return _bars(drawing) if isinstance(drawing, Bars) else [_trend(drawing)]
 
 
@@ -222,6 +225,33 @@ def _line(line: Line, look: Look, factor: float) -> dict[str, Any]:
         "line": {"color": colour, "width": 2.4, "dash": DASHES[style]},
         "marker": {"color": colour, "size": 8},
     }
+
+
+def _profiles(drawing: Profiles) -> Plot:
+    looks, traces = looks_of([profile.label for profile in drawing.profiles], drawing.looks), []
+    scores = _plain(drawing.scores)
+    for label, share, low, high in drawing.profiles:
+        colour, style = looks[label]
+        step = {"type": "scatter", "mode": "lines", "legendgroup": label, "x": scores}
+        edge = {"showlegend": False, "hoverinfo": "skip"}
+        if low:
+            nothing = {"shape": "hv", "width": 0}
+            traces.append({**step, **edge, "y": _plain(low), "line": nothing})
+            traces.append({**step, **edge, "y": _plain(high), "line": nothing})
+            traces[-1] |= {"fill": "tonexty", "fillcolor": _faint(colour)}
+        line = {"shape": "hv", "color": colour, "width": 2.4, "dash": DASHES[style]}
+        shown = {"name": _text(label), "y": _plain(share), "line": line}
+        between = [_between(*reach) for reach in zip(low, high, strict=True)] or [""] * len(share)
+        traces.append({**step, **shown, "text": between, "hovertemplate": "%{y:.0%}%{text}"})
+    return Plot(
+        "",
+        traces,
+        {
+            "hovermode": "x unified",
+            "xaxis": {"title": {"text": drawing.quantity}},
+            "yaxis": {"title": {"text": SHARE}, "tickformat": ".0%", "range": [-0.03, 1.03]},
+        },
+    )
 
 
 def _errors(middle: Sequence[float], low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:

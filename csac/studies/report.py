@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING, Any
 from csac.record.plots import NO_LOOKS
 from csac.record.rendering import Cell, Row, Table
 from csac.studies import paper, sections
+from csac.studies.aggregates import over_tasks
 from csac.studies.arms import gather, with_rows
 from csac.studies.cells import complete
 from csac.studies.claims import VERDICTS, comparisons, decide
-from csac.studies.parts import Heading, Items, Paragraph, write
-from csac.studies.sections import Scope, plain, report_looks
+from csac.studies.parts import Heading, Paragraph, write
+from csac.studies.sections import Scope, report_looks
+from csac.studies.settings import hyperparameters
+from csac.studies.standing import cells_so_far, wall_times
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -81,29 +84,19 @@ def _parts(study: Study, arms: list[Arm], commands: Sequence[str], looks: Mappin
     if study.scale < 1:
         told = f"Every run is shortened to {study.scale:g} of its steps."
         yield Paragraph("Runs that are shorter than the paper's neither confirm nor refute it.", told)
-    yield from _count(arms)
+    yield from cells_so_far(arms)
     if shown:
-        yield from _claims(study, arms, scope)
         for analysis in study.analyses:
             yield from _SECTIONS[analysis](shown, scope)
-    yield from _hyperparameters(study)
+            if analysis == "returns":
+                yield from over_tasks(arms, scope)
+        yield from _claims(study, arms, scope)
+    yield from hyperparameters(study)
     published = any(method.published for method in study.methods)
     yield from sections.provenance(arms, paper.INFERRED if published else ())
+    yield from wall_times(arms)
     runs = [train_command(arm) for arm in arms if arm.manifests]
     yield from sections.commands(commands, runs, "Each arm by itself, all its seeds in one run:")
-
-
-def _count(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Say how much of the study there is, and what is missing."""
-    done = sum(len(arm.manifests) for arm in arms)
-    failed = sum(len(arm.failures) for arm in arms)
-    missing = sum(len(arm.missing) for arm in arms)
-    text = f"{done} of {done + failed + missing} cells are complete"
-    yield Paragraph(text + f", {failed} failed" * bool(failed) + f", {missing} are not over" * bool(missing) + ".")
-    lines = [f"{_name(arm)}, seed {seed} failed: {reason}" for arm in arms for seed, reason in arm.failures.items()]
-    lines += [f"{_name(arm)}: no seed {', '.join(map(str, arm.missing))} yet" for arm in arms if arm.missing]
-    if lines:
-        yield Items(tuple(lines))
 
 
 def _claims(study: Study, arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
@@ -123,26 +116,6 @@ def _claims(study: Study, arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
     if len(found) > len(measured):
         yield Paragraph(f"Of {len(found) - len(measured)} more nothing was measured, or not both sides.")
     yield Paragraph(_VERDICTS)
-
-
-def _hyperparameters(study: Study) -> Iterator[Part]:
-    yield Heading("Hyperparameters")
-    task = study.tasks[0]
-    names: dict[str, dict[str, Any]] = {}
-    for method in study.methods:
-        for name, value in method.hyperparameters_on(task).items():
-            names.setdefault(name, {})[method.label] = value
-    rows = [
-        Row((Cell(name), *(Cell(plain(values.get(method.label))) for method in study.methods)))
-        for name, values in names.items()
-    ]
-    yield Table((f"on {task}", *(method.label for method in study.methods)), tuple(rows))
-    if study.scale < 1:
-        yield Paragraph("Warm-up is a tenth of a shortened run at most; runs are evaluated twenty times at least.")
-
-
-def _name(arm: Arm) -> str:
-    return ", ".join([f"{arm.label} on {arm.task}", *arm.condition])
 
 
 def _option(name: str, value: Any) -> list[str]:

@@ -28,6 +28,8 @@ class Record(NamedTuple):
     seconds: float
     evaluations: np.ndarray
     rollouts: np.ndarray | None
+    interrupted: bool | None = None
+    """Whether it was ever stopped and resumed, None where that was not written down."""
 
     @property
     def failure(self) -> str:
@@ -55,7 +57,8 @@ class Runs:
         if not is_final(path):
             return None
         run, seconds = RunDirectory.open(path), read_history(path).get("seconds", 0.0)
-        return Record(run.manifest, seconds, run.evaluations, _rows(path / ROLLOUTS))
+        tables = run.evaluations, _rows(path / ROLLOUTS)
+        return Record(run.manifest, seconds, *tables, bool(run.manifest.history))
 
 
 class Results:
@@ -80,8 +83,8 @@ class Results:
         if path is None:
             return None
         content = path.read_bytes()
-        tables = read_rows(path.with_suffix(".csv")), _rows(_rollouts(path))
-        return Record(manifests.read(content), json.loads(content).get("seconds", 0.0), *tables)
+        tables, told = (read_rows(path.with_suffix(".csv")), _rows(_rollouts(path))), json.loads(content)
+        return Record(manifests.read(content), told.get("seconds", 0.0), *tables, told.get("interrupted"))
 
     def status(self, cell: Cell, rollouts: int) -> Status | None:
         """Return how a cell ended that was collected, with the rollouts that are wanted, or None."""
@@ -103,7 +106,8 @@ def collect(store: Store, cell: Cell, directory: str | Path) -> None:
         write_atomically(_rollouts(path), (source / ROLLOUTS).read_bytes())
     manifest = dataclasses.replace(record.manifest, machine=dataclasses.replace(record.manifest.machine, host=""))
     fields = json.loads(manifests.written(dataclasses.replace(manifest, process=None, history=())))
-    write_atomically(path, (json.dumps({**fields, "seconds": record.seconds}, indent=1) + "\n").encode())
+    fields |= {"seconds": record.seconds, "interrupted": record.interrupted}
+    write_atomically(path, (json.dumps(fields, indent=1) + "\n").encode())
 
 
 def _rollouts(path: Path) -> Path:

@@ -22,10 +22,12 @@ from csac.record.run import RunDirectory, find_runs, is_run
 from csac.record.summaries import case_names, compare, last_rows
 from csac.record.summary_tables import case_comparison_table, comparison_table
 from csac.studies import sections
-from csac.studies.arms import Arm, by_condition, with_rows
+from csac.studies.aggregates import over_tasks
+from csac.studies.arms import Arm, Time, by_condition, with_rows
 from csac.studies.figures import tells_of_success
 from csac.studies.parts import Heading, Items, Paragraph, write
 from csac.studies.sections import Scope, described, marks_of, plain, report_looks
+from csac.studies.standing import wall_times
 from csac.tasks.perturbations import perturbations_of
 from csac.types import InputError
 
@@ -95,7 +97,7 @@ class Comparison:
             arm.tests += _tests(run, rows, failed)
             if run.manifest:
                 arm.manifests.append(run.manifest)
-                arm.seconds += _seconds(run.path, run.manifest)
+                arm.times += _times(run.path, run.manifest)
         if manifests:
             arm.algorithm, arm.hyperparameters = manifests[0].algorithm, _settings(manifests[0])
         return arm
@@ -197,6 +199,7 @@ def _parts(
         yield from sections.curves(plainly, scope)
     if shown:
         yield from sections.returns(shown, scope)
+        yield from over_tasks(arms, scope)
     if perturbed := [arm for arm in shown if arm.condition]:
         yield from sections.robustness(perturbed, scope)
     if any(tells_of_success(arm.rows) for arm in shown):
@@ -206,6 +209,7 @@ def _parts(
         yield Paragraph(f"Rollouts are those of {ROLLOUTS}, and of a run that has none its last evaluation's episodes.")
     yield from _hyperparameters(shown)
     yield from sections.provenance(arms)
+    yield from wall_times(arms)
     lines = [one.command for arm in arms for one in arm.manifests if one.command]
     yield from sections.commands(commands, list(dict.fromkeys(lines)), "The runs:")
 
@@ -311,11 +315,12 @@ def _seeds(runs: Sequence[Given]) -> set[int]:
     return {int(seed) for run in runs for seed in np.unique(run.rows["seed"])}
 
 
-def _seconds(path: Path, manifest: Manifest) -> list[float]:
+def _times(path: Path, manifest: Manifest) -> list[Time]:
     """Return how long a run took that was never interrupted, by its manifest and the last line of its log."""
     if manifest.history or manifest.state != "finished":
         return []
     with suppress(OSError, ValueError, IndexError):
         last = (path / "log.txt").read_text(encoding="utf-8").splitlines()[-1]
-        return [(datetime.fromisoformat(last.split(" ")[0]) - datetime.fromisoformat(manifest.created)).total_seconds()]
+        took = datetime.fromisoformat(last.split(" ")[0]) - datetime.fromisoformat(manifest.created)
+        return [Time(took.total_seconds(), manifest.steps, tuple(manifest.seeds), interrupted=False)]
     return []

@@ -40,6 +40,7 @@ from csac.studies.figures import (
     tells_of_success,
 )
 from csac.studies.parts import Commands, Figure, Heading, Items, Paragraph
+from csac.studies.stability import stability_table
 from csac.tasks.perturbations import by_step, perturbations_of
 
 if TYPE_CHECKING:
@@ -102,11 +103,12 @@ def curves(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
 
 
 def returns(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
-    """Maximum average returns, the paper's beside them, and what the last evaluations say."""
+    """Maximum average returns, the paper's beside them, what the last evaluations say, and how steady learning was."""
     yield Heading(scope.titled("Maximum average returns"))
     for (task, condition), own in by_condition(arms).items():
         yield returns_table(own, scope.titled(described(task, condition)))
         yield comparison_table(compare([(arm.label, arm.rows) for arm in own]))
+        yield stability_table(own, scope.titled(", ".join(filter(None, (described(task, condition), "stability")))))
         for name, trend in _trends(own):
             yield scope.figure("returns", f"{task}, over {name}", trend)
     yield Paragraph("Mean ± standard deviation over seeds at the evaluation where that mean is highest.")
@@ -221,7 +223,7 @@ def provenance(arms: Sequence[Arm], more: Sequence[str] = ()) -> Iterator[Part]:
     manifests = [manifest for arm in arms for manifest in arm.manifests]
     if not manifests:
         return
-    seconds = [value for arm in arms for value in arm.seconds]
+    seconds = [time.seconds for arm in arms for time in arm.times]
     versions = [f"{name} {version}" for one in manifests for name, version in one.versions.items()]
     yield Heading("Where the numbers come from")
     lines = [

@@ -16,6 +16,7 @@ from csac.record.statistics import (
     mean_returns,
     performance_profile,
     probability_of_improvement,
+    profile_interval,
     stratified_bootstrap_interval,
 )
 from csac.types import InputError
@@ -203,3 +204,14 @@ def test_intervals_are_those_of_rliable():
     # rliable's own, of 50,000 and 5,000 resamples: (3.5, 6.9) and (0.344, 0.75); these resamples are others.
     assert stratified_bootstrap_interval(FIRST, interquartile_mean) == pytest.approx((3.5, 6.9), abs=0.15)
     assert improvement_interval(FIRST, SECOND) == pytest.approx((0.344, 0.75), abs=0.02)
+
+
+def test_the_profile_s_interval_is_that_of_each_threshold_alone():
+    scores = np.random.default_rng(0).normal(size=(6, 3))
+    low, high = profile_interval(scores, np.array([-0.5, 0.5]), repetitions=300) or ([], [])
+    alone = [
+        stratified_bootstrap_interval(scores, lambda own, at=at: float((own > at).mean()), repetitions=300)
+        for at in (-0.5, 0.5)
+    ]
+    assert list(zip(low, high, strict=True)) == alone
+    assert profile_interval(scores[:4], np.array([0.0])) is None

@@ -56,6 +56,7 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
     assert collected is not None
     assert made is not None
     assert (collected.seconds, collected.manifest.versions) == (made.seconds, made.manifest.versions)
+    assert (collected.interrupted, made.interrupted) == (False, False)
     assert collected.manifest.machine.host == ""
     assert collected.evaluations.tobytes() == made.evaluations.tobytes()
     assert Results("out").record(other) is None

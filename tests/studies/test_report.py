@@ -218,9 +218,9 @@ def test_a_shortened_report_says_so_everywhere(tmp_path):
     assert "**Every run is shortened to 0.1 of its steps.**" in text
     headings = [line for line in text.splitlines() if line.startswith("## ")]
     assert headings[:3] == [
-        "## The paper's claims (scale 0.1)",
         "## Learning curves (scale 0.1)",
         "## Maximum average returns (scale 0.1)",
+        "## The paper's claims (scale 0.1)",
     ]
     assert "| reproduced |" not in text
     assert (tmp_path / "mujoco-curve-halfcheetah-v4-scale-0.1.png").exists()
