@@ -60,7 +60,7 @@ class CSAC:
     reference_rate: Annotated[float, RATE] = 0.005
     """Step of the running average towards the actor, with `average`."""
     critic_reference: Literal["same", "earlier"] = "same"
-    """The reference of the critic's target: the actor's, or the one that it replaced (CVI's pi_{k-1} beside pi_k)."""
+    """In the critic's target: the actor and its reference, or (CVI) that reference pi_k and the pi_{k-1} before it."""
     relative_entropy_estimator: Literal["closed_form", "sampled"] = "closed_form"
     """The exact KL of the two policies, or the paper's log-ratio at the sampled action."""
     relative_entropy_form: Literal["explicit", "actor_only", "implicit"] = "explicit"
@@ -177,13 +177,13 @@ class CSAC:
         renews, kept = step % self.reference_period == 0, (state.reference, state.earlier_reference)
         references = references_before(self.reference_policy, *kept, state.actor, renews)
 
-        policies = {"actor": state.actor, "reference": references.critic}
+        policies = {"actor": references.valued, "reference": references.critic}
         learnt = learn_critics(
             self._optimiser(self.critic_learning_rate),
             *(state.critics, state.target_critics, state.critic_optimiser),
             *(batch, target_noise),
             critic_target=partial(self.critic_target, weights=weights, **policies),
-            next_action=partial(action_at, state.actor),
+            next_action=partial(action_at, references.valued),
         )
 
         actor_loss = partial(self.actor_loss, reference=references.actor, critics=learnt.folded, weights=weights)
