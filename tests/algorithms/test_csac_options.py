@@ -75,6 +75,13 @@ def test_the_implicit_form_keeps_no_second_policy_and_survives_saturated_actions
     assert "relative_entropy" not in metrics
 
 
+def test_the_implicit_bonus_belongs_to_the_action_that_was_taken_and_no_termination_masks_it():
+    networks = {"actor": POLICY, "reference": None, "target_critics": CRITICS}
+    algorithm = csac(relative_entropy_form="implicit")
+    target = algorithm.critic_target(transition(terminated=1.0), NOISE, weights=BOTH_WEIGHTS, **networks)
+    assert float(target) == pytest.approx(2.0 - 0.5 * 0.7821251, abs=2e-6)
+
+
 # CVI charges π_k for its distance from π_(k-1), while the actor, already beyond π_k, is charged for its own from π_k:
 # KL(N(0, 1) ‖ N(1, 2²)) = 0.4431472 and KL(N(1, 2²) ‖ N(0, 2²)) = 1/8.
 EARLIER = gaussian(0.0, 2.0)
@@ -145,6 +152,7 @@ def test_the_next_action_of_two_references_is_that_of_the_stored_policy():
             {"relative_entropy_weight": "auto", "reference_policy": "algorithm1"},
             "relative_entropy_weight auto with reference_policy algorithm1 makes no sense: the actor is its own",
         ),
+        ({"relative_entropy_weight": "auto", "reference_period": 1}, "the actor is its own reference"),
         ({"relative_entropy_weight": "auto", "relative_entropy_form": "implicit"}, "there is no reference"),
         ({"critic_reference": "earlier", "relative_entropy_form": "actor_only"}, "the target has none"),
         ({"critic_reference": "earlier", "relative_entropy_form": "implicit"}, "the target has none"),
