@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
+import jax
 import jax.numpy as jnp
 
 from csac.algorithms.networks import begin_descent, descend
@@ -73,13 +75,18 @@ def weights_now(given: tuple[Weight, Weight], learnt: LearntWeights | None) -> W
 def adapted(
     learnt: LearntWeights | None, slack: Weights, optimiser: optax.GradientTransformation
 ) -> LearntWeights | None:
-    """Return the weights after one step, given by how much each one's constraint holds, negative where it does not."""
+    """Return the weights after one step, given by how much each one's constraint holds, negative where it does not.
+
+    A slack of exactly 0, which is that of a constraint not yet measured, moves neither the weight nor Adam's moments:
+    a thousand zeros in these would make the first steps after them several times too long.
+    """
 
     def adapt(one: LearntWeight | None, slack: Any) -> LearntWeight | None:
         if one is None:
             return None
         log_weight, state, _ = descend(optimiser, weight_loss, one.log_weight, one.optimiser, slack[None])
-        return LearntWeight(jnp.clip(log_weight, math.log(LEAST_WEIGHT), math.log(MOST_WEIGHT)), state)
+        moved = LearntWeight(jnp.clip(log_weight, math.log(LEAST_WEIGHT), math.log(MOST_WEIGHT)), state)
+        return jax.tree.map(partial(jnp.where, slack == 0), one, moved)
 
     return None if learnt is None else LearntWeights(*map(adapt, learnt, slack))
 

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import optax
 
 from csac.algorithms.adaptation import LearntWeights, Weights, adapted, begin_weights, told, weights_now
@@ -32,6 +33,7 @@ class State(NamedTuple):
     critic_optimiser: Any
     earlier_reference: MLP | None = None
     learnt_weights: LearntWeights | None = None
+    relative_entropy_per_refresh: Scalar | None = None  # what a τ that is learnt goes by; 0 before there is any
     observations: Statistics | None = None
 
 
@@ -39,6 +41,10 @@ FIRST_WEIGHTS = Weights(1.0, 0.5)  # of those that adapt: SAC's first temperatur
 
 NOT_TOGETHER = (
     ({"relative_entropy_weight": ["auto"], "reference_policy": ["algorithm1"]}, "the actor is its own reference"),
+    (
+        {"relative_entropy_weight": ["auto"], "reference_policy": ["periodic"], "reference_period": [1]},
+        "the actor is its own reference",
+    ),
     ({"relative_entropy_weight": ["auto"], "relative_entropy_form": ["implicit"]}, "there is no reference"),
     ({"critic_reference": ["earlier"], "relative_entropy_form": ["actor_only", "implicit"]}, "the target has none"),
     ({"critic_reference": ["earlier"], "reference_policy": ["previous", "average"]}, "no copy replaces another"),
@@ -60,17 +66,17 @@ class CSAC:
     reference_rate: Annotated[float, RATE] = 0.005
     """Step of the running average towards the actor, with `average`."""
     critic_reference: Literal["same", "earlier"] = "same"
-    """The reference of the critic's target: the actor's, or the one that it replaced (CVI's pi_{k-1} beside pi_k)."""
+    """In the critic's target: the actor and its reference, or (CVI) that reference pi_k and the pi_{k-1} before it."""
     relative_entropy_estimator: Literal["closed_form", "sampled"] = "closed_form"
     """The exact KL of the two policies, or the paper's log-ratio at the sampled action."""
     relative_entropy_form: Literal["explicit", "actor_only", "implicit"] = "explicit"
     """In the critic's target and the actor's loss; in the latter alone; or as tau log pi in the reward (Munchausen)."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on the size of each log-density and log-ratio in the critic's target, in nats; 0 leaves them alone."""
+    """Bound on each log-density and log-ratio of a whole action in the critic's target, in nats; 0 is none."""
     target_entropy: float | None = None
     """Entropy that `auto` aims at, in nats; by default minus the number of action dimensions."""
     target_relative_entropy: Annotated[float, POSITIVE] = 0.01
-    """Relative entropy towards the reference that `auto` aims at, in nats per action dimension."""
+    """Relative entropy that `auto` lets a refresh of the reference come to, in nats per action dimension."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the weights that are `auto`."""
     discount: Annotated[float, DISCOUNT] = 0.99
@@ -177,13 +183,13 @@ class CSAC:
         renews, kept = step % self.reference_period == 0, (state.reference, state.earlier_reference)
         references = references_before(self.reference_policy, *kept, state.actor, renews)
 
-        policies = {"actor": state.actor, "reference": references.critic}
+        policies = {"actor": references.valued, "reference": references.critic}
         learnt = learn_critics(
             self._optimiser(self.critic_learning_rate),
             *(state.critics, state.target_critics, state.critic_optimiser),
             *(batch, target_noise),
             critic_target=partial(self.critic_target, weights=weights, **policies),
-            next_action=partial(action_at, state.actor),
+            next_action=partial(action_at, references.valued),
         )
 
         actor_loss = partial(self.actor_loss, reference=references.actor, critics=learnt.folded, weights=weights)
@@ -191,6 +197,7 @@ class CSAC:
         actor, actor_optimiser, actor_metrics = descend(
             optimiser, actor_loss, state.actor, state.actor_optimiser, batch.observation, actor_noise
         )
+        refreshed = self.per_refresh(state.relative_entropy_per_refresh, actor_metrics, step)
 
         new_state = State(
             actor=actor,
@@ -202,20 +209,36 @@ class CSAC:
             earlier_reference=references.critic if self.critic_reference == "earlier" else None,
             learnt_weights=adapted(
                 state.learnt_weights,
-                self.slack(actor_metrics, batch.action.shape[-1]),
+                self.slack(actor_metrics["entropy"], refreshed, batch.action.shape[-1]),
                 self._optimiser(self.weight_learning_rate),
             ),
+            relative_entropy_per_refresh=refreshed,
             observations=observations,
         )
-        return new_state, {**learnt.metrics, **actor_metrics, **told(weights, state.learnt_weights)}
+        refresh = {} if refreshed is None else {"relative_entropy_per_refresh": refreshed}
+        return new_state, {**learnt.metrics, **actor_metrics, **refresh, **told(weights, state.learnt_weights)}
 
-    def slack(self, metrics: Metrics, dimensions: int) -> Weights:
-        """Return by how much the entropy lies above its target, and the relative entropy below its own, in nats."""
+    def per_refresh(self, last: Scalar | None, metrics: Metrics, step: Count) -> Scalar | None:
+        """Return what the relative entropy came to just before the last renewal of the reference, in nats.
+
+        With `periodic` that is what the last update of a period measures, held until the next one's; the others renew
+        their reference, or move it on, at every update.
+        """
+        if last is None:
+            return None
+        is_last = self.reference_policy != "periodic" or (step + 1) % self.reference_period == 0
+        return jnp.where(is_last, metrics["relative_entropy"], last)
+
+    def slack(self, entropy: Scalar, relative_entropy: Scalar | None, dimensions: int) -> Weights:
+        """Return by how much the entropy lies above its target, and the relative entropy below its own, in nats.
+
+        The latter is 0 while there is none: the actor and its reference were never apart.
+        """
         target_entropy = -float(dimensions) if self.target_entropy is None else self.target_entropy
-        relative_entropy = metrics.get("relative_entropy", 0.0)
-        return Weights(
-            metrics["entropy"] - target_entropy, self.target_relative_entropy * dimensions - relative_entropy
-        )
+        if relative_entropy is None:
+            return Weights(entropy - target_entropy, 0.0)
+        most = self.target_relative_entropy * dimensions
+        return Weights(entropy - target_entropy, jnp.where(relative_entropy == 0, 0.0, most - relative_entropy))
 
     @property
     def cadence(self) -> Cadence:
@@ -244,6 +267,7 @@ class CSAC:
                 FIRST_WEIGHTS,
                 self._optimiser(self.weight_learning_rate),
             ),
+            relative_entropy_per_refresh=jnp.zeros(()) if self.relative_entropy_weight == "auto" else None,
             observations=begin_statistics(spec.observation_size, self.normalise_observations),
         )
 

@@ -101,7 +101,10 @@ def kl(policy: TanhGaussian, reference: TanhGaussian) -> Scalar:
 
 
 def bounded(value: Scalar, bound: float) -> Scalar:
-    """Return a log-density or log-ratio, clipped to ± bound where that is more than 0."""
+    """Return a log-density, KL or log-ratio, clipped to ± bound nats where that is more than 0.
+
+    All three are sums over the action dimensions: the more of these there are, the tighter is the same bound on each.
+    """
     return jnp.clip(value, -bound, bound) if bound > 0 else value
 
 

@@ -18,6 +18,7 @@ class References(NamedTuple):
 
     actor: MLP | None  # of the actor's loss: π_k
     critic: MLP | None  # of the critic's target: the same, or π_{k-1}
+    valued: MLP  # the policy that the critic's target takes the value of: the actor as it is, or π_k beside π_{k-1}
 
 
 def references_before(
@@ -26,14 +27,15 @@ def references_before(
     """Return the references of an update, given those that were kept and the actor before its gradients.
 
     With `periodic` the reference is the actor where the period begins anew (`renews`). Where an earlier reference is
-    kept, the critic has the one that the actor's took the place of; that of `algorithm1` is renewed at every update.
+    kept, the target is that of CVI: the value of the actor's reference, which is charged for its distance from the one
+    that it took the place of. The reference of `algorithm1` is renewed at every update.
     """
     if kept is None:
-        return References(None, None)
+        return References(None, None, actor)
     used = actor if choice == "algorithm1" else _where(renews, actor, kept) if choice == "periodic" else kept
     if earlier is None:
-        return References(used, used)
-    return References(used, kept if choice == "algorithm1" else _where(renews, kept, earlier))
+        return References(used, used, actor)
+    return References(used, kept if choice == "algorithm1" else _where(renews, kept, earlier), used)
 
 
 def reference_after(choice: ReferencePolicy, used: MLP | None, actor: MLP, rate: float) -> MLP | None:

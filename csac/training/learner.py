@@ -142,7 +142,7 @@ class Learner:
         """
         for seed in saved:
             if problem := misfit(self.algorithm, self.spec, self._steps, seed):
-                raise InputError(f"the checkpoint does not fit: {problem}")
+                raise InputError(f"the checkpoint does not fit: {problem}: go on with the csac that wrote it")
         rows = np.zeros(self._carry.memory.rows.shape, self._carry.memory.rows.dtype)
         for index, fill in enumerate(memories):
             fill(self._axis.of(rows, index))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
-from equations import ONE, batch_of, gaussian, linear, transition, update
+from equations import LINEAR, ONE, POLICY, REFERENCE, batch_of, gaussian, linear, transition, update
 
 from csac.algorithms import CSAC
 from csac.algorithms.adaptation import (
@@ -21,6 +23,8 @@ from csac.algorithms.adaptation import (
     weights_now,
 )
 from csac.algorithms.networks import make_optimiser
+from csac.training.learner import Learner
+from csac.types import InputError, Spec, Transition
 
 GIVEN = (0.2, "auto")
 OPTIMISER = make_optimiser(0.02)
@@ -61,14 +65,14 @@ def test_a_weight_rises_where_its_constraint_is_hurt():
 PERIOD = 100
 
 
-def relative_entropies(target, updates):
+def relative_entropies(target, updates, actor_learning_rate=0.03):
     """The relative entropy and τ of each update of a policy that follows Q."""
     algorithm = CSAC(
         entropy_weight=0.2,
         relative_entropy_weight="auto",
         target_relative_entropy=target,
         reference_period=PERIOD,
-        actor_learning_rate=0.03,
+        actor_learning_rate=actor_learning_rate,
         critic_learning_rate=1e-9,  # the critics are given
         weight_learning_rate=0.005,
         actor_hidden_sizes=(),
@@ -89,15 +93,18 @@ def relative_entropies(target, updates):
     return [np.asarray(values, np.float64) for values in found]
 
 
-def test_the_relative_entropy_is_held_at_its_target_where_the_policy_strives_away():
-    held, weights = relative_entropies(0.1, updates=4000)  # per action dimension, of which there is one
-    assert held[-1000:].mean() == pytest.approx(0.1, rel=0.05)
-    assert 1.0 < weights[-1000:].min() < weights[-1000:].max() < 10.0
+def test_what_a_refresh_comes_to_is_held_at_its_target_where_the_policy_strives_away():
+    # Not the mean over all ages of the reference: the policy is on its way for most of a period.
+    held, weights = relative_entropies(0.05, updates=6000, actor_learning_rate=0.003)  # of one action dimension
+    assert held[PERIOD - 1 :: PERIOD][-20:].mean() == pytest.approx(0.05, rel=0.03)
+    assert held[-20 * PERIOD :].mean() < 0.95 * 0.05
+    assert 3.0 < weights[-1000:].min() < weights[-1000:].max() < 6.0
 
 
 def test_the_weight_falls_to_its_floor_where_the_policy_stays_near_by_itself():
     free, weights = relative_entropies(1000.0, updates=3000)
-    assert weights[0] == pytest.approx(0.5)
+    np.testing.assert_allclose(weights[:PERIOD], 0.5, rtol=1e-6)  # nothing is measured before the first renewal
+    assert weights[PERIOD] < 0.499
     assert weights[-1] == pytest.approx(LEAST_WEIGHT, rel=1e-5)
     assert free[-1000:].mean() > 5.0  # so that what held it above was τ
 
@@ -115,6 +122,102 @@ def test_both_weights_are_told_as_they_were_used():
     state, metrics = update(algorithm, state, batch_of(transition()))
     assert float(metrics["entropy_weight"]) == 1.0
     assert float(metrics["relative_entropy_weight"]) == 0.5
-    # Adam's first step is the learning rate: up, as the entropy is below 100, and down, as the reference is the actor.
+    # Adam's first step is the learning rate: up, as the entropy is below 100. The first refresh is not over yet.
     assert float(state.learnt_weights.entropy.log_weight) == pytest.approx(0.1, abs=1e-5)
+    assert float(state.learnt_weights.relative_entropy.log_weight) == pytest.approx(math.log(0.5), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("choice", "measured_at"),  # the update that measured what each update goes by; None before there is one
+    [
+        ("periodic", [None, None, 2, 2, 2, 5, 5, 5]),
+        ("previous", [None, 1, 2, 3, 4, 5, 6, 7]),  # at first the reference is the actor
+        ("average", [None, 1, 2, 3, 4, 5, 6, 7]),
+    ],
+)
+def test_the_weight_goes_by_the_relative_entropy_of_the_last_refresh(choice, measured_at):
+    target, rate = 0.3, 0.1
+    algorithm = CSAC(
+        relative_entropy_weight="auto",
+        reference_policy=choice,
+        reference_period=3,
+        target_relative_entropy=target,
+        weight_learning_rate=rate,
+        **LINEAR,
+    )
+    state, found = algorithm.init(jax.random.key(0), ONE, 1000), []
+    batch = batch_of(transition(), transition(observation=-1.0, action=-0.5))
+    for step in range(8):
+        state, metrics = update(algorithm, state, batch, step)
+        found.append((metrics["relative_entropy"], metrics["relative_entropy_per_refresh"], state.learnt_weights))
+
+    expected: Any = jnp.log(0.5)
+    adam = optax.adam(rate)
+    moments = adam.init(expected)
+    for at, (_, per_refresh, learnt) in zip(measured_at, found, strict=True):
+        if at is None:
+            assert float(per_refresh) == 0.0
+        else:
+            assert float(per_refresh) == float(found[at][0])
+            move, moments = adam.update(target - found[at][0], moments)
+            expected = optax.apply_updates(expected, move)
+        assert float(learnt.relative_entropy.log_weight) == pytest.approx(float(expected), abs=1e-6)
+    assert len({float(one) for one, _, _ in found}) >= 6  # so that each names its update; 0 with a new copy
+
+
+def test_a_checkpoint_from_before_the_refresh_was_kept_is_refused_in_one_line():
+    learner = Learner(CSAC(relative_entropy_weight="auto", batch_size=8, **LINEAR), ONE, [0], 100)
+    saved = learner.save(0)
+    del saved.arrays["state.relative_entropy_per_refresh"]
+    with pytest.raises(InputError) as raised:
+        learner.take_back([saved], [lambda rows: None])
+    assert str(raised.value) == (
+        "the checkpoint does not fit: state.relative_entropy_per_refresh is to be float32 () and the checkpoint has "
+        "no such array: go on with the csac that wrote it"
+    )
+
+
+def test_both_targets_grow_with_the_action_dimensions():
+    # Two dimensions. KL = 2·0.5²/2 = 0.25 lies between 0.2 and 2·0.2, and the entropy, about 2 (1.4189385 - 2.169) =
+    # -1.5, between -2 and -1: both weights fall, where targets of one dimension would raise both.
+    def pair(mean):
+        return linear([[0.0] * 4], [mean, mean, -2.169, -2.169])
+
+    algorithm = CSAC(
+        entropy_weight="auto",
+        relative_entropy_weight="auto",
+        reference_policy="previous",
+        target_relative_entropy=0.2,
+        weight_learning_rate=0.1,
+        **LINEAR,
+    )
+    state = algorithm.init(jax.random.key(0), Spec(1, 2), 1000)
+    state = state._replace(actor=pair(0.0), reference=pair(0.5 * math.exp(-2.169)))
+    nothing = np.zeros(64, np.float32)
+    observations = np.ones((64, 1), np.float32)
+    batch = Transition(observations, np.zeros((64, 2), np.float32), nothing, observations, nothing, nothing)
+    state, metrics = update(algorithm, state, batch)
+    assert float(metrics["relative_entropy"]) == pytest.approx(0.25, rel=1e-4)
+    assert float(metrics["entropy"]) == pytest.approx(-1.5, abs=0.4)
+    assert float(state.learnt_weights.entropy.log_weight) == pytest.approx(-0.1, abs=1e-5)
     assert float(state.learnt_weights.relative_entropy.log_weight) == pytest.approx(math.log(0.5) - 0.1, abs=1e-5)
+
+
+def test_the_target_charges_the_weight_that_is_learnt():
+    # τ = 2, KL = 0.4431472, critics 0 and target critics 3: y = 2 + 0.5 (3 - 2·0.4431472), and the loss is 2 y².
+    algorithm = CSAC(entropy_weight=0.0, relative_entropy_weight="auto", reference_policy="previous", **LINEAR)
+    nothing, three = linear([[0.0], [0.0]], [0.0]), linear([[0.0], [0.0]], [3.0])
+    state = algorithm.init(jax.random.key(0), ONE, 1000)
+    weights = state.learnt_weights
+    assert weights is not None
+    assert weights.relative_entropy is not None
+    tau = weights.relative_entropy._replace(log_weight=jnp.log(jnp.float32(2.0)))
+    state = state._replace(
+        actor=POLICY,
+        reference=REFERENCE,
+        critics=(nothing, nothing),
+        target_critics=(three, three),
+        learnt_weights=weights._replace(relative_entropy=tau),
+    )
+    _, metrics = update(algorithm, state, batch_of(transition()))
+    assert float(metrics["critic_loss"]) == pytest.approx(2 * (3.5 - 0.4431472) ** 2, rel=1e-5)

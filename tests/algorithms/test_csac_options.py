@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -74,28 +75,30 @@ def test_the_implicit_form_keeps_no_second_policy_and_survives_saturated_actions
     assert "relative_entropy" not in metrics
 
 
-# KL(N(0, 1) ‖ N(1, 2²)) = 0.4431472 and KL(N(0, 1) ‖ N(0, 2²)) = log 2 + 1/8 - 1/2 = 0.3181472.
+def test_the_implicit_bonus_belongs_to_the_action_that_was_taken_and_no_termination_masks_it():
+    networks = {"actor": POLICY, "reference": None, "target_critics": CRITICS}
+    algorithm = csac(relative_entropy_form="implicit")
+    target = algorithm.critic_target(transition(terminated=1.0), NOISE, weights=BOTH_WEIGHTS, **networks)
+    assert float(target) == pytest.approx(2.0 - 0.5 * 0.7821251, abs=2e-6)
+
+
+# CVI charges π_k for its distance from π_(k-1), while the actor, already beyond π_k, is charged for its own from π_k:
+# KL(N(0, 1) ‖ N(1, 2²)) = 0.4431472 and KL(N(1, 2²) ‖ N(0, 2²)) = 1/8.
 EARLIER = gaussian(0.0, 2.0)
+EARLIER_CRITIC = {"relative_entropy_weight": 0.5, "critic_reference": "earlier", "reference_period": 4}
 
 
 @pytest.mark.parametrize(
     ("choice", "step", "of_the_actor", "of_the_critic"),
     [
-        ("periodic", 5, 0.4431472, 0.3181472),
-        ("periodic", 8, 0.0, 0.4431472),  # renewed: the actor's becomes the actor, the critic's what it was
+        ("periodic", 5, 0.4431472, 0.125),
+        ("periodic", 8, 0.0, 0.4431472),  # renewed: π_k is the actor, and π_(k-1) what was π_k
         ("algorithm1", 5, 0.0, 0.4431472),
     ],
 )
 def test_the_critic_s_own_reference(choice, step, of_the_actor, of_the_critic):
     # No entropy weight, critics 0 and target critics 3 everywhere: y = 2 + 0.5 (3 - 0.5 KL), and the loss is 2 y².
-    algorithm = CSAC(
-        entropy_weight=0.0,
-        relative_entropy_weight=0.5,
-        reference_policy=choice,
-        reference_period=4,
-        critic_reference="earlier",
-        **LINEAR,
-    )
+    algorithm = CSAC(entropy_weight=0.0, reference_policy=choice, **EARLIER_CRITIC, **LINEAR)
     nothing, three = linear([[0.0], [0.0]], [0.0]), linear([[0.0], [0.0]], [3.0])
     state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(
         actor=POLICY,
@@ -109,6 +112,39 @@ def test_the_critic_s_own_reference(choice, step, of_the_actor, of_the_critic):
     assert float(metrics["critic_loss"]) == pytest.approx(2 * (3.5 - 0.25 * of_the_critic) ** 2, rel=1e-6)
 
 
+@pytest.mark.parametrize("normalisation", ["none", "batch"])
+def test_between_renewals_the_critics_of_two_references_do_not_hear_of_the_actor(normalisation):
+    algorithm = CSAC(critic_normalisation=normalisation, **EARLIER_CRITIC, **LINEAR)
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(reference=REFERENCE, earlier_reference=EARLIER)
+    batch = batch_of(transition(), transition(observation=-1.0, next_observation=0.5, action=-0.2))
+
+    def learnt(actor, step):
+        """The critics and, as Adam's first step is one of signs, the moments of their gradient."""
+        after, _ = update(algorithm, state._replace(actor=actor), batch, step)
+        return jax.flatten_util.ravel_pytree((after.critics, after.critic_optimiser))[0]
+
+    for step in (5, 7):
+        np.testing.assert_array_equal(learnt(POLICY, step), learnt(gaussian(0.5, 0.1), step))
+    assert not np.allclose(learnt(POLICY, 8), learnt(gaussian(0.5, 0.1), 8))
+
+
+def test_the_next_action_of_two_references_is_that_of_the_stored_policy():
+    # Policies so sharp that π_k always takes 0.5 and the actor -0.5; π_k = π_(k-1). The critics are 0, their targets
+    # 3 + 2a, and log π is left out: y = 2 + 0.5 (3 + 2·0.5) = 4, where the actor's own action would make it 3.
+    stored, actor = gaussian(0.5493061, 1e-6), gaussian(-0.5493061, 1e-6)
+    nothing, rising = linear([[0.0], [0.0]], [0.0]), linear([[0.0], [2.0]], [3.0])
+    algorithm = CSAC(entropy_weight=0.0, **EARLIER_CRITIC, **LINEAR)
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(
+        actor=actor,
+        reference=stored,
+        earlier_reference=stored,
+        critics=(nothing, nothing),
+        target_critics=(rising, rising),
+    )
+    _, metrics = update(algorithm, state, batch_of(transition()), 5)
+    assert float(metrics["critic_loss"]) == pytest.approx(2 * 4.0**2, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -116,6 +152,7 @@ def test_the_critic_s_own_reference(choice, step, of_the_actor, of_the_critic):
             {"relative_entropy_weight": "auto", "reference_policy": "algorithm1"},
             "relative_entropy_weight auto with reference_policy algorithm1 makes no sense: the actor is its own",
         ),
+        ({"relative_entropy_weight": "auto", "reference_period": 1}, "the actor is its own reference"),
         ({"relative_entropy_weight": "auto", "relative_entropy_form": "implicit"}, "there is no reference"),
         ({"critic_reference": "earlier", "relative_entropy_form": "actor_only"}, "the target has none"),
         ({"critic_reference": "earlier", "relative_entropy_form": "implicit"}, "the target has none"),

@@ -188,7 +188,7 @@ REWARD = GENERATOR.normal(size=(STATES, ACTIONS))
 DYNAMICS = GENERATOR.dirichlet(np.full(STATES, 0.3), size=(STATES, ACTIONS))  # [state, action, next state]
 FIRST_Q = GENERATOR.normal(size=(STATES, ACTIONS))
 FIRST_POLICY = np.log(GENERATOR.dirichlet(np.ones(ACTIONS), size=STATES))  # log π_(-1)
-SECOND_CRITIC = GENERATOR.uniform(0.0, 1.0, size=(STATES, ACTIONS))  # how far it lies above the first
+GAP = GENERATOR.normal(size=(STATES, ACTIONS))  # by which the first critic lies above the second, or below it
 PRE_TANH = np.linspace(-2.0, 2.0, ACTIONS)
 
 
@@ -238,12 +238,12 @@ def actor_of(log_policy):
 
 
 def critics_of(q):
-    """Two networks: the values of this table [state, action], and larger ones."""
+    """Two networks whose smaller values are those of this table [state, action]; neither is the smaller everywhere."""
 
     def critic(table):
         return lambda inputs: table[inputs[0].astype(int), choice(jnp.arctanh(inputs[1]))][None]
 
-    return critic(q), critic(q + SECOND_CRITIC)
+    return critic(q + np.maximum(GAP, 0.0)), critic(q + np.maximum(-GAP, 0.0))
 
 
 def expected_loss(algorithm, log_policy, log_reference, q):

@@ -17,6 +17,7 @@ def references(choice, keeps_earlier, updates=8, period=3, rate=0.5):
         renews = jnp.asarray(k % period == 0)
         used: Any = references_before(choice, kept, earlier if keeps_earlier else None, actor, renews)
         found.append((float(used.actor), float(used.critic)))
+        assert used.valued is (used.actor if keeps_earlier else actor)
         kept, earlier = reference_after(choice, used.actor, actor, rate), used.critic
     return found
 
@@ -49,5 +50,5 @@ def test_the_critic_has_the_reference_that_the_actor_s_replaced(choice, expected
 def test_without_a_reference_none_is_kept():
     actor: Any = jnp.ones(())
     used = references_before("average", None, None, actor, jnp.asarray(True))
-    assert used == (None, None)
+    assert used == (None, None, actor)
     assert reference_after("average", used.actor, actor, 0.5) is None
