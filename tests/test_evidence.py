@@ -1,8 +1,9 @@
-"""The statistics of the protocol, by hand, from results as `csac study run --results` collects them."""
+"""The statistics and the choices of the protocol, by hand, from results as `csac study run --results` collects them."""
 
 from __future__ import annotations
 
 import runpy
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,11 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made import MadeRecords
 
+from csac.record.rendering import Row, Table
 from csac.studies.arms import Arm
-from csac.studies.study import Method, Study
+from csac.studies.cells import Cell
+from csac.studies.study import Method, Study, read_study
+from csac.types import InputError
 
-EVIDENCE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "results" / "reference" / "evidence.py")))
+FOLDER = Path(__file__).parents[1] / "results" / "reference"
+EVIDENCE = SimpleNamespace(**runpy.run_path(str(FOLDER / "evidence.py")))
 STUDY = Study("s", "S", ("Hopper-v4",), (Method("SAC, 0.2", "sac", "paper"), Method("CSAC", "csac")), steps=50)
 
 
@@ -24,17 +30,24 @@ def rows(curves: Mapping[int, Sequence[float]]) -> np.ndarray:
     return np.array(told, [("seed", int), ("step", int), ("return", float)])
 
 
-def arm(method: Method, curves: Mapping[int, Sequence[float]], failed: tuple[int, ...] = (), condition=()) -> Arm:
+def arm(
+    method: Method,
+    curves: Mapping[int, Sequence[float]],
+    failed: tuple[int, ...] = (),
+    condition: tuple[str, ...] = (),
+    task: str = "Hopper-v4",
+) -> Arm:
     manifests: list[Any] = [SimpleNamespace(seeds=[seed]) for seed in curves]
     evaluations = [rows({seed: curve}) for seed, curve in curves.items()]
-    return Arm(
-        method.label,
-        "Hopper-v4",
-        condition,
-        manifests=manifests,
-        evaluations=evaluations,
-        failures=dict.fromkeys(failed, "NaN"),
-    )
+    failures = dict.fromkeys(failed, "NaN")
+    return Arm(method.label, task, condition, manifests=manifests, evaluations=evaluations, failures=failures)
+
+
+def cells_of_row(table: Table, *labels: str) -> Sequence[Any]:
+    def texts(row: Row) -> list[str]:
+        return [cell.text.strip("*") for cell in row.cells[: len(labels)]]
+
+    return next(row.cells for row in table.rows if texts(row) == list(labels))
 
 
 def test_the_final_return_is_the_mean_of_the_last_fifth():
@@ -49,16 +62,19 @@ def test_only_seeds_that_every_method_has_count_and_a_failed_one_has_nothing():
         arm(sac, {0: [1, 5, 2, 2, 2], 1: [1, 2, 3, 4, 4], 2: [9] * 5}),
         arm(csac, {0: [1, 2, 3, 4, 5]}, failed=(1,)),
     ]
-    found = EVIDENCE.measured(STUDY, arms)["Hopper-v4"]
-    np.testing.assert_array_equal(found["SAC, 0.2"].final, [2, 4])
-    np.testing.assert_array_equal(found["CSAC"].final, [5, 0])
-    np.testing.assert_array_equal(found["SAC, 0.2"].drawdown, [3, 0])
-    np.testing.assert_array_equal(found["CSAC"].drawdown, [0, np.inf])
+    found = EVIDENCE.measured(STUDY, arms)
+    sac_here, csac_here = found["Hopper-v4"]["SAC, 0.2"], found["Hopper-v4"]["CSAC"]
+    np.testing.assert_array_equal(sac_here.final, [2, 4])
+    np.testing.assert_array_equal(csac_here.final, [5, 0])
+    np.testing.assert_array_equal(sac_here.drawdown, [3, 0])
+    np.testing.assert_array_equal(csac_here.drawdown, [0, np.inf])
     # Scaled by SAC's mean of 3; pairs (5, 2), (5, 4) are won and (0, 2), (0, 4) lost.
-    np.testing.assert_allclose(EVIDENCE.scaled({"Hopper-v4": found})["CSAC"], [[5 / 3], [0]])
-    table = EVIDENCE.overall_table(STUDY, {"Hopper-v4": found})
-    assert [cell.value for cell in table.rows[1].cells[1:5]] == pytest.approx([5 / 6, 5 / 6, 0.0, 0.5])
-    assert table.rows[1].cells[5].value == pytest.approx((1.0 + 0.5 + 0.0 + 0.0) / 4)  # falls 0 and ∞ against 3 and 0
+    np.testing.assert_allclose(EVIDENCE.scaled(found, [0, 1])["CSAC"], [[5 / 3], [0]])
+    overall = EVIDENCE.overall_table(STUDY, found)
+    assert [cell.value for cell in cells_of_row(overall, "CSAC")[1:]] == pytest.approx([5 / 6, 5 / 6, 0.0])
+    compared = cells_of_row(EVIDENCE.comparison_table(STUDY, found), "CSAC", "SAC, 0.2")
+    assert (compared[2].value, compared[3].text) == (0.5, "no verdict")
+    assert compared[4].value == pytest.approx((1.0 + 0.5 + 0.0 + 0.0) / 4)  # falls 0 and ∞ against 3 and 0
 
 
 def test_recovery_is_the_area_lost_as_a_share_of_the_return_before():
@@ -68,8 +84,127 @@ def test_recovery_is_the_area_lost_as_a_share_of_the_return_before():
     assert measured.area_lost.tolist() == [5.0]
 
 
-def test_intervals_appear_from_five_seeds_on():
+def test_what_is_over_all_tasks_is_over_the_seeds_that_all_tasks_have():
     sac, csac = STUDY.methods
-    arms = [arm(sac, {seed: [1.0 + seed] * 5 for seed in range(5)}), arm(csac, {seed: [9.0] * 5 for seed in range(5)})]
-    found = EVIDENCE.measured(STUDY, arms)
-    assert EVIDENCE.overall_table(STUDY, found).rows[1].cells[4].text == "1.00 (1.00 to 1.00)"
+    study = Study("s", "S", ("Hopper-v4", "Ant-v4"), STUDY.methods, steps=50, seeds=6)
+    arms = [
+        arm(sac, {seed: [2.0] * 5 for seed in range(6)}),
+        arm(csac, {**{seed: [3.0] * 5 for seed in range(5)}, 5: [99.0] * 5}),
+        arm(sac, {seed: [1.0] * 5 for seed in range(5)}, task="Ant-v4"),
+        arm(csac, {seed: [0.5] * 5 for seed in range(5)}, task="Ant-v4"),
+    ]
+    found = EVIDENCE.measured(study, arms)
+    assert EVIDENCE.common_seeds(study, found) == [0, 1, 2, 3, 4]
+    overall = cells_of_row(EVIDENCE.overall_table(study, found), "CSAC")
+    assert overall[1].value == pytest.approx((1.5 + 0.5) / 2)  # without seed 5 and its 99
+    compared = cells_of_row(EVIDENCE.comparison_table(study, found), "CSAC", "SAC, 0.2")
+    assert compared[2].text == "0.50 (0.50 to 0.50)"
+    assert compared[3].text == "not told apart"
+    assert [cell.text for cell in compared[-2:]] == ["1.00 (1.00 to 1.00)", "0.00 (0.00 to 0.00)"]
+    assert EVIDENCE.common_seeds(study, {"Hopper-v4": found["Hopper-v4"]}) == []  # a task has nothing
+
+
+def test_the_tables_say_which_seeds_are_missing_and_left_out():
+    methods = (Method("SAC, 0.2", "sac", "paper"), Method("CSAC", "csac"))
+    study = Study("s", "S", ("Hopper-v4", "Ant-v4"), methods, steps=1_000, seeds=2, evaluation_interval=100)
+    source = MadeRecords(lambda cell, step: None if (cell.task, cell.seed) == ("Ant-v4", 1) else 1.0)
+    told = EVIDENCE.told(study, source)
+    assert "- not run: CSAC on Ant-v4: seed 1\n" in told
+    assert "- left out of what is over all tasks: Hopper-v4, seed 1, which another task lacks\n" in told
+    assert "S: comparisons, seeds 0" in told
+
+
+def test_an_interval_on_one_side_of_one_half_is_a_verdict():
+    assert [EVIDENCE.verdict(one) for one in (None, (0.51, 0.9), (0.1, 0.49), (0.5, 0.9), (0.1, 0.5))] == [
+        "no verdict",
+        "better",
+        "worse",
+        "not told apart",
+        "not told apart",
+    ]
+
+
+def test_a_form_is_judged_beside_what_is_the_same_without_relative_entropy():
+    bounded = Method("bounded, none", "csac", None, {"relative_entropy_weight": 0, "target_log_prob_bound": 5})
+    sac = Method("SAC, 0.2", "sac", "paper"), Method("SAC, automatic", "sac")
+    forms = {
+        "SAC, 0.2": {"reference_policy": "previous"},
+        "SAC, automatic": {"entropy_weight": "auto"},
+        "bounded, none": {"target_log_prob_bound": 5.0, "relative_entropy_form": "implicit"},
+        None: {"target_log_prob_bound": 4.0},
+    }
+    study = Study("s", "S", ("Hopper-v4",), (*sac, bounded))
+    found = [EVIDENCE.counterpart(study, Method("CSAC", "csac", None, one)) for one in forms.values()]
+    assert [one and one.label for one in found] == list(forms)
+
+
+def test_close_scores_are_ranked_by_the_worst_seed():
+    values = {
+        "highest": np.array([[1.0, 0.0], [1.0, 2.0]]),
+        "close and steady": np.array([[0.9, 0.99], [1.0, 1.09]]),
+        "close to the second": np.array([[0.988, 0.988], [0.988, 0.988]]),
+        "far": np.full((2, 2), 0.97),
+    }
+    # 1, 0.995, 0.988, 0.97: the steady one wins of the first two; then the first alone, for 0.988 is 0.012 away.
+    assert EVIDENCE.ranked(values) == ["close and steady", "highest", "close to the second", "far"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for path in FOLDER.glob("*.toml"):
+        shutil.copy(path, tmp_path)
+    return tmp_path
+
+
+def returns(cell: Cell, step: int) -> float:
+    """CSAC with an average comes first, then a period of 100; less weight is better, and so is a bound."""
+    told = cell.hyperparameters
+    if cell.algorithm == "sac" or told["reference_policy"] == "algorithm1":
+        return 100.0 if cell.algorithm == "sac" else 900.0
+    value = {"average": 300.0 - told["reference_rate"], "periodic": 250.0 - told["reference_period"] / 100}
+    weight = told["relative_entropy_weight"]
+    gain = 10 * (weight == 0.05) + 70 * (told["target_log_prob_bound"] > 0) - 20 * (told["entropy_weight"] == "auto")
+    return value.get(told["reference_policy"], 200.0) + gain - 5 * (told["relative_entropy_form"] == "implicit")
+
+
+def test_each_stage_is_written_from_the_results_of_those_before(folder):
+    source = MadeRecords(returns)
+    EVIDENCE.write("weights", folder, source)
+    labels = [method.label for method in read_study(folder / "weights.toml").methods]
+    form = "CSAC, average 0.005, tau 0.05"
+    assert labels[1:3] == [form, "CSAC, average 0.005, tau 5"]
+    assert labels[3:] == ["CSAC, average 0.05, tau 0.05", "CSAC, average 0.05, tau 5"]
+
+    EVIDENCE.write("options", folder, source)
+    written = {one.label: one.hyperparameters_on("Hopper-v4") for one in read_study(folder / "options.toml").methods}
+    assert list(written)[3:5] == [form, f"{form}, entropy weight automatic"]
+    assert written[form]["relative_entropy_weight"] == 0.05
+    implicit = written[f"{form}, implicit, log-densities bounded"]
+    assert (implicit["relative_entropy_form"], implicit["reference_rate"]) == ("implicit", 0.005)
+    two = written["CSAC, periodic 1000, two references"]
+    assert (two["critic_reference"], two["relative_entropy_weight"]) == ("earlier", 0.5)
+
+    # The two that are bounded are the best; what they are judged beside comes with them; a second time changes nothing.
+    for _ in range(2):
+        EVIDENCE.write("chosen", folder, source)
+    chosen = [
+        f"{form}, log-densities bounded",
+        f"{form}, implicit, log-densities bounded",
+        "CSAC, no relative entropy, log-densities bounded",
+    ]
+    fixed = ["SAC, 0.2", "SAC, automatic", "CSAC, paper", "CSAC, periodic 1000"]
+    for name, first in (("confirm", fixed), ("ant", fixed), ("recovery", fixed[:1])):
+        study = read_study(folder / f"{name}.toml")
+        assert [method.label for method in study.methods] == [*first, *chosen]
+    assert EVIDENCE.counterpart(study, study.methods[1]).label == chosen[2]
+
+
+def test_nothing_is_chosen_before_every_cell_has_run(folder):
+    source = MadeRecords(lambda cell, step: None if cell.seed == 2 else returns(cell, step))
+    with pytest.raises(InputError, match=r"SAC, 0.2 on Hopper-v4, seed 2, has not run: run it first"):
+        EVIDENCE.write("weights", folder, source)
+
+
+def test_where_nothing_differs_few_are_told_apart():
+    shares = EVIDENCE.false_verdicts(tasks=1, seeds=4, trials=3)  # four seeds have no interval
+    assert shares == (0.0, 0.0, 0.0)

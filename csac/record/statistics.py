@@ -105,9 +105,9 @@ def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
     An equal pair counts half; NaNs are left out, NaN where a task has no pair. One task may be given as [seed].
     Agarwal et al. 2021, there P(X > Y).
     """
-    scores, others = (np.asarray(array, dtype=np.float64) for array in (scores, others))
-    difference = scores[:, None] - others[None, :]  # [seed, other seed, ...]
-    above = np.where(np.isnan(difference), np.nan, (np.sign(difference) + 1) / 2)
+    scores = np.asarray(scores, dtype=np.float64)[:, None]  # [seed, other seed, ...]
+    others = np.asarray(others, dtype=np.float64)[None, :]
+    above = np.where(np.isnan(scores) | np.isnan(others), np.nan, (scores > others) + 0.5 * (scores == others))
     pairs = (~np.isnan(above)).sum(axis=(0, 1))
     return float(np.mean(_divide(np.nansum(above, axis=(0, 1)), pairs)))
 

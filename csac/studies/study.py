@@ -34,11 +34,13 @@ class Method:
     preset: str | None = None
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
     published: str | None = None
+    common: Mapping[str, Any] = field(default_factory=dict)
+    """What it has in common with the others of its algorithm, where neither it nor its preset says otherwise."""
 
     def hyperparameters_on(self, task: str) -> dict[str, Any]:
         """Return every hyperparameter on this task. Raises InputError for one that there is not."""
         preset = preset_of(self.preset, self.algorithm, task) if self.preset else {}
-        return complete(self.algorithm, {**preset, **self.hyperparameters})
+        return complete(self.algorithm, {**self.common, **preset, **self.hyperparameters})
 
 
 class Entry(NamedTuple):
@@ -189,6 +191,10 @@ def _study(name: str, told: dict[str, Any]) -> Study:
     if missing:
         raise InputError(f"{' and '.join(missing)} missing: a study names its tasks and its methods")
     values = {key: _KEYS[key](key, value) for key, value in told.items()}
+    common = values.pop("common", {})
+    for algorithm, hyperparameters in common.items():
+        complete(algorithm, hyperparameters)
+    values["methods"] = tuple(replace(one, common=common.get(one.algorithm, {})) for one in values["methods"])
     for key in ("seeds", "steps", "evaluation_interval", "evaluation_episodes"):
         if key in values and values[key] < 1:
             raise InputError(f"{key} must be at least 1, not {values[key]}")
@@ -272,6 +278,11 @@ def _conditions(key: str, value: Any) -> tuple[tuple[str, ...], ...]:
     return tuple(_texts(key, item) for item in value)
 
 
+def _common(key: str, value: Any) -> dict[str, dict[str, Any]]:
+    tables = _of(dict, "a table of algorithms")(key, value)
+    return {name: _of(dict, "a table of hyperparameters")(f"{key}.{name}", given) for name, given in tables.items()}
+
+
 def _steps_on(key: str, value: Any) -> dict[str, int]:
     table = _of(dict, "a table of tasks and steps")(key, value)
     return {task: _of(int, "a whole number of steps")(f"{key}.{task}", steps) for task, steps in table.items()}
@@ -281,6 +292,7 @@ _KEYS: Mapping[str, Callable[[str, Any], Any]] = {
     "title": _of(str, "a text"),
     "tasks": _texts,
     "methods": _methods,
+    "common": _common,
     "seeds": _of(int, "a whole number"),
     "first_seed": _of(int, "a whole number"),
     "steps": _of(int, "a whole number"),

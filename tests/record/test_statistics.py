@@ -152,6 +152,7 @@ def test_the_probability_of_improvement_worked_by_hand():
     assert probability_of_improvement(x, x) == 0.5
     assert probability_of_improvement(x, np.array([4.0, np.nan])) == 0.5  # of 3 < 4 and 5 > 4
     assert np.isnan(probability_of_improvement(x, np.array([np.nan])))
+    assert probability_of_improvement(np.array([-np.inf, 1.0]), np.array([-np.inf])) == 0.75  # two failures are equal
 
 
 def test_tasks_weigh_the_same_in_the_probability_of_improvement():

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from studying import TINY, write
 
+from csac.studies.cells import complete
 from csac.studies.named import NAMED, WHOLE, find
 from csac.studies.study import Method, Study, cells_of, read_study
 from csac.types import InputError
@@ -139,6 +140,23 @@ def test_a_sweep_is_a_method_for_each_combination(tmp_path):
     assert len({one.key for one in cells_of([study])}) == 4 * 2
 
 
+def test_what_methods_have_in_common_gives_way_to_presets_and_to_their_own(tmp_path):
+    text = """
+        tasks = ["Hopper-v4"]
+        common.csac = { relative_entropy_weight = 7, entropy_weight = 3, reference_rate = 1, critic_learning_rate = 1 }
+        [[methods]]
+        algorithm = "csac"
+        preset = "paper"
+        hyperparameters = { entropy_weight = 2 }
+        [[methods]]
+        algorithm = "sac"
+    """
+    csac, sac = read_study(write(tmp_path / "mine.toml", text)).methods
+    told = csac.hyperparameters_on("Hopper-v4")
+    assert (told["entropy_weight"], told["relative_entropy_weight"], told["reference_rate"]) == (2.0, 0.5, 1.0)
+    assert sac.hyperparameters_on("Hopper-v4")["critic_learning_rate"] == 3e-4
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -147,6 +165,8 @@ def test_a_sweep_is_a_method_for_each_combination(tmp_path):
         (('algorithm = "sac"', ""), "a method needs an algorithm"),
         (('algorithm = "sac"', 'algorithm = "scc"'), "no algorithm is called 'scc'; did you mean sac?"),
         (("batch_size = 8", "bach_size = 8"), "sac has no hyperparameter 'bach_size'; did you mean batch_size?"),
+        (("seeds = 2", "common.sac.bach_size = 8"), "sac has no hyperparameter 'bach_size'; did you mean batch_size?"),
+        (("seeds = 2", "common.sac = 8"), "common.sac is a table of hyperparameters, not 8"),
         (("seeds = 2", 'seeds = "two"'), "seeds is a whole number, not 'two'"),
         (("seeds = 2", "seeds = 0"), "seeds must be at least 1, not 0"),
         (("seeds = 2", "first_seed = -1"), "first_seed must be 0 or more, not -1"),
@@ -186,14 +206,27 @@ def test_the_screen_is_the_named_study_in_short():
     assert [method.label for method in screen.methods] == [method.label for method in named.methods]
 
 
-@pytest.mark.parametrize("path", sorted(EVIDENCE.glob("*.toml")), ids=lambda path: path.stem)
-def test_every_study_of_the_protocol_is_understood(path):
-    study = read_study(path)
+PROTOCOLS = [*sorted(EVIDENCE.glob("*.toml")), *sorted((EVIDENCE.parent / "strong").glob("*.toml"))]
+FRESH = {"confirm", "ant", "recovery", "aims"}
+
+
+@pytest.mark.parametrize("path", PROTOCOLS, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_every_study_of_the_protocols_is_understood(path):
+    study, is_reference = read_study(path), path.parent == EVIDENCE
     first = study.methods[0].hyperparameters_on(study.tasks[0])
-    assert (study.methods[0].algorithm, first["temperature"], first["entropy_weight"]) == ("sac", "fixed", 0.2)
+    scale = ("fixed", 0.2) if is_reference else ("automatic", 1.0)
+    assert (study.methods[0].algorithm, first["temperature"], first["entropy_weight"]) == ("sac", *scale)
     assert (study.evaluation_interval, study.evaluation_episodes) == (5_000, 10)
-    fresh = {"confirm", "ant", "recovery"}
-    assert {one.seed for one in cells_of([study])} == (set(range(100, 105)) if path.stem in fresh else {0, 1, 2})
+    fresh = set(range(100, 105)) if is_reference else set(range(200, 205))
+    assert {one.seed for one in cells_of([study])} == (fresh if path.stem in FRESH else {0, 1, 2})
+
+
+@pytest.mark.parametrize("path", PROTOCOLS, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_no_default_decides_what_an_arm_of_the_protocols_is(path):
+    for method in read_study(path).methods:
+        # None, which TOML has not, is minus the number of action dimensions.
+        named = {**method.common, **method.hyperparameters, "target_entropy": None}
+        assert named.keys() == complete(method.algorithm, {}).keys()
 
 
 def test_a_file_that_there_is_not(tmp_path):
