@@ -40,7 +40,7 @@ train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=2 S
 	$(VENV)/bin/csac train $(TASK) --algorithm $(ALGORITHM) --seeds $(SEEDS) --steps $(STEPS) $(ARGS)
 
 test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
-	$(VENV)/bin/pytest --numprocesses logical --dist loadfile -m 'not slow' $(ARGS)
+	$(VENV)/bin/pytest --numprocesses logical --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 
 slow: $(SETUP)  ## Run the tests that need longer: processes that are killed, clusters, browsers
 	$(VENV)/bin/pytest -m slow $(ARGS)

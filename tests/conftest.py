@@ -1,7 +1,10 @@
 """Before anything imports JAX: small processes, and a broadcast that raises the rank is an error."""
 
 import os
+import signal
 import tempfile
+
+import pytest
 
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 os.environ["JAX_PLATFORMS"] = "cpu"
@@ -14,3 +17,15 @@ _KEPT = tempfile.TemporaryDirectory()
 os.environ["XDG_STATE_HOME"] = _KEPT.name
 if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["XDG_CACHE_HOME"] = _KEPT.name
+
+# A shell has its background jobs ignore Ctrl-C, and what they start inherits that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+LONGEST = ("training", "tasks")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the rooms that take longest first: else one process is left with them alone at the end."""
+    items.sort(
+        key=lambda item: LONGEST.index(item.path.parent.name) if item.path.parent.name in LONGEST else len(LONGEST)
+    )

@@ -48,6 +48,19 @@ def test_the_commands_of_a_page_write_its_tables(copied, page):
     assert there.read_text() == page.read_text()
 
 
+STUDIED = sorted((ROOT / "results" / "studies").glob("*/report.md"))
+
+
+@pytest.mark.parametrize("page", STUDIED, ids=lambda page: page.parent.name)
+def test_the_command_of_a_study_s_report_writes_it(copied, page):
+    (line,) = re.findall(r"^csac (study report .*)$", page.read_text(), re.MULTILINE)
+    there = copied / page.parent.relative_to(ROOT)
+    shutil.rmtree(there)
+    assert main(shlex.split(line)) == 0
+    assert (there / "report.md").read_text() == page.read_text()
+    assert {path.name for path in there.glob("*.svg")} == {path.name for path in page.parent.glob("*.svg")}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
 def test_no_table_of_numbers_is_written_by_hand(page):
     """What stands between markers is written by a command; any other table may only list files and commands."""

@@ -315,12 +315,9 @@ def report(options: Report) -> int:
     folder = options.out or options.results or Path("runs/studies/reports", f"{Path(options.name).stem}{scale}")
     chosen = options.words()
     results = [] if options.results is None else ["--results", str(options.results)]
-    path = write_report(
-        studies,
-        source,
-        folder,
-        [shlex.join(["csac", "study", command, *chosen, *results]) for command in ("run", "report")],
-    )
+    place = [] if options.out is None else ["--out", str(options.out)]
+    run, report = (["csac", "study", command, *chosen, *results] for command in ("run", "report"))
+    path = write_report(studies, source, folder, [shlex.join(run), shlex.join([*report, *place])])
     _say(console, f"{path}\n{path.with_suffix('.md')}")
     if not any(source.record(cell) for cell in cells_of(studies)):
         _say(console, f"note: no cell is over yet in {options.results or options.directory}, so there is little in it")

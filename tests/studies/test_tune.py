@@ -407,6 +407,7 @@ def test_the_page_shows_the_search_space_as_it_is(name):
 # The command.
 
 
+@pytest.mark.slow
 def test_a_search_whose_best_line_trains(capsys):
     assert csac(f"{LINE} --trials 2 --directory out") == 0
     shown = capsys.readouterr().out

@@ -64,6 +64,7 @@ def kept(home: Path) -> list[Path]:
     return sorted(home.rglob("*-cache"))
 
 
+@pytest.mark.slow
 def test_programs_are_kept_and_change_no_bit(tmp_path):
     without = learnt(tmp_path / "none", JAX_ENABLE_COMPILATION_CACHE="0")
     assert not (tmp_path / "none").exists()
@@ -152,6 +153,7 @@ def test_the_users_own_choice_comes_first_and_workers_hear_of_it(tmp_path, choic
     assert not (tmp_path / "csac").exists()
 
 
+@pytest.mark.slow
 def test_the_programs_of_one_worker_serve_the_others(tmp_path, choices):
     algorithm = CSAC(batch_size=8, warmup_steps=50, **TINY)
     settings: dict[str, Any] = {"steps": 100, "evaluation_episodes": 1, "checkpoint_interval": 0, "tensorboard": False}
