@@ -45,7 +45,7 @@ NAVIGATION = {
         "docs/reliability",
     ],
     "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")],
-    "Measured": ["docs/performance", "docs/gpu", "benchmarks/README", "results/*/*", "results/parity/*/README"],
+    "Measured": ["docs/performance", "docs/gpu", "benchmarks/README", "results/*/*", "results/*/*/*"],
     "Inside": ["docs/design", "docs/adding-an-algorithm", "CONTRIBUTING", "docs/reference/csac", "CHANGELOG"],
 }
 

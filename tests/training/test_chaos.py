@@ -123,7 +123,7 @@ def plant_what_a_torn_write_leaves(run: Path) -> None:
     (folder / "replay" / ".seed_0.300-600.safetensors.4711").write_bytes(b"\0" * 100)
     shutil.copy(folder / "step_300.seed_0.safetensors", folder / "step_600.seed_0.safetensors")
     (run / ".manifest.json.4711").write_bytes(b"{")
-    (run / "policy" / "seed_0.safetensors.tmp").write_bytes(b"\0")
+    (run / "policy" / ".seed_0.safetensors.4711").write_bytes(b"\0")
     with open(run / "episodes.csv", "a") as table:
         table.write("0,3")
 

@@ -131,6 +131,8 @@ def test_a_crashed_run_goes_on_and_leaves_the_same_files(tmp_path, uninterrupted
     with pytest.raises(Crash):
         run(tmp_path / "run", on_evaluation=crash_at(300))
     assert len(contents(tmp_path / "run")["evaluations.csv"]) > 0
+    for torn in (".manifest.json.4711", "policy/.seed_0.best.safetensors.4711"):  # without their names yet
+        (tmp_path / "run" / torn).write_bytes(b"{")
     finished = resume(tmp_path / "run")
     assert contents(tmp_path / "run") == uninterrupted
     assert finished.manifest.state == "finished"
