@@ -45,7 +45,14 @@ NAVIGATION = {
         "docs/reliability",
     ],
     "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")],
-    "Measured": ["docs/performance", "docs/gpu", "benchmarks/README", "results/*/*", "results/*/*/*"],
+    "Measured": [
+        "docs/performance",
+        "docs/gpu",
+        "benchmarks/README",
+        "results/*/*",
+        "results/parity/*/README",
+        "results/studies/*/report",
+    ],
     "Inside": ["docs/design", "docs/adding-an-algorithm", "CONTRIBUTING", "docs/reference/csac", "CHANGELOG"],
 }
 
