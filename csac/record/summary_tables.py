@@ -170,7 +170,7 @@ def plus_minus(over: OverSeeds) -> Cell:
 def interval(over: OverSeeds) -> Cell:
     """Return the interval of a mean, or that there are too few seeds for one."""
     if over.seeds < FEWEST_FOR_INTERVAL:
-        return Cell(f"{over.seeds} seed{'s' * (over.seeds != 1)}: no interval", math.nan)
+        return Cell(no_interval(over.seeds), math.nan)
     form = _form(over.mean)
     return Cell(f"{over.low:{form}} to {over.high:{form}}", over.mean)
 
@@ -185,7 +185,12 @@ def interval_rows(over: Sequence[OverSeeds], largest: float, blank: int) -> list
 
 def few_seeds(count: int) -> str:
     """Return what a table says where seeds are too few for an interval, nothing where there is but one."""
-    return f"{count} seeds: no interval" if 1 < count < FEWEST_FOR_INTERVAL else ""
+    return no_interval(count) if 1 < count < FEWEST_FOR_INTERVAL else ""
+
+
+def no_interval(seeds: int) -> str:
+    """Return what stands in an interval's place where these seeds are too few for one."""
+    return f"{seeds} seed{'s' * (seeds != 1)}: no interval"
 
 
 def _summary(label: str, *cells: Cell) -> Row:

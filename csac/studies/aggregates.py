@@ -21,6 +21,7 @@ from csac.record.statistics import (
     profile_interval,
     stratified_bootstrap_interval,
 )
+from csac.record.summary_tables import no_interval
 from csac.studies import paper
 from csac.studies.parts import Heading, Paragraph
 from csac.studies.profiles import Profile, Profiles
@@ -125,7 +126,7 @@ def means_table(shares: Mapping[str, np.ndarray], title: str) -> Table:
     rows = []
     for label, own in shares.items():
         middle, bounds = interquartile_mean(own), stratified_bootstrap_interval(own, interquartile_mean)
-        between = Cell(f"{bounds[0]:.3f} to {bounds[1]:.3f}", middle) if bounds else Cell(_few(len(own)), np.nan)
+        between = Cell(f"{bounds[0]:.3f} to {bounds[1]:.3f}", middle) if bounds else Cell(no_interval(len(own)), np.nan)
         rows.append(Row((Cell(label), Cell(f"{middle:.3f}", middle), between, Cell(str(own.size), own.size))))
     headings = ("method", f"IQM, {_SHARES}", "95 % bootstrap interval", "runs")
     return Table(headings, tuple(rows), title)
@@ -142,7 +143,7 @@ def improvements_table(shares: Mapping[str, np.ndarray], baselines: Sequence[str
         if [label] != others
     ]
     seeds = len(next(iter(shares.values())))
-    note = "" if seeds >= FEWEST_FOR_BOOTSTRAP else _few(seeds)
+    note = "" if seeds >= FEWEST_FOR_BOOTSTRAP else no_interval(seeds)
     told = "Probability of improvement: that a seed scores higher, 95 % bootstrap interval"
     return Table(("method", *(f"above {label}" for label in others)), tuple(rows), told, note)
 
@@ -233,10 +234,6 @@ def _wanted(arm: Arm) -> set[int]:
 def _improvement(own: np.ndarray, others: np.ndarray) -> Cell:
     probability, bounds = probability_of_improvement(own, others), improvement_interval(own, others)
     return Cell(f"{probability:.2f}" + (f" ({bounds[0]:.2f} to {bounds[1]:.2f})" if bounds else ""), probability)
-
-
-def _few(seeds: int) -> str:
-    return f"{seeds} seed{'s' * (seeds > 1)}: no interval"
 
 
 def _with_intersections(sets: Iterable[frozenset[_Item]]) -> list[frozenset[_Item]]:

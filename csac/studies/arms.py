@@ -109,6 +109,11 @@ def by_condition(arms: Sequence[Arm]) -> dict[tuple[str, tuple[str, ...]], list[
     return groups
 
 
+def variant_of(label: str) -> str:
+    """Return what stands before the first comma of a label: the method, without what was swept."""
+    return label.partition(", ")[0]
+
+
 def tasks_of(arms: Sequence[Arm]) -> dict[str, list[Arm]]:
     """Return the arms of each task."""
     return {task: [arm for arm in arms if arm.task == task] for task in dict.fromkeys(arm.task for arm in arms)}

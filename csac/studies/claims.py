@@ -16,8 +16,9 @@ from csac.record.statistics import (
     probability_of_improvement,
 )
 from csac.record.summaries import cases
+from csac.record.summary_tables import no_interval
 from csac.studies import paper
-from csac.studies.arms import tasks_of, with_rows
+from csac.studies.arms import tasks_of, variant_of, with_rows
 from csac.tasks.perturbations import by_step, perturbations_of
 
 if TYPE_CHECKING:
@@ -65,8 +66,7 @@ def decide(comparison: Comparison) -> Decision:
     probability, bounds = probability_of_improvement(ours, others), improvement_interval(ours, others)
     told = f"better in {probability:.0%} of the pairs of seeds"
     if bounds is None:
-        few = f"{fewest} seed{'s' * (fewest > 1)}: no interval below {FEWEST_FOR_BOOTSTRAP}"
-        return Decision(claim, "not yet decidable", f"{told}; {few}")
+        return Decision(claim, "not yet decidable", f"{told}; {no_interval(fewest)} below {FEWEST_FOR_BOOTSTRAP}")
     low, high = bounds
     verdict: Verdict = "reproduced" if low > EVEN else "not reproduced" if high < EVEN else "not yet decidable"
     told += f", 95 % interval {low:.0%} to {high:.0%}"
@@ -77,9 +77,13 @@ def decide(comparison: Comparison) -> Decision:
 
 
 def comparisons(study: Study, arms: Sequence[Arm]) -> list[Comparison]:
-    """Return what the paper claims of a study, held against each variant of CSAC that was run."""
-    kinds = () if study.name == "reference" else study.analyses
-    return [comparison for kind in kinds if kind in _KINDS for comparison in _KINDS[kind](arms)]
+    """Return what the paper claims of a study, held against each variant of CSAC that was run.
+
+    Of perturbed tasks the paper claims robustness alone.
+    """
+    kinds = () if study.name == "reference" else [kind for kind in study.analyses if kind in _KINDS]
+    plain = [arm for arm in arms if not arm.condition]
+    return [one for kind in kinds for one in _KINDS[kind](arms if kind == "robustness" else plain)]
 
 
 def lower_boundary(arms: Sequence[Arm]) -> float:
@@ -122,7 +126,7 @@ def _weights(arms: Sequence[Arm]) -> Iterator[Comparison]:
     values = [(arm, arm.hyperparameters["relative_entropy_weight"]) for arm in arms]
     for best in (arm for arm, value in values if value == paper.BEST_TAU):
         for other, value in values:
-            if _variant(other) == _variant(best) and value != paper.BEST_TAU:
+            if variant_of(other.label) == variant_of(best.label) and value != paper.BEST_TAU:
                 yield _better(
                     f"tau {paper.BEST_TAU:g}: a higher maximum average return than {value:g}", best, other, _best
                 )
@@ -186,7 +190,8 @@ def _better(claim: str, arm: Arm, other: Arm, value: Callable[[Arm], np.ndarray]
     ours, others = (value(one) if len(one.rows) else np.zeros(0) for one in (arm, other))
     steps = paper.STEPS.get(arm.task, np.inf)
     is_whole = all(manifest.steps >= steps for one in (arm, other) for manifest in one.manifests)
-    return Comparison(claim, ours, others, _variant(arm), is_whole)
+    in_time = all(change.step == paper.FRICTION_STEP for change in perturbations_of(arm.condition))
+    return Comparison(claim, ours, others, variant_of(arm.label), is_whole and in_time)
 
 
 def _best(arm: Arm) -> np.ndarray:
@@ -226,10 +231,6 @@ def _pairs(arms: Sequence[Arm]) -> Iterator[tuple[Arm, Arm]]:
     for arm in (arm for arm in arms if arm.algorithm == "csac"):
         for other in (other for other in arms if other.algorithm != "csac"):
             yield arm, other
-
-
-def _variant(arm: Arm) -> str:
-    return arm.label.partition(", ")[0]
 
 
 _KINDS: dict[str, Callable[[Sequence[Arm]], Iterator[Comparison]]] = {

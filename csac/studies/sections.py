@@ -21,7 +21,7 @@ from csac.record.summary_tables import (
     recovery_table,
 )
 from csac.studies import paper
-from csac.studies.arms import by_condition, tasks_of
+from csac.studies.arms import by_condition, tasks_of, variant_of
 from csac.studies.claims import interactions, lower_boundary
 from csac.studies.figures import (
     NOT_REACHED,
@@ -88,7 +88,7 @@ class Scope(NamedTuple):
 def report_looks(labels: Sequence[str], known: Mapping[str, Look] = NO_LOOKS) -> dict[str, Look]:
     """Return the looks of the labels of a report, of what stands before their first commas, and those known already."""
     looks = {**known, **looks_of(labels, known)}
-    return {**looks, **looks_of(map(_variant, labels), looks)}
+    return {**looks, **looks_of(map(variant_of, labels), looks)}
 
 
 def curves(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
@@ -302,12 +302,8 @@ def _variants(arms: Sequence[Arm]) -> dict[str, list[Arm]]:
     """Return the arms by what stands before the first comma of their labels."""
     groups: dict[str, list[Arm]] = {}
     for arm in arms:
-        groups.setdefault(_variant(arm.label), []).append(arm)
+        groups.setdefault(variant_of(arm.label), []).append(arm)
     return groups
-
-
-def _variant(label: str) -> str:
-    return label.partition(", ")[0]
 
 
 def _trends(arms: Sequence[Arm]) -> Iterator[tuple[str, Trend]]:

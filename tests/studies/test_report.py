@@ -154,6 +154,31 @@ def test_only_the_paper_s_friction_is_claimed(tmp_path):
     assert not claims_of(of_ones_own(tmp_path, analyses + '[[], ["friction=1.5@300000", "gravity=2@400000"]]'))
 
 
+def test_friction_that_changes_at_another_step_decides_nothing(tmp_path):
+    """The paper changes it at step 300,000; the seeds would decide, if the change did not come sooner."""
+    sooner, when = (
+        claims_of(
+            of_ones_own(
+                tmp_path, f'steps = 1_000_000\nanalyses = ["robustness"]\nconditions = [[], ["friction=1.5@{step}"]]'
+            )
+        )
+        for step in (100_000, 300_000)
+    )
+    assert len(sooner) == len(when) > 0
+    assert set(sooner.values()) == {"not yet decidable"}
+    assert "reproduced" in when.values()
+
+
+def test_returns_are_claimed_of_tasks_that_nothing_perturbs(tmp_path):
+    study = 'steps = 1_000_000\nanalyses = ["returns", "efficiency"]\n'
+    plain, perturbed = (
+        claims_of(of_ones_own(tmp_path, f"{study}conditions = {conditions}"))
+        for conditions in ("[[]]", '[[], ["friction=1.5@300000"]]')
+    )
+    assert plain == perturbed
+    assert plain
+
+
 def test_a_study_of_one_s_own_with_every_analysis_has_a_report(tmp_path):
     conditions = '[[], ["friction=1.5@30000"]]'
     text = f"steps = 100_000\nseeds = 2\nrollouts = 2\nconditions = {conditions}\nanalyses = {list(ANALYSES)}"
