@@ -9,9 +9,11 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float
 
 from csac.algorithms.adaptation import LearntWeights, Weights, adapted, begin_weights, told, weights_now
 from csac.algorithms.critics import Critics, Normalisation, learn_critics, least_q_value, make_critics, make_targets
+from csac.algorithms.delay import begin_metrics, improve_delayed
 from csac.algorithms.distributions import action_at, bounded, kl, log_ratio, policy_at
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
@@ -35,6 +37,7 @@ class State(NamedTuple):
     learnt_weights: LearntWeights | None = None
     relative_entropy_per_refresh: Scalar | None = None  # what a τ that is learnt goes by; 0 before there is any
     observations: Statistics | None = None
+    actor_metrics: Metrics | None = None  # of an actor that waits: what it told when it last moved
 
 
 FIRST_WEIGHTS = Weights(1.0, 0.5)  # of those that adapt: SAC's first temperature, and the paper's τ
@@ -48,6 +51,10 @@ NOT_TOGETHER = (
     ({"relative_entropy_weight": ["auto"], "relative_entropy_form": ["implicit"]}, "there is no reference"),
     ({"critic_reference": ["earlier"], "relative_entropy_form": ["actor_only", "implicit"]}, "the target has none"),
     ({"critic_reference": ["earlier"], "reference_policy": ["previous", "average"]}, "no copy replaces another"),
+    (
+        {"critic_reference": ["earlier"], "reference_policy": ["algorithm1"], "policy_delay": range(2, 1_000_000)},
+        "an actor that waits would take its own place",
+    ),
 )
 
 
@@ -101,10 +108,14 @@ class CSAC:
     """Transitions that the replay keeps."""
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts (the paper's T_initial)."""
+    policy_delay: Annotated[int, COUNT] = 1
+    """Updates of the critics for each update of the actor and of weights that are learnt (TD3's d)."""
     updates_per_step: Annotated[int, COUNT] = 1
     """Updates for each environment step."""
     update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
+    adam_momentum: Annotated[float, DISCOUNT] = 0.9
+    """Share of its average gradient that Adam keeps at each update (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
@@ -176,7 +187,7 @@ class CSAC:
         return value, {"entropy": -log_prob, "relative_entropy": relative_entropy}
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
-        """Take one gradient step on the critics, then one on the actor, then move weights and target critics."""
+        """Take one gradient step on the critics, move their targets, then improve the actor against them."""
         observations, batch = normalise_batch(state.observations, batch)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         weights = weights_now((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
@@ -192,41 +203,58 @@ class CSAC:
             next_action=partial(action_at, references.valued),
         )
 
-        actor_loss = partial(self.actor_loss, reference=references.actor, critics=learnt.folded, weights=weights)
-        optimiser = self._optimiser(self.actor_learning_rate)
-        actor, actor_optimiser, actor_metrics = descend(
-            optimiser, actor_loss, state.actor, state.actor_optimiser, batch.observation, actor_noise
-        )
-        refreshed = self.per_refresh(state.relative_entropy_per_refresh, actor_metrics, step)
-
-        new_state = State(
-            actor=actor,
-            reference=reference_after(self.reference_policy, references.actor, state.actor, self.reference_rate),
+        state = state._replace(
+            reference=references.actor,
             critics=learnt.critics,
             target_critics=polyak(state.target_critics, learnt.critics, self.target_rate),
-            actor_optimiser=actor_optimiser,
             critic_optimiser=learnt.optimiser,
             earlier_reference=references.critic if self.critic_reference == "earlier" else None,
+            observations=observations,
+        )
+        given = (learnt.folded, batch.observation, actor_noise, step)
+        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
+        return state, {**learnt.metrics, **actor_metrics, **told(weights, state.learnt_weights)}
+
+    def improve(
+        self,
+        state: State,
+        critics: Critics,
+        observations: Float[Array, "batch observation"],
+        noise: Float[Array, "batch action"],
+        step: Count,
+    ) -> tuple[State, Metrics]:
+        """Return the state after one gradient step on the actor, with its reference and the weights that are learnt."""
+        weights = weights_now((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
+        actor_loss = partial(self.actor_loss, reference=state.reference, critics=critics, weights=weights)
+        optimiser = self._optimiser(self.actor_learning_rate)
+        actor, actor_optimiser, metrics = descend(
+            optimiser, actor_loss, state.actor, state.actor_optimiser, observations, noise
+        )
+        refreshed = self.per_refresh(state.relative_entropy_per_refresh, metrics, step)
+        new_state = state._replace(
+            actor=actor,
+            reference=reference_after(self.reference_policy, state.reference, state.actor, self.reference_rate),
+            actor_optimiser=actor_optimiser,
             learnt_weights=adapted(
                 state.learnt_weights,
-                self.slack(actor_metrics["entropy"], refreshed, batch.action.shape[-1]),
+                self.slack(metrics["entropy"], refreshed, noise.shape[-1]),
                 self._optimiser(self.weight_learning_rate),
             ),
             relative_entropy_per_refresh=refreshed,
-            observations=observations,
         )
-        refresh = {} if refreshed is None else {"relative_entropy_per_refresh": refreshed}
-        return new_state, {**learnt.metrics, **actor_metrics, **refresh, **told(weights, state.learnt_weights)}
+        return new_state, metrics if refreshed is None else {**metrics, "relative_entropy_per_refresh": refreshed}
 
     def per_refresh(self, last: Scalar | None, metrics: Metrics, step: Count) -> Scalar | None:
         """Return what the relative entropy came to just before the last renewal of the reference, in nats.
 
-        With `periodic` that is what the last update of a period measures, held until the next one's; the others renew
-        their reference, or move it on, at every update.
+        With `periodic` that is what the actor's last update of a period measures, held until the next one's; the others
+        renew their reference, or move it on, at every update.
         """
         if last is None:
             return None
-        is_last = self.reference_policy != "periodic" or (step + 1) % self.reference_period == 0
+        is_last = self.reference_policy != "periodic" or (
+            step % self.reference_period + self.policy_delay >= self.reference_period
+        )
         return jnp.where(is_last, metrics["relative_entropy"], last)
 
     def slack(self, entropy: Scalar, relative_entropy: Scalar | None, dimensions: int) -> Weights:
@@ -269,6 +297,7 @@ class CSAC:
             ),
             relative_entropy_per_refresh=jnp.zeros(()) if self.relative_entropy_weight == "auto" else None,
             observations=begin_statistics(spec.observation_size, self.normalise_observations),
+            actor_metrics=begin_metrics(self._actor_metrics(), self.policy_delay),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
@@ -281,5 +310,11 @@ class CSAC:
         normaliser = normaliser_of(state.observations)
         return PolicyNetwork(PolicyParameters((state.actor.layers,), normaliser=normaliser))
 
+    def _actor_metrics(self) -> tuple[str, ...]:
+        names = ("actor_loss", "entropy")
+        if self.relative_entropy_form != "implicit":
+            names += ("relative_entropy",)
+        return (*names, "relative_entropy_per_refresh") if self.relative_entropy_weight == "auto" else names
+
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
-        return make_optimiser(learning_rate, self.max_gradient_norm)
+        return make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)

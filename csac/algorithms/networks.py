@@ -78,10 +78,13 @@ def copy_tree(tree: Any) -> Any:
 
 
 def make_optimiser(
-    learning_rate: float | Scalar, max_gradient_norm: float = 0.0, epsilon: float = 1e-8
+    learning_rate: float | Scalar, max_gradient_norm: float = 0.0, *, epsilon: float = 1e-8, momentum: float = 0.9
 ) -> optax.GradientTransformation:
-    """Return Adam, after clipping by the global norm of the gradient where a positive bound is given."""
-    adam = optax.adam(learning_rate, eps=epsilon)
+    """Return Adam, after clipping by the global norm of the gradient where a positive bound is given.
+
+    `momentum` is Adam's β₁, the share of its average gradient that it keeps at each update.
+    """
+    adam = optax.adam(learning_rate, b1=momentum, eps=epsilon)
     if max_gradient_norm > 0:
         return optax.chain(optax.clip_by_global_norm(max_gradient_norm), adam)
     return adam

@@ -284,7 +284,7 @@ class PPO:
 
     def _optimiser(self, learning_rate: float | Scalar) -> optax.GradientTransformation:
         # As one vector: few buffers to hand over when acting, which takes longer than the networks do.
-        return optax.flatten(make_optimiser(learning_rate, self.max_gradient_norm, self.adam_epsilon))
+        return optax.flatten(make_optimiser(learning_rate, self.max_gradient_norm, epsilon=self.adam_epsilon))
 
 
 def policy_at(parameters: Parameters, observation: Observation) -> Gaussian:

@@ -9,8 +9,10 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float
 
 from csac.algorithms.critics import Critics, Normalisation, learn_critics, least_q_value, make_critics, make_targets
+from csac.algorithms.delay import begin_metrics, improve_delayed
 from csac.algorithms.distributions import action_at, policy_at
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
@@ -31,6 +33,7 @@ class State(NamedTuple):
     critic_optimiser: Any
     temperature_optimiser: Any
     observations: Statistics | None = None
+    actor_metrics: Metrics | None = None  # of an actor that waits: what it told when it last moved
 
 
 @dataclass(frozen=True)
@@ -67,10 +70,14 @@ class SAC:
     """Transitions that the replay keeps."""
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts."""
+    policy_delay: Annotated[int, COUNT] = 1
+    """Updates of the critics for each update of the actor and of weights that are learnt (TD3's d)."""
     updates_per_step: Annotated[int, COUNT] = 1
     """Updates for each environment step."""
     update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
+    adam_momentum: Annotated[float, DISCOUNT] = 0.9
+    """Share of its average gradient that Adam keeps at each update (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
@@ -107,7 +114,7 @@ class SAC:
         return log_temperature * (entropy - target_entropy), {}
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
-        """Take one gradient step on the critics, the actor and the temperature, then move the target critics."""
+        """Take one gradient step on the critics, move their targets, then improve the actor and the temperature."""
         observations, batch = normalise_batch(state.observations, batch)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.log_temperature)
@@ -120,33 +127,46 @@ class SAC:
             next_action=partial(action_at, state.actor),
         )
 
-        actor_loss = partial(self.actor_loss, critics=learnt.folded, temperature=temperature)
+        state = state._replace(
+            critics=learnt.critics,
+            target_critics=polyak(state.target_critics, learnt.critics, self.target_rate),
+            critic_optimiser=learnt.optimiser,
+            observations=observations,
+        )
+        given = (learnt.folded, batch.observation, actor_noise)
+        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
+        return state, {**learnt.metrics, **actor_metrics, "temperature": temperature}
+
+    def improve(
+        self,
+        state: State,
+        critics: Critics,
+        observations: Float[Array, "batch observation"],
+        noise: Float[Array, "batch action"],
+    ) -> tuple[State, Metrics]:
+        """Return the state after one gradient step on the actor and the temperature, and what the actor's loss told."""
+        actor_loss = partial(self.actor_loss, critics=critics, temperature=jnp.exp(state.log_temperature))
         optimiser = self._optimiser(self.actor_learning_rate)
-        actor, actor_optimiser, actor_metrics = descend(
-            optimiser, actor_loss, state.actor, state.actor_optimiser, batch.observation, actor_noise
+        actor, actor_optimiser, metrics = descend(
+            optimiser, actor_loss, state.actor, state.actor_optimiser, observations, noise
         )
 
         log_temperature, temperature_optimiser = state.log_temperature, state.temperature_optimiser
         if self.temperature == "automatic":
-            target_entropy = self.target_entropy if self.target_entropy is not None else -float(batch.action.shape[-1])
+            target_entropy = self.target_entropy if self.target_entropy is not None else -float(noise.shape[-1])
             temperature_loss = partial(self.temperature_loss, target_entropy=target_entropy)
-            mean_entropy = actor_metrics["entropy"][None]  # the loss is linear in it: one example stands for all
+            mean_entropy = metrics["entropy"][None]  # the loss is linear in it: one example stands for all
             optimiser = self._optimiser(self.temperature_learning_rate)
             log_temperature, temperature_optimiser, _ = descend(
                 optimiser, temperature_loss, log_temperature, temperature_optimiser, mean_entropy
             )
-
-        new_state = State(
+        new_state = state._replace(
             actor=actor,
-            critics=learnt.critics,
-            target_critics=polyak(state.target_critics, learnt.critics, self.target_rate),
-            log_temperature=log_temperature,
             actor_optimiser=actor_optimiser,
-            critic_optimiser=learnt.optimiser,
+            log_temperature=log_temperature,
             temperature_optimiser=temperature_optimiser,
-            observations=observations,
         )
-        return new_state, {**learnt.metrics, **actor_metrics, "temperature": temperature}
+        return new_state, metrics
 
     @property
     def cadence(self) -> Cadence:
@@ -173,6 +193,7 @@ class SAC:
             critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
             temperature_optimiser=begin_descent(self._optimiser(self.temperature_learning_rate), log_temperature),
             observations=begin_statistics(spec.observation_size, self.normalise_observations),
+            actor_metrics=begin_metrics(("actor_loss", "entropy"), self.policy_delay),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
@@ -186,4 +207,4 @@ class SAC:
         return PolicyNetwork(PolicyParameters((state.actor.layers,), normaliser=normaliser))
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
-        return make_optimiser(learning_rate, self.max_gradient_norm)
+        return make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)

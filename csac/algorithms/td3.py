@@ -79,6 +79,8 @@ class TD3:
     """Updates for each environment step."""
     update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
+    adam_momentum: Annotated[float, DISCOUNT] = 0.9
+    """Share of its average gradient that Adam keeps at each update (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
 
@@ -173,4 +175,4 @@ class TD3:
         return PolicyNetwork(PolicyParameters((state.actor.layers,), normaliser=normaliser), head="tanh")
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
-        return make_optimiser(learning_rate, self.max_gradient_norm)
+        return make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)

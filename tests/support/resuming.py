@@ -35,6 +35,8 @@ ADAPTIVE = CSAC(
     reference_period=30,
     critic_normalisation="batch",
     normalise_observations=True,
+    policy_delay=3,
+    adam_momentum=0.5,
     **SMALL,
 )
 SHORT: dict[str, Any] = {"evaluation_interval": 100, "evaluation_episodes": 2, "tensorboard": False}
