@@ -8,6 +8,7 @@
 `evaluation`    whole intervals of 5,000 steps: no evaluation, in line, and beside
 `copies`        updates alone, with and without XLA's region analysis of what it need not copy
 `first`         several updates in one dispatch: what the first costs more than those that follow it
+`critics`       updates alone, with plain critics, normalised ones, and the candidate of docs/algorithms/critics.md
 
 A ratio is that of two measurements of one round. Processes of one kind differ, so each repetition starts new ones.
 """
@@ -20,7 +21,7 @@ import os
 import statistics
 import time
 from itertools import count
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from benchmarks.measuring import TASK
 from benchmarks.tables import table
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 WARMUP = 500
+NORMALISED = (("critic_normalisation", "batch"),)
+CANDIDATE = (*NORMALISED, ("policy_delay", 3), ("adam_momentum", 0.5), ("normalise_observations", True))
 REGIONS = "--xla_cpu_copy_insertion_use_region_analysis=true"
 Rates = dict[str, list[float]]
 
@@ -47,6 +50,7 @@ class Variant(NamedTuple):
     seeds: int = 1  # side by side in one program
     evaluation: str | None = None  # None: no environment at all; else "off", "in line" or "beside"
     flags: str = ""  # of XLA
+    changes: tuple[tuple[str, Any], ...] = ()  # of the paper's hyperparameters
 
 
 def suites() -> dict[str, dict[str, list[Variant]]]:
@@ -75,6 +79,13 @@ def suites() -> dict[str, dict[str, list[Variant]]]:
             title: [Variant(f"{n} in one", *setting, interval=n) for n in (1, 2, 4, 8)]
             for title, setting in alone.items()
         },
+        "critics": {
+            title: [
+                Variant(kind, *setting, changes=changes)
+                for kind, changes in (("plain", ()), ("normalised", NORMALISED), ("candidate", CANDIDATE))
+            ]
+            for title, setting in alone.items()
+        },
     }
 
 
@@ -90,7 +101,8 @@ def work(connection: Connection, variant: Variant) -> None:
     from benchmarks.driver import Driver, make_learner, make_settings
     from csac.training.group import Group
 
-    learner = make_learner(variant.algorithm, seeds=variant.seeds, update_interval=variant.interval)
+    changes = {"update_interval": variant.interval, **dict(variant.changes)}
+    learner = make_learner(variant.algorithm, seeds=variant.seeds, **changes)
     if variant.evaluation:
         algorithm = dataclasses.replace(learner.algorithm, warmup_steps=WARMUP)  # pyright: ignore[reportArgumentType]
         interval, beside = 10**6 if variant.evaluation == "off" else 5_000, int(variant.evaluation == "beside")

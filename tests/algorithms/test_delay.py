@@ -126,7 +126,7 @@ def test_adam_by_hand():
     state, steps = begin_descent(optimiser, parameter), []
     for gradient in (1.0, 3.0):
         step, state = optimiser.update(jnp.float32(gradient), state, parameter)
-        steps.append(float(step))
+        steps.append(np.asarray(step).item())
     assert steps == pytest.approx([-0.1, -0.1 * (7 / 3) / 5.002001**0.5], rel=1e-5)
 
 
