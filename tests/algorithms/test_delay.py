@@ -18,10 +18,8 @@ from csac.types import InputError, Spec, Transition
 SPEC = Spec(3, 2)
 SMALL: dict[str, Any] = {"actor_hidden_sizes": (4,), "critic_hidden_sizes": (4,), "batch_size": 8}
 DELAYED = [
-    CSAC(policy_delay=3, reference_policy="previous", **SMALL),
     CSAC(policy_delay=3, reference_policy="average", entropy_weight="auto", **SMALL),
     CSAC(policy_delay=3, relative_entropy_form="implicit", critic_normalisation="batch", **SMALL),
-    SAC(policy_delay=3, **SMALL),
     SAC(policy_delay=3, normalise_observations=True, **SMALL),
 ]
 # What a waiting update leaves alone.
