@@ -15,13 +15,11 @@ from pathlib import Path
 
 import gymnasium
 import torch
+from evaluation import evaluate
 from models import make_model
 from stable_baselines3.common.callbacks import BaseCallback
 
 warnings.filterwarnings("ignore", category=DeprecationWarning)
-
-# Episode j of every evaluation is reset with this seed + j: the same starts that csac's own evaluation uses.
-EVALUATION_SEED = 1_000_000
 
 
 class Evaluations(BaseCallback):
@@ -40,25 +38,11 @@ class Evaluations(BaseCallback):
 
     def _on_step(self):
         if self.num_timesteps % self.arguments.evaluation_interval == 0 or self.num_timesteps == self.arguments.steps:
-            for episode in range(self.arguments.evaluation_episodes):
-                total, length = self._episode(EVALUATION_SEED + episode)
+            episodes = evaluate(self.model, self.environment, self.arguments.evaluation_episodes)
+            for episode, (total, length) in enumerate(episodes):
                 self.writer.writerow([self.arguments.seed, self.num_timesteps, episode, total, length, ""])
             self.file.flush()
         return self.num_timesteps < self.arguments.steps
-
-    def _episode(self, seed):
-        """Return the return and the length of one episode of deterministic actions, which draw no random numbers."""
-        observation, _ = self.environment.reset(seed=seed)
-        total, length, ended = 0.0, 0, False
-        while not ended:
-            action, _ = self.model.predict(self._scaled(observation), deterministic=True)
-            observation, reward, terminated, truncated, _ = self.environment.step(action)
-            total, length, ended = total + float(reward), length + 1, terminated or truncated
-        return total, length
-
-    def _scaled(self, observation):
-        normaliser = self.model.get_vec_normalize_env()
-        return observation if normaliser is None else normaliser.normalize_obs(observation)
 
 
 def main():
