@@ -1,0 +1,259 @@
+"""What csac's candidate and its peers have learnt in equal time: the tables of stage 5 that PROTOCOL.md asks for.
+
+    python results/strong/equal_time.py
+
+The runs are those of `python -m benchmarks.equal_time`, in equal-time/; the candidate's are those of stage 3, in
+cells/. The return at equal time of a run is the mean of its two evaluations: a peer's at 0.9 of the time T and at T,
+the candidate's at 90,000 and 100,000 steps, of which T is the time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import itertools
+import runpy
+import statistics
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+
+from csac.record.rendering import Cell, Row, Table, markdown, number, numeric
+from csac.record.statistics import (
+    evaluation_matrix,
+    improvement_interval,
+    probability_of_improvement,
+)
+from csac.studies.arms import Arm, gather
+from csac.studies.results import Results, Source
+from csac.studies.study import Study, read_study
+from csac.types import InputError
+
+HERE = Path(__file__).parent
+EVIDENCE = SimpleNamespace(**runpy.run_path(str(HERE.parent / "reference" / "evidence.py")))
+CANDIDATE = "CSAC, candidate"  # of confirm.toml
+CANDIDATE_STEPS = (90_000, 100_000)
+# By the folders of benchmarks/equal_time.py. The first is the SAC automatic of this stage: what scores are shares of.
+PEERS = {
+    "sb3-sac": "SB3 SAC",
+    "sbx-sac": "SBX SAC",
+    "sbx-tqc": "SBX TQC",
+    "sbx-crossq": "SBX CrossQ",
+    "sbx-simba": "SBX SimBa",
+}
+ROWS = 20  # of a peer's file: two evaluations of ten episodes
+
+
+class Reached(NamedTuple):
+    """What one run has reached at equal time."""
+
+    value: float
+    """The mean of its two evaluations; NaN where training failed."""
+    steps: float
+    updates: float = np.nan
+
+
+Found = dict[str, dict[str, dict[int, Reached]]]  # by task, method and seed
+
+
+# What runs have reached.
+
+
+def read_times(path: Path) -> dict[str, list[float]]:
+    """Return the seconds of the candidate's runs by task. Raises InputError where there are none."""
+    times: dict[str, list[float]] = {}
+    for row in _table(path, ("task", "seconds"), "python -m benchmarks.equal_time seconds"):
+        times.setdefault(row["task"], []).append(float(row["seconds"]))
+    return times
+
+
+def read_peer(path: Path, limit: float) -> Reached:
+    """Return what the file of one run tells. Raises InputError where it is not one, or of another T."""
+    rows = _table(path, ("limit", "step", "updates", "return"), "python -m benchmarks.equal_time run")
+    if len(rows) != ROWS or {float(row["limit"]) for row in rows} != {limit}:
+        raise InputError(f"{path} does not hold two evaluations of a run of {limit:g} seconds: remove it")
+    value = statistics.fmean(float(row["return"]) for row in rows)
+    return Reached(value, int(rows[-1]["step"]), int(rows[-1]["updates"]))
+
+
+def _table(path: Path, columns: tuple[str, ...], written_by: str) -> list[dict[str, str]]:
+    """Return the rows of a CSV. Raises InputError where it is missing or has not got these columns of numbers."""
+    try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        for row, column in itertools.product(rows, columns):
+            row[column] if column == "task" else float(row[column])
+    except (OSError, KeyError, TypeError, ValueError):
+        raise InputError(f"{path} is missing or damaged: {written_by} writes it") from None
+    return rows
+
+
+def of_candidate(arm: Arm) -> dict[int, Reached]:
+    """Return what each seed of the candidate has reached after the steps of which T is the time."""
+    reached = {seed: Reached(np.nan, np.nan) for seed in arm.failures}
+    if len(arm.rows):
+        at, seeds, returns = evaluation_matrix(arm.rows)
+        values = returns[:, np.isin(at, CANDIDATE_STEPS)].mean(axis=1)
+        steps = CANDIDATE_STEPS[-1]
+        reached |= {int(seed): Reached(float(value), steps) for seed, value in zip(seeds, values, strict=True)}
+    return reached
+
+
+def gathered(study: Study, results: Source, folder: Path, limits: dict[str, float]) -> Found:
+    """Return what every peer, and after them the candidate, has reached on each task, as far as it has run."""
+    seeds = range(study.first_seed, study.first_seed + study.seeds)
+    candidate = {arm.task: arm for arm in gather(study.narrowed(algorithms=[CANDIDATE]), results)}
+    found: Found = {}
+    for task in study.tasks:
+        files = {(peer, seed): folder / task / peer / f"seed-{seed}.csv" for peer in PEERS for seed in seeds}
+        found[task] = {
+            label: {s: read_peer(files[peer, s], limits[task]) for s in seeds if files[peer, s].exists()}
+            for peer, label in PEERS.items()
+        }
+        found[task][CANDIDATE] = of_candidate(candidate[task])
+    return found
+
+
+def measured(found: Found) -> dict[str, dict[str, EVIDENCE.Measured]]:
+    """Return the returns of each method on the seeds that all of them have on the task; a failed one has 0."""
+    made = {}
+    for task, methods in found.items():
+        seeds = tuple(sorted(set.intersection(*(set(runs) for runs in methods.values()))))
+        unknown = np.full(len(seeds), np.nan)
+        if seeds:
+            finals = {label: np.nan_to_num([runs[seed].value for seed in seeds]) for label, runs in methods.items()}
+            made[task] = {
+                label: EVIDENCE.Measured(seeds, final, unknown, unknown, unknown, np.nan)
+                for label, final in finals.items()
+            }
+    return made
+
+
+# Tables.
+
+
+def task_table(task: str, limit: float, reached: dict[str, dict[int, Reached]], seeds: Sequence[int]) -> Table:
+    """Return what each method has reached on one task."""
+    rows = []
+    for label, runs in reached.items():
+        values = np.nan_to_num([runs[seed].value for seed in seeds])
+        std = f" ± {number(values.std(ddof=1), values.mean())}" if len(values) > 1 else ""
+        steps, updates = (np.mean([runs[seed][i] for seed in seeds]) for i in (1, 2))
+        cells = (
+            Cell(label),
+            Cell(f"{number(values.mean())}{std}", values.mean()),
+            Cell(number(values.min()), values.min()),
+            numeric(steps, f"{steps:,.0f}"),
+            numeric(updates, f"{updates:,.0f}"),
+        )
+        rows.append(Row(cells))
+    headings = ("method", "return at equal time, mean ± std", "worst seed", "steps, mean", "updates, mean")
+    return Table(headings, tuple(rows), f"{task}: {limit:g} s, seeds {_seeds(seeds)}")
+
+
+def comparisons(found: dict[str, dict[str, EVIDENCE.Measured]], seeds: Sequence[int]) -> tuple[Table, list[str]]:
+    """Return how the candidate compares with each peer, over all tasks and on each, and the verdicts."""
+    returns = EVIDENCE.scores(found, lambda one: one.final, seeds)
+    rows, verdicts = [], []
+    for peer in PEERS.values():
+        interval = improvement_interval(returns[CANDIDATE], returns[peer])
+        verdicts.append(EVIDENCE.verdict(interval))
+        pairs = [(methods[CANDIDATE].final, methods[peer].final) for methods in found.values()]
+        cells = [Cell(peer), _probability(returns[CANDIDATE], returns[peer]), Cell(verdicts[-1])]
+        rows.append(Row((*cells, *(_probability(*pair) for pair in pairs))))
+    headings = ("candidate against", "P(higher return)", "so", *(f"P(higher return), {task}" for task in found))
+    return Table(headings, tuple(rows), f"The candidate against each peer, seeds {_seeds(seeds)}"), verdicts
+
+
+def _probability(values: np.ndarray, others: np.ndarray) -> Cell:
+    value, interval = probability_of_improvement(values, others), improvement_interval(values, others)
+    return numeric(value, f"{value:.2f}" + (f" ({interval[0]:.2f} to {interval[1]:.2f})" if interval else ""))
+
+
+def aim(verdicts: Sequence[str]) -> str:
+    """Say whether the candidate is better than every peer."""
+    if "no verdict" in verdicts:
+        return "open: too few seeds"
+    return "reached" if set(verdicts) == {"better"} else "missed"
+
+
+def notes(study: Study, found: Found, seeds: Sequence[int]) -> list[str]:
+    """Return what did not run, what failed, and what is left out of the comparisons over all tasks."""
+    planned = set(range(study.first_seed, study.first_seed + study.seeds))
+    arms = {f"{label} on {task}": runs for task, methods in found.items() for label, runs in methods.items()}
+    failed = {arm: [seed for seed, one in runs.items() if np.isnan(one.value)] for arm, runs in arms.items()}
+    lists = [
+        *((f"not run: {arm}", planned - set(runs)) for arm, runs in arms.items()),
+        *((f"failed, and counted as 0: {arm}", which) for arm, which in failed.items()),
+        ("left out, since not every method has them on every task", planned - set(seeds)),
+    ]
+    return [f"{what}: seeds {_seeds(which)}" for what, which in lists if which]
+
+
+def surroundings(folder: Path) -> list[str]:
+    """Return what the runs depend on: the machine, as far as it was noted, and what else ran on it."""
+    machine, path = folder / "machine.txt", folder / "load.csv"
+    lines = machine.read_text(encoding="utf-8").splitlines() if machine.exists() else []
+    if path.exists():
+        loads = [float(row["load"]) for row in _table(path, ("load",), "python -m benchmarks.equal_time run")]
+        lines.append(
+            f"other programs kept {statistics.fmean(loads):.2f} cores busy on average, {max(loads):.2f} at most"
+        )
+    return lines
+
+
+def told(study: Study, results: Source, folder: Path) -> str:
+    """Return all that is known of stage 5, in Markdown. Raises InputError where T is not known."""
+    times = read_times(folder / "seconds.csv")
+    if missing := [task for task in study.tasks if task not in times]:
+        raise InputError(f"{missing[0]} was not timed: python -m benchmarks.equal_time seconds")
+    limits = {task: round(statistics.median(times[task]), 1) for task in study.tasks}
+    study = dataclasses.replace(study, title="Equal time")
+    found = gathered(study, results, folder, limits)
+    over = measured(found)
+    seeds = EVIDENCE.common_seeds(study, over)
+    parts = [f"## {study.title}", _list([*notes(study, found, seeds), *surroundings(folder)])]
+    rows = [
+        Row((Cell(task), Cell(f"{limits[task]:g}"), Cell(", ".join(f"{value:.1f}" for value in times[task]))))
+        for task in study.tasks
+    ]
+    tables = [Table(("task", "T, s", "the candidate's runs, s"), tuple(rows))]
+    tables += [
+        task_table(task, limits[task], found[task], next(iter(one.values())).seeds) for task, one in over.items()
+    ]
+    if seeds:
+        comparison, verdicts = comparisons(over, seeds)
+        tables += [EVIDENCE.overall_table(study, over), comparison]
+        parts += [*map(markdown, tables), f"Better than every one of the {len(PEERS)}: {aim(verdicts)}."]
+    else:
+        parts += map(markdown, tables)
+    return "\n\n".join(part for part in parts if part)
+
+
+def _list(notes: Sequence[str]) -> str:
+    return "\n".join(f"- {note}" for note in notes)
+
+
+def _seeds(seeds: Iterable[int]) -> str:
+    return ", ".join(map(str, sorted(seeds)))
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, default=HERE / "equal-time", help="where the runs' files are")
+    parser.add_argument("--results", type=Path, default=HERE, help="where the candidate's cells/ lies")
+    arguments = parser.parse_args()
+    try:
+        print(told(read_study(HERE / "confirm.toml"), Results(arguments.results, may_be_empty=True), arguments.folder))
+    except InputError as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main()
