@@ -21,6 +21,16 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 # A shell has its background jobs ignore Ctrl-C, and what they start inherits that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Have XLA optimise little, but in the tests that are slow: two thirds of the others' time would be compilation.
+
+    Their programs run but for moments. What depends on the last bits has a process of its own, without the flag.
+    """
+    if config.getoption("markexpr") != "slow":
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
+
+
 LONGEST = ("training", "tasks")
 
 
