@@ -158,6 +158,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--repetitions", type=int, default=3, help="new processes for each")
     options = parser.parse_args(arguments)
+    if min(options.rounds, options.repetitions) < 1 or options.rounds * options.repetitions < 2:
+        parser.error("--rounds times --repetitions must be at least 2: one measurement has no middle half")
     for suite in options.suites:
         for setting, variants in suites()[suite].items():
             if options.only in setting:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
+from benchmarks import dispatch
 from benchmarks.__main__ import PARTS, SUITES, main, named
 from benchmarks.measuring import ROOT, Process, run, surroundings
 from benchmarks.parts import Options, Part
@@ -201,3 +202,10 @@ def test_every_part_runs(arguments, capsys):
     assert "| --- |" in printed
     assert "one core multiplies 256 x 256 x 256 at" in printed
     assert f"not written: only a part of {arguments[0]} was measured" in printed
+
+
+def test_one_measurement_is_too_few_for_a_middle_half(capsys):
+    with pytest.raises(SystemExit) as ended:
+        dispatch.main(["critics", "--rounds", "1", "--repetitions", "1"])
+    assert ended.value.code == 2
+    assert "must be at least 2" in capsys.readouterr().err
