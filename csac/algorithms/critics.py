@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
 from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp
-from csac.algorithms.normalisation import Moments, Normalisation, batch_moments, fold
+from csac.algorithms.normalisation import Moments, batch_moments, fold
 from csac.algorithms.shapes import Action, Key, Observation, Scalar
 from csac.types import Metrics, Spec, Transition
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import optax
 
 Critics: TypeAlias = tuple[MLP, MLP]
+Normalisation: TypeAlias = Literal["none", "batch"]
 
 
 class Learnt(NamedTuple):

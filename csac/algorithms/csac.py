@@ -11,15 +11,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from csac.algorithms.actors import RunningMoments, begin_moments, learn_actor
 from csac.algorithms.adaptation import LearntWeights, Weights, adapted, begin_weights, told, weights_now
-from csac.algorithms.critics import Critics, learn_critics, least_q_value, make_critics, make_targets
+from csac.algorithms.critics import Critics, Normalisation, learn_critics, least_q_value, make_critics, make_targets
 from csac.algorithms.delay import begin_metrics, improve_delayed
 from csac.algorithms.distributions import action_at, bounded, kl, log_ratio, policy_at
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, begin_descent, copy_tree, make_mlp, make_optimiser, polyak
-from csac.algorithms.normalisation import Normalisation, fold
+from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
 from csac.algorithms.references import ReferencePolicy, reference_after, references_before
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
@@ -39,7 +37,6 @@ class State(NamedTuple):
     learnt_weights: LearntWeights | None = None
     relative_entropy_per_refresh: Scalar | None = None  # what a τ that is learnt goes by; 0 before there is any
     observations: Statistics | None = None
-    actor_moments: RunningMoments | None = None
     actor_metrics: Metrics | None = None  # of an actor that waits: what it told when it last moved
 
 
@@ -101,8 +98,6 @@ class CSAC:
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
-    actor_normalisation: Normalisation = "none"
-    """`batch` normalises the inputs of the actor's layers: over each batch to learn, by running moments to act."""
     critic_normalisation: Normalisation = "none"
     """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
@@ -197,8 +192,7 @@ class CSAC:
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         weights = weights_now((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
         renews, kept = step % self.reference_period == 0, (state.reference, state.earlier_reference)
-        actor = fold(state.actor, state.actor_moments)
-        references = references_before(self.reference_policy, *kept, actor, renews)
+        references = references_before(self.reference_policy, *kept, state.actor, renews)
 
         policies = {"actor": references.valued, "reference": references.critic}
         learnt = learn_critics(
@@ -233,25 +227,22 @@ class CSAC:
         weights = weights_now((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
         actor_loss = partial(self.actor_loss, reference=state.reference, critics=critics, weights=weights)
         optimiser = self._optimiser(self.actor_learning_rate)
-        given = (state.actor, state.actor_moments, state.actor_optimiser)
-        learnt = learn_actor(optimiser, actor_loss, *given, observations, noise)
-        before = fold(state.actor, state.actor_moments)
-        refreshed = self.per_refresh(state.relative_entropy_per_refresh, learnt.metrics, step)
+        actor, actor_optimiser, metrics = descend(
+            optimiser, actor_loss, state.actor, state.actor_optimiser, observations, noise
+        )
+        refreshed = self.per_refresh(state.relative_entropy_per_refresh, metrics, step)
         new_state = state._replace(
-            actor=learnt.actor,
-            reference=reference_after(self.reference_policy, state.reference, before, self.reference_rate),
-            actor_moments=learnt.moments,
-            actor_optimiser=learnt.optimiser,
+            actor=actor,
+            reference=reference_after(self.reference_policy, state.reference, state.actor, self.reference_rate),
+            actor_optimiser=actor_optimiser,
             learnt_weights=adapted(
                 state.learnt_weights,
-                self.slack(learnt.metrics["entropy"], refreshed, noise.shape[-1]),
+                self.slack(metrics["entropy"], refreshed, noise.shape[-1]),
                 self._optimiser(self.weight_learning_rate),
             ),
             relative_entropy_per_refresh=refreshed,
         )
-        if refreshed is None:
-            return new_state, learnt.metrics
-        return new_state, {**learnt.metrics, "relative_entropy_per_refresh": refreshed}
+        return new_state, metrics if refreshed is None else {**metrics, "relative_entropy_per_refresh": refreshed}
 
     def per_refresh(self, last: Scalar | None, metrics: Metrics, step: Count) -> Scalar | None:
         """Return what the relative entropy came to just before the last renewal of the reference, in nats.
@@ -290,17 +281,15 @@ class CSAC:
         """Return random networks; targets and references are copies."""
         actor_key, critics_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, 2 * spec.action_size)
-        actor_moments = begin_moments(actor, self.actor_normalisation)
-        reference = fold(actor, actor_moments)
         critics = make_critics(critics_key, spec, self.critic_hidden_sizes)
         return State(
             actor=actor,
-            reference=None if self.relative_entropy_form == "implicit" else copy_tree(reference),
+            reference=None if self.relative_entropy_form == "implicit" else copy_tree(actor),
             critics=critics,
             target_critics=make_targets(critics, self.critic_normalisation),
             actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
             critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
-            earlier_reference=copy_tree(reference) if self.critic_reference == "earlier" else None,
+            earlier_reference=copy_tree(actor) if self.critic_reference == "earlier" else None,
             learnt_weights=begin_weights(
                 (self.entropy_weight, self.relative_entropy_weight),
                 FIRST_WEIGHTS,
@@ -308,19 +297,18 @@ class CSAC:
             ),
             relative_entropy_per_refresh=jnp.zeros(()) if self.relative_entropy_weight == "auto" else None,
             observations=begin_statistics(spec.observation_size, self.normalise_observations),
-            actor_moments=actor_moments,
             actor_metrics=begin_metrics(self._actor_metrics(), self.policy_delay),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return ã(s, ξ) to explore (Eq. actor), else tanh(mean)."""
-        policy = policy_at(fold(state.actor, state.actor_moments), normalise(state.observations, observation))
+        policy = policy_at(state.actor, normalise(state.observations, observation))
         return policy.sample(jax.random.normal(key, policy.mean.shape)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, and what it sees observations by."""
-        actor, normaliser = fold(state.actor, state.actor_moments), normaliser_of(state.observations)
-        return PolicyNetwork(PolicyParameters((actor.layers,), normaliser=normaliser))
+        normaliser = normaliser_of(state.observations)
+        return PolicyNetwork(PolicyParameters((state.actor.layers,), normaliser=normaliser))
 
     def _actor_metrics(self) -> tuple[str, ...]:
         names = ("actor_loss", "entropy")

@@ -6,7 +6,7 @@ are folded into its weights. No scale and shift are learnt beside, which the lay
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +17,6 @@ from csac.types import Layer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-Normalisation: TypeAlias = Literal["none", "batch"]
 
 # Added to variances, as by CrossQ's authors: a unit that is silent in the batch is not blown up where it fires.
 EPSILON = 1e-3
@@ -46,10 +44,8 @@ def fold_layer(layer: Layer, moments: Moments) -> Layer:
     return Layer(weight, layer.bias - moments.mean @ weight)
 
 
-def fold(network: MLP, moments: Sequence[Moments] | None) -> MLP:
-    """Return the network whose layers see their inputs normalised by these moments; itself where there are none."""
-    if moments is None:
-        return network
+def fold(network: MLP, moments: Sequence[Moments]) -> MLP:
+    """Return the network whose layers see their inputs normalised by these moments, one for each layer."""
     return MLP(tuple(map(fold_layer, network.layers, moments)), network.activation)
 
 

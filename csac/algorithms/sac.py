@@ -11,14 +11,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from csac.algorithms.actors import RunningMoments, begin_moments, learn_actor
-from csac.algorithms.critics import Critics, learn_critics, least_q_value, make_critics, make_targets
+from csac.algorithms.critics import Critics, Normalisation, learn_critics, least_q_value, make_critics, make_targets
 from csac.algorithms.delay import begin_metrics, improve_delayed
 from csac.algorithms.distributions import action_at, policy_at
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import MLP, begin_descent, descend, make_mlp, make_optimiser, polyak
-from csac.algorithms.normalisation import Normalisation, fold
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
@@ -35,7 +33,6 @@ class State(NamedTuple):
     critic_optimiser: Any
     temperature_optimiser: Any
     observations: Statistics | None = None
-    actor_moments: RunningMoments | None = None
     actor_metrics: Metrics | None = None  # of an actor that waits: what it told when it last moved
 
 
@@ -63,8 +60,6 @@ class SAC:
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
-    actor_normalisation: Normalisation = "none"
-    """`batch` normalises the inputs of the actor's layers: over each batch to learn, by running moments to act."""
     critic_normalisation: Normalisation = "none"
     """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
@@ -123,14 +118,13 @@ class SAC:
         observations, batch = normalise_batch(state.observations, batch)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.log_temperature)
-        actor = fold(state.actor, state.actor_moments)
 
         learnt = learn_critics(
             self._optimiser(self.critic_learning_rate),
             *(state.critics, state.target_critics, state.critic_optimiser),
             *(batch, target_noise),
-            critic_target=partial(self.critic_target, actor=actor, temperature=temperature),
-            next_action=partial(action_at, actor),
+            critic_target=partial(self.critic_target, actor=state.actor, temperature=temperature),
+            next_action=partial(action_at, state.actor),
         )
 
         state = state._replace(
@@ -153,26 +147,26 @@ class SAC:
         """Return the state after one gradient step on the actor and the temperature, and what the actor's loss told."""
         actor_loss = partial(self.actor_loss, critics=critics, temperature=jnp.exp(state.log_temperature))
         optimiser = self._optimiser(self.actor_learning_rate)
-        given = (state.actor, state.actor_moments, state.actor_optimiser)
-        learnt = learn_actor(optimiser, actor_loss, *given, observations, noise)
+        actor, actor_optimiser, metrics = descend(
+            optimiser, actor_loss, state.actor, state.actor_optimiser, observations, noise
+        )
 
         log_temperature, temperature_optimiser = state.log_temperature, state.temperature_optimiser
         if self.temperature == "automatic":
             target_entropy = self.target_entropy if self.target_entropy is not None else -float(noise.shape[-1])
             temperature_loss = partial(self.temperature_loss, target_entropy=target_entropy)
-            mean_entropy = learnt.metrics["entropy"][None]  # the loss is linear in it: one example stands for all
+            mean_entropy = metrics["entropy"][None]  # the loss is linear in it: one example stands for all
             optimiser = self._optimiser(self.temperature_learning_rate)
             log_temperature, temperature_optimiser, _ = descend(
                 optimiser, temperature_loss, log_temperature, temperature_optimiser, mean_entropy
             )
         new_state = state._replace(
-            actor=learnt.actor,
-            actor_moments=learnt.moments,
-            actor_optimiser=learnt.optimiser,
+            actor=actor,
+            actor_optimiser=actor_optimiser,
             log_temperature=log_temperature,
             temperature_optimiser=temperature_optimiser,
         )
-        return new_state, learnt.metrics
+        return new_state, metrics
 
     @property
     def cadence(self) -> Cadence:
@@ -187,7 +181,6 @@ class SAC:
         """Return random networks; the targets are copies."""
         actor_key, critics_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, 2 * spec.action_size)
-        actor_moments = begin_moments(actor, self.actor_normalisation)
         critics = make_critics(critics_key, spec, self.critic_hidden_sizes)
         # log 0 is no number to keep; the lowest float is one, and its exponential is 0 too.
         log_temperature = jnp.maximum(jnp.log(jnp.float32(self.entropy_weight)), jnp.finfo(jnp.float32).min)
@@ -200,19 +193,18 @@ class SAC:
             critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
             temperature_optimiser=begin_descent(self._optimiser(self.temperature_learning_rate), log_temperature),
             observations=begin_statistics(spec.observation_size, self.normalise_observations),
-            actor_moments=actor_moments,
             actor_metrics=begin_metrics(("actor_loss", "entropy"), self.policy_delay),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return a sampled action to explore, else tanh(mean)."""
-        policy = policy_at(fold(state.actor, state.actor_moments), normalise(state.observations, observation))
+        policy = policy_at(state.actor, normalise(state.observations, observation))
         return policy.sample(jax.random.normal(key, policy.mean.shape)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, and what it sees observations by."""
-        actor, normaliser = fold(state.actor, state.actor_moments), normaliser_of(state.observations)
-        return PolicyNetwork(PolicyParameters((actor.layers,), normaliser=normaliser))
+        normaliser = normaliser_of(state.observations)
+        return PolicyNetwork(PolicyParameters((state.actor.layers,), normaliser=normaliser))
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
         return make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from csac.algorithms.actors import RunningMoments, begin_moments, learn_actor
 from csac.algorithms.critics import (
     Critics,
+    Normalisation,
     learn_critics,
     least_q_value,
     make_critics,
@@ -22,8 +22,7 @@ from csac.algorithms.critics import (
 )
 from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, begin_descent, copy_tree, make_mlp, make_optimiser, polyak
-from csac.algorithms.normalisation import Normalisation, fold
+from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
@@ -40,7 +39,6 @@ class State(NamedTuple):
     critic_optimiser: Any
     actor_loss: Scalar  # when the actor last moved, to be reported until it moves again
     observations: Statistics | None = None
-    actor_moments: RunningMoments | None = None
 
 
 @dataclass(frozen=True)
@@ -67,8 +65,6 @@ class TD3:
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
-    actor_normalisation: Normalisation = "none"
-    """`batch` normalises the inputs of the actor's layers: over each batch to learn, by running moments to act."""
     critic_normalisation: Normalisation = "none"
     """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
@@ -132,15 +128,13 @@ class TD3:
         """Return the state after one gradient step on the actor, against the new critics, and one of the targets."""
         actor_loss = partial(self.actor_loss, critics=critics)
         optimiser = self._optimiser(self.actor_learning_rate)
-        given = (state.actor, state.actor_moments, state.actor_optimiser)
-        learnt = learn_actor(optimiser, actor_loss, *given, observations)
+        actor, actor_optimiser, loss = descend(optimiser, actor_loss, state.actor, state.actor_optimiser, observations)
         return state._replace(
-            actor=learnt.actor,
-            target_actor=polyak(state.target_actor, fold(learnt.actor, learnt.moments), self.target_rate),
+            actor=actor,
+            target_actor=polyak(state.target_actor, actor, self.target_rate),
             target_critics=polyak(state.target_critics, state.critics, self.target_rate),
-            actor_optimiser=learnt.optimiser,
-            actor_loss=learnt.metrics,
-            actor_moments=learnt.moments,
+            actor_optimiser=actor_optimiser,
+            actor_loss=loss,
         )
 
     @property
@@ -156,32 +150,29 @@ class TD3:
         """Return random networks; the targets are copies."""
         actor_key, critics_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, spec.action_size)
-        actor_moments = begin_moments(actor, self.actor_normalisation)
         critics = make_critics(critics_key, spec, self.critic_hidden_sizes)
         return State(
             actor=actor,
-            target_actor=copy_tree(fold(actor, actor_moments)),
+            target_actor=copy_tree(actor),
             critics=critics,
             target_critics=make_targets(critics, self.critic_normalisation),
             actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
             critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
             actor_loss=jnp.zeros(()),
             observations=begin_statistics(spec.observation_size, self.normalise_observations),
-            actor_moments=actor_moments,
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return tanh(actor), with noise and clipped to [-1, 1] to explore."""
-        actor = fold(state.actor, state.actor_moments)
-        action = jnp.tanh(actor(normalise(state.observations, observation)))
+        action = jnp.tanh(state.actor(normalise(state.observations, observation)))
         if not explore:
             return action
         return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, and what it sees observations by."""
-        actor, normaliser = fold(state.actor, state.actor_moments), normaliser_of(state.observations)
-        return PolicyNetwork(PolicyParameters((actor.layers,), normaliser=normaliser), head="tanh")
+        normaliser = normaliser_of(state.observations)
+        return PolicyNetwork(PolicyParameters((state.actor.layers,), normaliser=normaliser), head="tanh")
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
         return make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +50,7 @@ class Learner:
         self._waiting = np.zeros((len(seeds), self._cadence.update_interval, row_width(spec)), np.float32)
         keep_programs()
         self._one = OneSeed(algorithm, spec, steps)
-        self.network = eqx.filter_eval_shape(algorithm.policy, self._one.state)  # for all but its parameters
+        self.network = algorithm.policy(self._one.state)  # for all but its parameters
         # It runs once, and less optimised it is compiled in three quarters of the time.
         begin = jax.jit(self._axis.map(self._one.begin), compiler_options={"xla_backend_optimization_level": 1})
         keys = [np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds]

@@ -34,7 +34,6 @@ ADAPTIVE = CSAC(
     critic_reference="earlier",
     reference_period=30,
     critic_normalisation="batch",
-    actor_normalisation="batch",
     normalise_observations=True,
     policy_delay=3,
     adam_momentum=0.5,
