@@ -66,8 +66,8 @@ def c_header(network: PolicyNetwork, contract: ArtefactContract) -> str:
         if array is not None:
             arrays.add(name, array)
     return template("policy.h.jinja").render(
-        task=policy.task or "a task of its own",
-        algorithm=policy.algorithm,
+        task=_in_comment(policy.task or "a task of its own"),
+        algorithm=_in_comment(policy.algorithm),
         weights=contract.weights,
         c_type=_C_TYPES[contract.weights],
         head=network.head,
@@ -85,6 +85,11 @@ def c_header(network: PolicyNetwork, contract: ArtefactContract) -> str:
         has_normaliser=parameters.normaliser is not None,
         critics=len(parameters.critics),
     )
+
+
+def _in_comment(text: str) -> str:
+    """Return a text that cannot end the comment that it stands in: a contract may be anybody's."""
+    return re.sub(r"[^\w.:/ -]", "_", text)
 
 
 def is_header(text: str, contract: ArtefactContract) -> bool:

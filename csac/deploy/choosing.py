@@ -44,9 +44,11 @@ def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
     if seed is not None or which != "last":
         raise InputError(f"{folder} holds one policy and no run: leave out seed and which")
     fields = read_json(folder / CONTRACT)
-    if fields.get("guards") and any(value not in (None, 0) for value in fields["guards"].values()):
+    contract = Contract.of_fields(fields, folder / CONTRACT)
+    guards = fields.get("guards") or {}
+    if not isinstance(guards, dict) or any(value not in (None, 0) for value in guards.values()):
         raise InputError(f"{folder} is an artefact with guards: csac.deploy.artefact.open_artefact keeps them")
-    return Policy.load(folder / SAVED, Contract.of_fields(fields, folder / CONTRACT))
+    return Policy.load(folder / SAVED, contract)
 
 
 def choose_seed(run: RunDirectory, seed: int | None = None) -> int:

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 CARD = "README.md"
 CURVE = "curve.png"
 
-_OURS = {CONTRACT, CARD, CURVE, LOADER.name, *POLICY_FILES.values()}
+# With what Python leaves where the loader was imported.
+_OURS = {CONTRACT, CARD, CURVE, LOADER.name, *POLICY_FILES.values(), "__pycache__"}
 
 
 def write_artefact(folder: Path, network: PolicyNetwork, contract: ArtefactContract) -> ArtefactContract:

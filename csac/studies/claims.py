@@ -117,8 +117,17 @@ def _stability(task: str, arm: Arm, other: Arm) -> Iterator[Comparison]:
     yield _better(f"{task}: a smaller largest fall of a learning curve than {other.published}", arm, other, _steadiness)
     published = paper.RETURNS[task]
     if published["CSAC"].std < published["SAC"].std:
-        claim = f"{task}: maximum average returns of the seeds nearer to their median than {other.published}'s"
-        yield _better(claim, arm, other, lambda one: -np.abs(_best(one) - np.median(_best(one))))
+        claim = f"{task}: maximum average returns of the seeds nearer to their mean than {other.published}'s"
+        yield _better(claim, arm, other, _closeness)
+
+
+def _closeness(arm: Arm) -> np.ndarray:
+    """Return minus each seed's distance from the mean of the seeds; none where there is one alone.
+
+    Not from their median, which one of an odd number of seeds is: so that none could ever be nearer.
+    """
+    best = _best(arm)
+    return -np.abs(best - best.mean()) if len(best) > 1 else np.zeros(0)
 
 
 def _weights(arms: Sequence[Arm]) -> Iterator[Comparison]:
@@ -148,7 +157,8 @@ def _robustness(arms: Sequence[Arm]) -> Iterator[Comparison]:
         ("comes back sooner", lambda one: -min(one.steps_to_regain, 1e12)),
         ("ends higher", lambda one: one.final),
     )
-    for condition in dict.fromkeys(arm.condition for arm in arms if _is_of_the_paper(arm)):
+    arms = [arm for arm in arms if _is_of_the_paper(arm)]
+    for condition in dict.fromkeys(arm.condition for arm in arms):
         for arm, other in _pairs([arm for arm in arms if arm.condition == condition]):
             if other.published == "SAC":
                 for words, value in measures:
@@ -167,7 +177,7 @@ def _is_of_the_paper(arm: Arm) -> bool:
 
 
 def _cases(arms: Sequence[Arm]) -> Iterator[Comparison]:
-    for arm, other in _pairs(arms):
+    for arm, other in (pair for own in tasks_of(arms).values() for pair in _pairs(own)):
         for name, published in paper.CASES.items():
             told = published.get(other.published or "")
             if told is None:

@@ -31,7 +31,7 @@ from csac.studies.study import Study, cells_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from rich.console import Console
 
@@ -56,6 +56,16 @@ To begin: csac study run smoke
 STATE_STYLES = {"complete": "green", "running": "cyan", "partial": "yellow", "waiting": "dim", "failed": "red"}
 
 
+def _split(text: str, known: Collection[str]) -> list[str]:
+    """Return the names in a text with commas between them; a name that is known may have commas itself."""
+    words, names = text.split(","), []
+    while words:
+        count = next((n for n in range(len(words), 0, -1) if ",".join(words[:n]) in known), 1)
+        names.append(",".join(words[:count]))
+        del words[:count]
+    return names
+
+
 @dataclass(frozen=True)
 class Chosen:
     """Which study, and what of it."""
@@ -75,8 +85,11 @@ class Chosen:
 
     def studies(self) -> list[Study]:
         """Return the studies that are meant."""
-        tasks, algorithms = (None if text is None else text.split(",") for text in (self.tasks, self.algorithms))
-        return narrowed([study.shortened(self.scale) for study in find(self.name)], tasks, algorithms, self.seeds)
+        studies = [study.shortened(self.scale) for study in find(self.name)]
+        names = {name for study in studies for name in study.names}
+        tasks = None if self.tasks is None else self.tasks.split(",")
+        algorithms = None if self.algorithms is None else _split(self.algorithms, names)
+        return narrowed(studies, tasks, algorithms, self.seeds)
 
     def words(self) -> list[str]:
         """Return what to type for the same choice, wherever the runs are."""

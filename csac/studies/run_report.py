@@ -86,7 +86,7 @@ class Comparison:
             raise InputError(
                 f"{runs[0].label}: its runs learn {' and '.join(sorted(tasks))}; give each a label of its own"
             )
-        condition = self.perturbations or next((one.perturbations for one in manifests), ())
+        condition = manifests[0].perturbations if manifests else self.perturbations
         arm = Arm(runs[0].label or "", tasks.pop() if tasks else "", tuple(map(str, perturbations_of(condition))))
         for run in runs:
             failed = run.manifest.failures if run.manifest else {}

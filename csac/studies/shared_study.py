@@ -186,8 +186,10 @@ class SharedStudy:
         attempt.lock.close()
 
     def drop(self, attempt: Attempt) -> None:
-        """Leave a trial out that could not begin."""
-        self._requeue(attempt.trial.number, {}, {})
+        """Leave a trial out that could not begin; one whose configuration came from the queue goes back there."""
+        trial = self._all()[attempt.trial.number]
+        was_queued = "fixed_params" in trial.system_attrs
+        self._requeue(trial.number, *((trial.params, trial.user_attrs) if was_queued else ({}, {})))
         attempt.lock.close()
 
     def results(self) -> list[Result]:
@@ -258,7 +260,7 @@ class SharedStudy:
         return study
 
     def _pruner(self) -> Any:
-        """Return the median rule: stop what is worse than half of the complete trials were at the same step."""
+        """Return the median rule: stop what was never as good as half of the complete trials were at the same step."""
         unpruned = max(self.question.algorithm.cadence.warmup_steps, round(SHARE_UNPRUNED * self.question.steps))
         return self._optuna.pruners.MedianPruner(STARTUP_TRIALS, unpruned, n_min_trials=FEWEST_TO_COMPARE)
 

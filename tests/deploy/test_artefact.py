@@ -321,6 +321,20 @@ def test_a_header_that_is_not_csacs_is_not_compiled(tmp_path, algorithm):
         open_artefact(tmp_path)
 
 
+@needs_compiler
+def test_a_contract_cannot_bring_code_into_its_header(tmp_path):
+    artefact = leave(tmp_path, algorithm_policy("csac"), "c")
+    path, task = tmp_path / "policy.h", "Pendulum-v1 */ int evil(void) { return 1; } /*"
+    policy = dataclasses.replace(artefact.contract.policy, task=task)
+    first, _, rest = path.read_text().partition("\n")
+    known = artefact.contract.policy.task or "a task of its own"
+    path.write_text(f"{first.replace(known, task)}\n{rest}")
+    assert "evil" in path.read_text()
+    write_contract(tmp_path, dataclasses.replace(artefact.contract, policy=policy, sha256=sha256_of(path)))
+    with pytest.raises(InputError, match="is not a header of this csac"):
+        open_artefact(tmp_path)
+
+
 def test_an_observation_of_another_size_is_refused(tmp_path, format):
     artefact = leave(tmp_path, algorithm_policy("csac"), format)
     with pytest.raises(InputError, match=r"shape \(4,\); the artefact takes \(5,\)"):
@@ -534,6 +548,10 @@ def test_an_older_artefact_is_replaced_and_nothing_else(tmp_path):
         with placed(place) as folder:
             (folder / "contract.json").write_text(str(number))
     assert (place / "contract.json").read_text() == "1"
+    (place / "__pycache__").mkdir()  # which Python leaves where the loader was imported
+    with placed(place) as folder:
+        (folder / "contract.json").write_text("2")
+    assert {path.name for path in place.iterdir()} == {"contract.json"}
     (place / "notes.txt").touch()
     with pytest.raises(InputError, match="holds more than an artefact"), placed(place):
         pass

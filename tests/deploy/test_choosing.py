@@ -168,3 +168,6 @@ def test_an_artefact_without_guards_is_loaded_and_one_with_guards_is_not(tmp_pat
     assert same(load(tmp_path / "bare"), policy)
     with pytest.raises(InputError, match="is an artefact with guards"):
         load(tmp_path / "guarded")
+    (tmp_path / "bare" / "contract.json").write_text("[]")
+    with pytest.raises(InputError, match="contract"):
+        load(tmp_path / "bare")

@@ -88,6 +88,11 @@ def test_one_cell_of_an_array(engine):
     assert [job.cell.seed for job in engine] == [1]
 
 
+def test_a_method_whose_name_has_a_comma_is_found(engine):
+    assert csac("study run reference --tasks Hopper-v4 --algorithms 'SAC, 0.2,SAC, automatic' --seeds 1") == 0
+    assert sorted(job.cell.hyperparameters["temperature"] for job in engine) == ["automatic", "fixed"]
+
+
 def test_what_is_narrowed_is_run(engine):
     assert csac("study run mujoco --scale 0.1 --tasks Ant-v4,Hopper-v4 --algorithms sac,TD3 --seeds 2") == 0
     assert len(engine) == 2 * 2 * 2

@@ -124,7 +124,7 @@ def test_a_steadier_method_falls_less_and_its_seeds_are_nearer_together():
     claims = {one.claim.partition(": ")[2]: one for one in comparisons(study, gather(study, MadeRecords(value)))}
     fall = claims["a smaller largest fall of a learning curve than SAC"]
     assert (fall.ours.tolist(), fall.others.tolist()) == ([-5] * 5, [-50, -51, -52, -53, -54])
-    nearer = claims["maximum average returns of the seeds nearer to their median than SAC's"]
+    nearer = claims["maximum average returns of the seeds nearer to their mean than SAC's"]
     assert (nearer.ours.tolist(), nearer.others.tolist()) == ([-2, -1, 0, -1, -2], [-200, -100, 0, -100, -200])
 
 
@@ -164,6 +164,34 @@ def test_only_the_paper_s_friction_is_claimed(tmp_path):
     assert len(claims) == 3
     assert all("friction=1.5" in claim for claim in claims)
     assert not claims_of(of_ones_own(tmp_path, analyses + '[[], ["friction=1.5@300000", "gravity=2@400000"]]'))
+
+
+def test_robustness_is_claimed_of_the_paper_s_task_alone(tmp_path):
+    """A second task is neither claimed nor mixed with the first."""
+    analyses = 'analyses = ["robustness"]\nconditions = [[], ["friction=1.5@300000"]]'
+    study = of_ones_own(tmp_path, analyses)
+    two = replace(study, tasks=("HalfCheetah-v4", "Hopper-v4"))
+    assert len(comparisons(two, gather(two, MadeRecords(made)))) == 3
+    assert claims_of(two) == claims_of(study)
+
+
+def test_a_lone_seed_is_near_to_nothing():
+    study = mujoco(algorithms=["CSAC (paper)", "sac"])
+    arms = gather(study.narrowed(seeds=1), MadeRecords(made))
+    nearer = next(one for one in comparisons(study, arms) if "nearer to their mean" in one.claim)
+    assert len(nearer.ours) == len(nearer.others) == 0
+
+
+def test_an_odd_number_of_seeds_can_be_nearer_together():
+    def value(cell, step):
+        return 6_000 + (100 if cell.algorithm == "sac" else 1) * (0, 3, 4, 8, 20)[cell.seed]
+
+    study = mujoco(algorithms=["CSAC (paper)", "sac"])
+    nearer = next(
+        one for one in comparisons(study, gather(study, MadeRecords(value))) if "nearer to their mean" in one.claim
+    )
+    assert nearer.ours.tolist() == [-7, -4, -3, -1, -13]
+    assert decide(nearer).verdict == "reproduced"
 
 
 def test_friction_that_changes_at_another_step_decides_nothing(tmp_path):

@@ -153,6 +153,11 @@ def test_a_report_tells_of_perturbations_success_and_what_failed():
     assert {path.suffix for path in Path("out").iterdir()} == {".html", ".md", ".png", ".svg"}
 
 
+def test_a_manifest_says_what_perturbed_a_run_and_an_option_does_not():
+    make_run_of("runs/a", [[100.0, 40.0, 90.0]])
+    assert "friction x 2" not in report("runs/a --perturb friction=2@10")
+
+
 def test_an_arm_has_one_colour_on_all_tasks():
     make_run_of("runs/a", [[10.0]], algorithm="csac")
     for task in ("Hopper-v4", "Ant-v4"):

@@ -252,6 +252,23 @@ def test_a_trial_whose_process_died_is_taken_up_and_one_that_is_run_is_not(tmp_p
         attempt.lock.close()
 
 
+def test_a_trial_that_could_not_begin_leaves_the_configuration_that_the_search_begins_with(tmp_path):
+    study = SharedStudy(tmp_path / "study", question())
+    for _ in range(2):
+        first = study.next(10)
+        assert first is not None
+        assert (first.label, first.values) == (0, {"actor_learning_rate": 3e-4, "discount": 0.99})
+        study.drop(first)
+    first, second = study.next(10), study.next(10)
+    assert first is not None
+    assert second is not None
+    drawn = dict(second.values)
+    study.drop(second)
+    assert drawn != first.values
+    assert [result.label for result in study.results()] == [0]
+    first.lock.close()
+
+
 def test_a_trial_that_died_before_its_first_checkpoint_begins_anew(search, tmp_path):
     study = SharedStudy(tmp_path / "study", question())
     lost = study.next(1)
