@@ -325,9 +325,10 @@ class Chosen(NamedTuple):
 
         source = None
         if (where := peek(arguments, "--from", None)) is not None:
-            from csac.training.resume import Source
+            from csac.training.plan import Before
 
-            source = Source.find(where).run.manifest
+            before = Before.find(peek(arguments, "--directory", None), "--resume" in arguments, where)
+            source = before.run.manifest if before.run else None
         name = peek(arguments, "--algorithm", source.algorithm if source else "csac")
         if name not in ALGORITHMS:
             raise InputError(f"no algorithm is called {name!r}: choose {' or '.join(ALGORITHMS)}")

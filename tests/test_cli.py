@@ -17,6 +17,7 @@ import csac.training.train as training
 from csac.algorithms import ALGORITHMS, CSAC, SAC
 from csac.arguments import peek
 from csac.cli import main
+from csac.commands import Chosen
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.record.manifest import EvaluationPlan, Manifest
@@ -531,6 +532,20 @@ def test_a_failed_seed_is_exit_code_3(capsys):
     assert code == 3
     assert "seed 0 failed at step 30: " in capsys.readouterr().out
     assert RunDirectory.open("run").manifest.state == "failed"
+
+
+def test_an_interrupted_run_says_what_is_not_saved():
+    run = RunDirectory(Path("my run"), NOTHING)
+    assert str(training.Interrupted(run, signal.SIGINT, True, 9_500)) == (
+        "stopped by SIGINT; my run is saved but for its last 9,500 steps"
+    )
+
+
+def test_a_run_that_is_there_needs_no_source_any_more(tmp_path):
+    """A scheduler types the same line again; meanwhile the source has trained on, or is gone."""
+    run = make_run(tmp_path / "fork", "Hopper-v4", 3, [-1.0], [1.0])
+    chosen = Chosen.among(["--from", str(tmp_path / "gone@400"), "--directory", str(run.path), "--resume"])
+    assert chosen.source == run.manifest
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -26,7 +26,7 @@ from csac.tasks.perturbations import by_step, perturbations_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from rich.console import ConsoleOptions
 
@@ -136,10 +136,13 @@ def events_table(rows: np.ndarray) -> Fitted | None:
     return table and Fitted(table)
 
 
-def evaluation_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Fitted:
+def evaluation_table(
+    results: Mapping[int, Sequence[EvaluationEpisode]], failed: Collection[int] = frozenset()
+) -> Fitted:
     """Return one row per seed: mean, standard deviation and range of its episodes' returns, their mean length.
 
-    Where there are several seeds, the last rows are the mean of their means and its 95 % t-interval.
+    Where there are several seeds, the last rows are the mean of their means and its 95 % t-interval, without those of
+    seeds that failed in training.
     """
     returns = {seed: np.array([episode.episode_return for episode in result]) for seed, result in results.items()}
     largest = max((float(np.abs(values).max()) for values in returns.values()), default=0.0)
@@ -154,13 +157,14 @@ def evaluation_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Fitt
         if has_success:
             share = float(np.mean([episode.success or 0.0 for episode in results[seed]]))
             cells.append(Cell(f"{share:.0%}", share))
-        rows.append(Row(tuple(cells)))
-    if len(returns) > 1:
-        over = over_seeds(values.mean() for values in returns.values())
+        rows.append(Row(tuple(cells), "failed" if seed in failed else "plain"))
+    sound = [values.mean() for seed, values in returns.items() if seed not in failed]
+    if len(sound) > 1:
+        over = over_seeds(sound)
         blank = [EMPTY] * (len(headings) - 2)
         rows.append(Row((Cell("mean", np.nan), Cell(number(over.mean, largest), over.mean), *blank), "summary"))
         rows += summary_tables.interval_rows([over], largest, len(blank))
-    return Fitted(Table(headings, tuple(rows), note=summary_tables.few_seeds(len(returns))))
+    return Fitted(Table(headings, tuple(rows), note=summary_tables.few_seeds(len(sound))))
 
 
 def case_table(results: Mapping[int, Sequence[EvaluationEpisode]]) -> Fitted | None:

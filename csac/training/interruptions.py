@@ -30,10 +30,16 @@ _CANNOT_WRITE = (
 
 
 class Interrupted(Exception):
-    """Training was stopped by a signal. `is_saved` says whether what was learnt can be gone on with."""
+    """Training was stopped by a signal.
 
-    def __init__(self, run: RunDirectory, signal_number: int, is_saved: bool) -> None:
+    `is_saved` says whether what was learnt can be gone on with, `steps_lost` how many of the last steps cannot: where
+    none were to be saved any more, or a second signal came before they were.
+    """
+
+    def __init__(self, run: RunDirectory, signal_number: int, is_saved: bool, steps_lost: int = 0) -> None:
         where = f"saved in {run.path}" if is_saved else f"{run.path} has its results and no checkpoint to go on from"
+        if is_saved and steps_lost:
+            where = f"{run.path} is saved but for its last {steps_lost:,} steps"
         super().__init__(f"stopped by {signal.Signals(signal_number).name}; {where}")
         self.run, self.signal_number, self.is_saved = run, signal_number, is_saved
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from contextlib import suppress
 from typing import TYPE_CHECKING, get_args
 
@@ -59,7 +60,7 @@ def restore(run: Path, checkpoint: Checkpoint | None) -> list[str]:
     return told + (_mend(checkpoint) if checkpoint else [])
 
 
-def copy(checkpoint: Checkpoint, run: Path) -> Files:
+def copy(checkpoint: Checkpoint, run: Path, seeds: Sequence[int]) -> Files:
     """Give a new run the tables, the log and the files of another's checkpoint; return the files.
 
     Transitions, which are never written again, get a second name where the file system has such a thing.
@@ -70,6 +71,9 @@ def copy(checkpoint: Checkpoint, run: Path) -> Files:
     (run / FOLDER / "replay").mkdir(parents=True, exist_ok=True)
     files = dict(checkpoint.files)
     for name in checkpoint.files:
+        if (of := re.search(r"seed_(\d+)\.", name)) and int(of[1]) not in seeds:
+            del files[name]
+            continue
         try:
             content = checkpoint.read(name)
         except Damaged:
@@ -81,10 +85,18 @@ def copy(checkpoint: Checkpoint, run: Path) -> Files:
         if not (is_shared and _link(checkpoint.folder / name, run / FOLDER / name)):
             write_atomically(run / FOLDER / name, content)
         if name.endswith(".csv"):
+            content = _rows_of(content, seeds)
+            files[name] = write_file(run / FOLDER, name, content)
             write_atomically(run / name.partition(".")[2], content)
     with suppress(FileNotFoundError), open(checkpoint.folder.parent / LOG, "rb") as log:
         write_atomically(run / LOG, log.read(checkpoint.values["log_bytes"]))
     return files
+
+
+def _rows_of(content: bytes, seeds: Sequence[int]) -> bytes:
+    """Return the header of a table and the rows of these seeds, whose labels are its first column."""
+    header, *rows = content.splitlines(keepends=True)
+    return b"".join([header, *(row for row in rows if int(row.partition(b",")[0]) in seeds)])
 
 
 def _cut_back(path: Path, content: bytes) -> bool:

@@ -174,6 +174,8 @@ class Source(NamedTuple):
         missing = sorted(set(wanted.seeds) - set(before.seeds))
         if missing:
             found.append(f"it has no seeds {', '.join(map(str, missing))}")
+        elif set(wanted.seeds) <= {int(seed) for seed in self.checkpoint.values["failures"]}:
+            found.append(f"every seed asked for had failed by step {self.checkpoint.step}; begin with an earlier step")
         if not found:
             with taken_back(self.checkpoint):
                 problem = misfit(self.checkpoint.seed(wanted.seeds[0]).part("learner"))
@@ -201,11 +203,13 @@ class Source(NamedTuple):
 
     def copy_to(self, run: RunDirectory, keep: int) -> None:
         """Give a new run the tables up to the checkpoint, and the checkpoint."""
-        files = copy(self.checkpoint, run.path)
+        files = copy(self.checkpoint, run.path, run.manifest.seeds)
+        failures = self.checkpoint.values["failures"].items()
+        values = {**self.checkpoint.values, "failures": {k: v for k, v in failures if int(k) in run.manifest.seeds}}
         if self.run.contract.exists():
             run.contract.parent.mkdir()
             shutil.copyfile(self.run.contract, run.contract)
-        Checkpoints(run.checkpoints, keep).commit(self.checkpoint.step, files, self.checkpoint.values)
+        Checkpoints(run.checkpoints, keep).commit(self.checkpoint.step, files, values)
 
 
 def _would_lose_results(run: RunDirectory) -> bool:

@@ -213,6 +213,7 @@ class _Scheduler:
         """Let another process go on from the newest checkpoint, once."""
         reason = worker.cause_of_death()
         self._take_cores(worker)
+        self.waiting = [other for other in self.waiting if other is not worker]
         if self.settings.checkpoints:
             remove_unfinished(self.settings.checkpoints, worker.process.pid)
         if self.stopping and self.checkpoints and index not in self.restarted:
@@ -224,7 +225,9 @@ class _Scheduler:
             return GroupCrashed(again + reason, "")
         self.restarted.add(index)
         begin = self.checkpoints.newest or 0
-        self.workers[index] = _Worker(self.settings._replace(begin=begin), worker.seeds)
+        has_other_task = self.settings.has_other_task and begin == self.settings.begin
+        again = self.settings._replace(begin=begin, has_other_task=has_other_task)
+        self.workers[index] = _Worker(again, worker.seeds)
         self.waiting.append(self.workers[index])
         return GroupRestarted(reason, begin)
 

@@ -231,8 +231,8 @@ def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, re
     with caught_signals(told) as (stop, received):
         recorder = _follow(run, plan, notes, watchers, restart, stop, received)
     if run.manifest.state == "interrupted":
-        is_saved = recorder.checkpoints is not None and recorder.checkpoints.newest is not None
-        raise Interrupted(run, received[0], is_saved)
+        newest = recorder.checkpoints.newest if recorder.checkpoints else None
+        raise Interrupted(run, received[0], newest is not None, run.manifest.steps_done - (newest or 0))
     return run
 
 

@@ -101,6 +101,14 @@ def test_evaluations_are_summed_up_per_seed():
     ]
 
 
+def test_a_seed_that_failed_is_in_no_mean():
+    results = {seed: [EvaluationEpisode(0, value, 10, None)] for seed, value in ((0, 2.0), (1, 4.0), (2, -100.0))}
+    assert text_of(evaluation_table(results, {2: "step 5: a reward is NaN"}))[-2:] == [
+        "mean 3.0",
+        "2 seeds: no interval",
+    ]
+
+
 def test_one_episode_has_no_spread():
     table = text_of(evaluation_table({0: [EvaluationEpisode(0, 1.0, 10, None)]}))
     assert table[1:] == ["0 1.00 1.00 1.00 10.0"]

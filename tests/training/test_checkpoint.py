@@ -31,6 +31,7 @@ from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.record.tensorboard import TensorBoardLog
 from csac.tasks.seeds import SeedEnvironments
+from csac.training import scheduler as scheduler_module
 from csac.training.checkpoint import (
     SCHEMA_VERSION,
     Checkpoint,
@@ -524,8 +525,30 @@ def test_a_worker_that_dies_while_a_run_stops_is_no_failure_unless_it_died_befor
     scheduler.stopping, scheduler.restarted, scheduler.checkpoints = stopping, before, Checkpoints(tmp_path, 2)
     scheduler.settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
     worker: Any = DeadWorker()
+    scheduler.waiting = [worker]
     assert type(scheduler._receive(0, worker)) is kind
     assert worker.over
+    assert not scheduler.waiting
+
+
+def test_a_worker_that_dies_while_it_waits_for_its_turn_gives_its_place_to_the_next(tmp_path, monkeypatch):
+    """With more groups than cores most of them wait; whoever is dead is handed no cores."""
+    told: list[Any] = []
+    monkeypatch.setattr(scheduler_module, "_Worker", lambda settings, seeds: told.append((settings, seeds)) or "next")
+    scheduler: Any = object.__new__(_Scheduler)
+    scheduler.stopping, scheduler.restarted, scheduler.checkpoints = False, set(), Checkpoints(tmp_path, 2)
+    scheduler.settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
+    scheduler.settings = scheduler.settings._replace(begin=0, has_other_task=True)
+    other: Any = object()
+    worker: Any = DeadWorker()
+    scheduler.workers, scheduler.waiting, worker.seeds = [other, worker], [worker, other], (1,)
+    scheduler.checkpoints.commit(300, {}, {"failures": {}})
+    assert scheduler._receive(1, worker) == GroupRestarted("its process was killed by SIGKILL", 300)
+    assert scheduler.waiting == [other, "next"]
+    assert scheduler.workers == [other, "next"]
+    # What it goes on from was made on the task of this run, whatever the run began with.
+    ((settings, seeds),) = told
+    assert (settings.begin, settings.has_other_task, seeds) == (300, False, (1,))
 
 
 def test_a_group_that_merely_stopped_makes_no_checkpoint_whole(recorder):

@@ -442,6 +442,26 @@ def test_a_fork_may_change_hyperparameters_and_says_so(tmp_path):
     assert rows["step"].max() == 400
 
 
+def test_a_fork_with_some_of_the_seeds_has_nothing_of_the_others(tmp_path):
+    """The other one failed, and its rows would be in every mean."""
+    fails = {"where": "step", "at": 130, "seeds": [probes_seed(0, episode) for episode in range(200)]}
+    given: dict[str, Any] = {"task": "probes:Failing-v0", "environment_arguments": fails}
+    with pytest.warns(RuntimeWarning, match="seed 0 of .* failed at step 130"):
+        first = run(tmp_path / "first", steps=200, seeds=2, **given)
+    forked = run(tmp_path / "second", steps=300, seeds=1, first_seed=1, start_from=first.path, **given)
+    assert (forked.manifest.state, forked.manifest.failures) == ("finished", {})
+    ours, theirs = forked.evaluations, first.evaluations
+    np.testing.assert_array_equal(ours["return"][ours["step"] <= 200], theirs["return"][theirs["seed"] == 1])
+    for name in ("evaluations.csv", "episodes.csv", "metrics.csv"):
+        _, *lines = (forked.path / name).read_text().splitlines()
+        assert {line.partition(",")[0] for line in lines} == {"1"}
+    assert not list(forked.path.glob("**/*seed_0*"))
+    assert resume(forked.path, steps=350).manifest.steps_done == 350
+    with pytest.raises(InputError, match="every seed asked for had failed by step 200; begin with an earlier step"):
+        run(tmp_path / "third", steps=300, seeds=1, start_from=first.path, **given)
+    assert not (tmp_path / "third").exists()
+
+
 @pytest.mark.parametrize(
     ("where", "change", "message"),
     [
