@@ -201,14 +201,14 @@ def _evaluate(arguments: list[str]) -> int:
         console.print(line, soft_wrap=True)
     manifest = RunDirectory.open(options.run).manifest
     console.print(evaluation_table(results, manifest.failures))
-    if (cases := case_table(results)) is not None:
+    sound = {seed: episodes for seed, episodes in results.items() if seed not in manifest.failures}
+    if (cases := case_table(sound)) is not None:
         console.print(cases)
     for name in silent_events(results):
         _say(f"note: no episode's last info holds a number called {name!r}")
     for seed in sorted(results.keys() & manifest.failures.keys()):
         _say(f"note: seed {seed} failed at {manifest.failures[seed]}; it is in no mean, and in no file of rows")
     if options.csv:
-        sound = {seed: episodes for seed, episodes in results.items() if seed not in manifest.failures}
         rows = [episode.row(seed, manifest.steps_done) for seed, episodes in sound.items() for episode in episodes]
         write_rows(options.csv, COLUMNS["evaluations"], rows)
         console.print(str(options.csv), soft_wrap=True)

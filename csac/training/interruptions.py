@@ -32,8 +32,7 @@ _CANNOT_WRITE = (
 class Interrupted(Exception):
     """Training was stopped by a signal.
 
-    `is_saved` says whether what was learnt can be gone on with, `steps_lost` how many of the last steps cannot: where
-    none were to be saved any more, or a second signal came before they were.
+    `is_saved` says whether there is a checkpoint to go on from, `steps_lost` how many of the last steps lie beyond it.
     """
 
     def __init__(self, run: RunDirectory, signal_number: int, is_saved: bool, steps_lost: int = 0) -> None:

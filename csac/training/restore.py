@@ -61,7 +61,7 @@ def restore(run: Path, checkpoint: Checkpoint | None) -> list[str]:
 
 
 def copy(checkpoint: Checkpoint, run: Path, seeds: Sequence[int]) -> Files:
-    """Give a new run the tables, the log and the files of another's checkpoint; return the files.
+    """Give a new run the tables, the log and the files of another's checkpoint, of these seeds; return the files.
 
     Transitions, which are never written again, get a second name where the file system has such a thing.
 
@@ -81,13 +81,14 @@ def copy(checkpoint: Checkpoint, run: Path, seeds: Sequence[int]) -> Files:
                 raise
             del files[name]
             continue
-        is_shared = name.startswith("replay/") and name not in checkpoint.mended
-        if not (is_shared and _link(checkpoint.folder / name, run / FOLDER / name)):
-            write_atomically(run / FOLDER / name, content)
         if name.endswith(".csv"):
             content = _rows_of(content, seeds)
             files[name] = write_file(run / FOLDER, name, content)
             write_atomically(run / name.partition(".")[2], content)
+            continue
+        is_shared = name.startswith("replay/") and name not in checkpoint.mended
+        if not (is_shared and _link(checkpoint.folder / name, run / FOLDER / name)):
+            write_atomically(run / FOLDER / name, content)
     with suppress(FileNotFoundError), open(checkpoint.folder.parent / LOG, "rb") as log:
         write_atomically(run / LOG, log.read(checkpoint.values["log_bytes"]))
     return files
