@@ -24,6 +24,7 @@ NANOSECONDS = 10**9
 USUAL_RATE = 100.0  # Hz, where neither the contract nor anybody says one
 OBSERVATIONS = 1024  # that are gone through in turn
 WARM_UP = 1_000  # calls that nobody counts
+MOST_CALLS = 100_000_000  # of one measurement: each takes 16 bytes
 SECONDS_OF_A_PART = 0.25  # of a measurement at a rate: between two parts a Ctrl-C is heard
 
 
@@ -55,21 +56,25 @@ def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, s
 
     Args:
         path: the artefact's folder.
-        calls: how many follow each other flat out, at least 1.
+        calls: how many follow each other flat out, from 1 to 100,000,000.
         rate: Hz; by default the control rate of the task, or 100 where it is not known.
-        seconds: how long calls are made at the rate; 0 leaves that out.
+        seconds: how long calls are made at the rate, of which there may be as many; 0 leaves that out.
 
     Raises:
         InputError: no artefact there, nothing here to run it with, or arguments out of their range.
     """
     if calls < 1:
         raise InputError(f"calls must be at least 1, not {calls}")
+    if calls > MOST_CALLS:
+        raise InputError(f"calls must be at most {MOST_CALLS:,}, not {calls:,}")
     if rate is not None and not 0 < rate <= NANOSECONDS:
         raise InputError(f"the rate must be more than 0 Hz and at most 1e9, not {rate:g}")
     if not 0 <= seconds < float("inf"):
         raise InputError(f"seconds must be 0 or more, not {seconds:g}")
     artefact = open_artefact(path)
     rate = rate or artefact.contract.control_rate or USUAL_RATE
+    if rate * seconds > MOST_CALLS:
+        raise InputError(f"{seconds:g} seconds at {rate:g} Hz are more than {MOST_CALLS:,} calls: take fewer seconds")
     make_calls = (
         _measure_c(artefact) if artefact.format == "c" else measure_python(artefact.act, _observations(artefact))
     )

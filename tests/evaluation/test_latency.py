@@ -103,6 +103,11 @@ def test_the_command_prints_a_row_for_each_and_draws(tmp_path, monkeypatch, caps
         ("", "give the folder of an artefact (csac export writes one)"),
         ("nowhere", "nowhere does not exist; give the folder of an artefact (csac export writes one)"),
         ("numpy --calls 0", "calls must be at least 1, not 0"),
+        ("numpy --calls 100000000000000", "calls must be at most 100,000,000, not 100,000,000,000,000"),
+        (
+            "numpy --rate 1e6 --seconds 1e9",
+            "1e+09 seconds at 1e+06 Hz are more than 100,000,000 calls: take fewer seconds",
+        ),
         ("numpy --rate 0", "the rate must be more than 0 Hz and at most 1e9, not 0"),
         ("numpy --seconds nan", "seconds must be 0 or more, not nan"),
         ("numpy --plot curve.pdf", "the picture is a .png file: name it curve.png"),
