@@ -39,6 +39,7 @@ from csac.tasks.perturbations import perturbations_of
 from csac.types import InputError
 
 HERE = Path(__file__).parent
+CELLS = HERE.parent / "studies"  # one store for all studies, which share cells
 LAST_SHARE = 0.2  # of a run's steps: its evaluations there are its final return
 EARLY = 100_000  # steps at which others publish their returns
 CLOSE = 0.01  # screen scores that are no further apart are equal
@@ -404,7 +405,7 @@ def main() -> None:
     writing = commands.add_parser("write", help="write the arms of a stage, by the results of those before it")
     writing.add_argument("stage", choices=STAGES)
     for command in (tables, writing):
-        command.add_argument("--results", type=Path, default=HERE, help="where cells/ lies")
+        command.add_argument("--results", type=Path, default=CELLS, help="where cells/ lies")
     null = commands.add_parser("null", help="how often the rule tells apart what does not differ")
     for name, default in (("tasks", 3), ("seeds", 5), ("trials", 500)):
         null.add_argument(f"--{name}", type=int, default=default)
