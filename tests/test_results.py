@@ -2,8 +2,10 @@
 
 import csv
 import re
+import runpy
 import shlex
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +61,16 @@ def test_the_command_of_a_study_s_report_writes_it(copied, page):
     assert main(shlex.split(line)) == 0
     assert (there / "report.md").read_text() == page.read_text()
     assert {path.name for path in there.glob("*.svg")} == {path.name for path in page.parent.glob("*.svg")}
+
+
+def test_the_table_of_the_relative_entropy_follows_from_its_runs(copied, monkeypatch, capsys):
+    script = copied / "results" / "reference" / "mechanism.py"
+    monkeypatch.setattr(sys, "argv", [str(script), "draw"])
+    runpy.run_path(str(script), run_name="__main__")
+    table = capsys.readouterr().out.strip()
+    assert table.count("\n") > 10
+    assert f"\n{table}\n" in (ROOT / "docs" / "relative-entropy.md").read_text()
+    assert (script.parent / "mechanism.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
