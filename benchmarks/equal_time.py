@@ -1,4 +1,4 @@
-"""What csac's candidate and its peers reach in equal time: stage 5 of results/strong/PROTOCOL.md, run by run.
+"""What csac's candidate and its peers reach in equal time: stage 4 of results/strong/PROTOCOL.md, run by run.
 
     python -m benchmarks.equal_time seconds     # T of each task: three runs of the candidate
     python -m benchmarks.equal_time run         # every peer for T seconds: 50 runs of some 13 minutes
@@ -31,7 +31,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-STUDY = ROOT / "results" / "strong" / "confirm.toml"  # stage 3: the candidate, the tasks and the seeds
+STUDY = ROOT / "results" / "strong" / "confirm.toml"  # stage 1: the candidate, the tasks and the seeds
 CANDIDATE = "CSAC, candidate"
 FOLDER = ROOT / "results" / "strong" / "equal-time"
 PEERS = ("sb3-sac", "sbx-sac", "sbx-tqc", "sbx-crossq", "sbx-simba")  # peers/models.py has their settings

@@ -1,4 +1,4 @@
-"""The tables of stage 5 in results/strong, by hand: returns at equal time, comparisons, and what is left out."""
+"""The tables of stage 4 in results/strong, by hand: returns at equal time, comparisons, and what is left out."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def folder(tmp_path) -> Path:
     (tmp_path / "seconds.csv").write_text("\n".join(["task,repetition,seconds", *lines, ""]))
     for peer, values in RETURNS.items():
         for (task, limit), value in zip(LIMITS.items(), values, strict=True):
-            for seed in range(200, 205):
+            for seed in range(100, 105):
                 write_peer(tmp_path / task / peer / f"seed-{seed}.csv", 0.0, 2 * value, limit)
     return tmp_path
 
@@ -65,7 +65,7 @@ def test_the_return_at_equal_time_is_the_mean_of_both_evaluations(folder):
     lines = told(folder).splitlines()
 
     assert "| Walker2d-v4 | 20 | 19.0, 20.0, 21.0 |" in lines
-    assert "**Ant-v4: 30.1 s, seeds 200, 201, 202, 203, 204**" in lines
+    assert "**Ant-v4: 30.1 s, seeds 100, 101, 102, 103, 104**" in lines
     assert "| SBX CrossQ | 450.0 ± 0.0 | 450.0 | 1,000 | 900 |" in lines
     assert f"| {CANDIDATE} | 400.0 ± 0.0 | 400.0 | 100,000 |  |" in lines  # Walker2d
     assert f"| {CANDIDATE} | 100.0 ± 0.0 | 100.0 | 100,000 |  |" in lines  # Ant
@@ -102,25 +102,25 @@ def test_the_aim(verdicts, said):
 
 
 def test_below_five_common_seeds_there_is_no_verdict(folder):
-    (folder / "Ant-v4" / "sbx-simba" / "seed-202.csv").unlink()
+    (folder / "Ant-v4" / "sbx-simba" / "seed-102.csv").unlink()
     page = told(folder)
     lines = page.splitlines()
 
-    assert "- not run: SBX SimBa on Ant-v4: seeds 202" in lines
-    assert "- left out, since not every method has them on every task: seeds 202" in lines
-    assert "**Walker2d-v4: 20 s, seeds 200, 201, 202, 203, 204**" in lines
-    assert "**Ant-v4: 30.1 s, seeds 200, 201, 203, 204**" in lines
-    assert "**The candidate against each peer, seeds 200, 201, 203, 204**" in lines
+    assert "- not run: SBX SimBa on Ant-v4: seeds 102" in lines
+    assert "- left out, since not every method has them on every task: seeds 102" in lines
+    assert "**Walker2d-v4: 20 s, seeds 100, 101, 102, 103, 104**" in lines
+    assert "**Ant-v4: 30.1 s, seeds 100, 101, 103, 104**" in lines
+    assert "**The candidate against each peer, seeds 100, 101, 103, 104**" in lines
     assert "| SBX TQC | 1.00 | no verdict | 1.00 (1.00 to 1.00) | 1.00 |" in lines
     assert lines[-1] == "Better than every one of the 5: open: too few seeds."
 
 
 def test_a_seed_that_failed_counts_as_0_and_is_listed(folder):
-    write_peer(folder / "Walker2d-v4" / "sb3-sac" / "seed-201.csv", np.nan, np.nan, LIMITS["Walker2d-v4"])
-    lines = told(folder, failing=lambda cell: "NaN" if (cell.task, cell.seed) == ("Ant-v4", 204) else "").splitlines()
+    write_peer(folder / "Walker2d-v4" / "sb3-sac" / "seed-101.csv", np.nan, np.nan, LIMITS["Walker2d-v4"])
+    lines = told(folder, failing=lambda cell: "NaN" if (cell.task, cell.seed) == ("Ant-v4", 104) else "").splitlines()
 
-    assert "- failed, and counted as 0: SB3 SAC on Walker2d-v4: seeds 201" in lines
-    assert f"- failed, and counted as 0: {CANDIDATE} on Ant-v4: seeds 204" in lines
+    assert "- failed, and counted as 0: SB3 SAC on Walker2d-v4: seeds 101" in lines
+    assert f"- failed, and counted as 0: {CANDIDATE} on Ant-v4: seeds 104" in lines
     # Of 100, 0, 100, 100, 100 the mean is 80 and the standard deviation 40 * 5 / sqrt(20) = 44.7.
     assert "| SB3 SAC | 80.00 ± 44.72 | 0.00 | 1,000 | 900 |" in lines
     assert f"| {CANDIDATE} | 80.00 ± 44.72 | 0.00 |  |  |" in lines
@@ -128,7 +128,7 @@ def test_a_seed_that_failed_counts_as_0_and_is_listed(folder):
 
 def test_the_machine_and_what_else_ran_there_are_told(folder):
     (folder / "machine.txt").write_text("processor: a fast one\n")
-    (folder / "load.csv").write_text("peer,task,seed,load\nsb3-sac,Ant-v4,200,0.01\nsb3-sac,Ant-v4,201,0.05\n")
+    (folder / "load.csv").write_text("peer,task,seed,load\nsb3-sac,Ant-v4,100,0.01\nsb3-sac,Ant-v4,101,0.05\n")
     page = told(folder)
 
     assert "- processor: a fast one\n- other programs kept 0.03 cores busy on average, 0.05 at most\n" in page
@@ -137,20 +137,20 @@ def test_the_machine_and_what_else_ran_there_are_told(folder):
 def test_without_the_candidate_s_stage_nothing_is_compared(folder):
     lines = told(folder, lambda cell, step: None).splitlines()
 
-    assert f"- not run: {CANDIDATE} on Ant-v4: seeds 200, 201, 202, 203, 204" in lines
+    assert f"- not run: {CANDIDATE} on Ant-v4: seeds 100, 101, 102, 103, 104" in lines
     assert lines[-1].startswith("| Ant-v4 | 30.1 |")
 
 
 def test_rows_of_another_time_or_half_a_file_are_refused(folder):
-    path = folder / "Ant-v4" / "sbx-tqc" / "seed-203.csv"
+    path = folder / "Ant-v4" / "sbx-tqc" / "seed-103.csv"
     write_peer(path, 0.0, 1.0, 29.0)
-    with pytest.raises(InputError, match=r"seed-203.csv does not hold two evaluations of a run of 30.1 seconds"):
+    with pytest.raises(InputError, match=r"seed-103.csv does not hold two evaluations of a run of 30.1 seconds"):
         told(folder)
     path.write_text("\n".join(path.read_text().splitlines()[:12]))
-    with pytest.raises(InputError, match=r"seed-203.csv does not hold two evaluations"):
+    with pytest.raises(InputError, match=r"seed-103.csv does not hold two evaluations"):
         told(folder)
     path.write_text("something else\n1\n")
-    with pytest.raises(InputError, match=r"seed-203.csv is missing or damaged: python -m benchmarks.equal_time run"):
+    with pytest.raises(InputError, match=r"seed-103.csv is missing or damaged: python -m benchmarks.equal_time run"):
         told(folder)
     (folder / "seconds.csv").unlink()
     with pytest.raises(InputError, match=r"seconds.csv is missing or damaged: python -m benchmarks.equal_time seconds"):

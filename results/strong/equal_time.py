@@ -1,9 +1,9 @@
-"""What csac's candidate and its peers have learnt in equal time: the tables of stage 5 that PROTOCOL.md asks for.
+"""What csac's candidate and its peers have learnt in equal time: the tables of stage 4 that PROTOCOL.md asks for.
 
     python results/strong/equal_time.py
 
-The runs are those of `python -m benchmarks.equal_time`, in equal-time/; the candidate's are those of stage 3, in
-cells/. The return at equal time of a run is the mean of its two evaluations: a peer's at 0.9 of the time T and at T,
+The runs are those of `python -m benchmarks.equal_time`, in equal-time/; the candidate's are those of stage 1, in
+results/studies. The return at equal time of a run is the mean of its two evaluations: a peer's at 0.9 of the time T and at T,
 the candidate's at 90,000 and 100,000 steps, of which T is the time.
 """
 
@@ -208,7 +208,7 @@ def surroundings(folder: Path) -> list[str]:
 
 
 def told(study: Study, results: Source, folder: Path) -> str:
-    """Return all that is known of stage 5, in Markdown. Raises InputError where T is not known."""
+    """Return all that is known of stage 4, in Markdown. Raises InputError where T is not known."""
     times = read_times(folder / "seconds.csv")
     if missing := [task for task in study.tasks if task not in times]:
         raise InputError(f"{missing[0]} was not timed: python -m benchmarks.equal_time seconds")
@@ -247,7 +247,7 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, default=HERE / "equal-time", help="where the runs' files are")
-    parser.add_argument("--results", type=Path, default=HERE, help="where the candidate's cells/ lies")
+    parser.add_argument("--results", type=Path, default=EVIDENCE.CELLS, help="where the candidate's cells/ lies")
     arguments = parser.parse_args()
     try:
         print(told(read_study(HERE / "confirm.toml"), Results(arguments.results, may_be_empty=True), arguments.folder))
