@@ -112,7 +112,19 @@ class Cadence(NamedTuple):
     transitions_per_update: int
     """Transitions that one call of `update` is given."""
     has_schedule: bool = False
-    """Whether what is learnt depends on how many steps the run has in all, so that it cannot be extended."""
+    """Whether what is learnt depends on how many steps the run has in all, so that it cannot be extended.
+
+    Its state has `total_updates`, by which it is planned.
+    """
+
+    @property
+    def first_update(self) -> int:
+        """The step after which it learns for the first time: the first that ends an interval, once it is warm."""
+        return -(-max(self.warmup_steps, 1) // self.update_interval) * self.update_interval
+
+    def updates(self, steps: int) -> int:
+        """Return how many updates a run of so many steps makes without a warm-up, at least 1."""
+        return max(steps // self.update_interval * self.updates_per_interval, 1)
 
 
 class Algorithm(Protocol):

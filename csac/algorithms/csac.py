@@ -21,7 +21,7 @@ from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, mak
 from csac.algorithms.references import ReferencePolicy, reference_after, references_before
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
-from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
+from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
 class State(NamedTuple):
@@ -51,10 +51,6 @@ NOT_TOGETHER = (
     ({"relative_entropy_weight": ["auto"], "relative_entropy_form": ["implicit"]}, "there is no reference"),
     ({"critic_reference": ["earlier"], "relative_entropy_form": ["actor_only", "implicit"]}, "the target has none"),
     ({"critic_reference": ["earlier"], "reference_policy": ["previous", "average"]}, "no copy replaces another"),
-    (
-        {"critic_reference": ["earlier"], "reference_policy": ["algorithm1"], "policy_delay": range(2, 1_000_000)},
-        "an actor that waits would take its own place",
-    ),
 )
 
 
@@ -115,14 +111,15 @@ class CSAC:
     update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
-    """Share of its average gradient that Adam keeps at each update (its beta1)."""
+    """Share of its average gradient that the networks' Adam keeps at each update (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
+    """Bound on the global norm of each network's gradient, both critics counting as one; 0 leaves gradients alone."""
 
     name: ClassVar[str] = "csac"
 
     def __post_init__(self) -> None:
         take_hyperparameters(self, NOT_TOGETHER)
+        self._refuse_idle_references()
 
     def critic_target(
         self,
@@ -238,7 +235,7 @@ class CSAC:
             learnt_weights=adapted(
                 state.learnt_weights,
                 self.slack(metrics["entropy"], refreshed, noise.shape[-1]),
-                self._optimiser(self.weight_learning_rate),
+                make_optimiser(self.weight_learning_rate),
             ),
             relative_entropy_per_refresh=refreshed,
         )
@@ -293,7 +290,7 @@ class CSAC:
             learnt_weights=begin_weights(
                 (self.entropy_weight, self.relative_entropy_weight),
                 FIRST_WEIGHTS,
-                self._optimiser(self.weight_learning_rate),
+                make_optimiser(self.weight_learning_rate),
             ),
             relative_entropy_per_refresh=jnp.zeros(()) if self.relative_entropy_weight == "auto" else None,
             observations=begin_statistics(spec.observation_size, self.normalise_observations),
@@ -318,3 +315,17 @@ class CSAC:
 
     def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
         return make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)
+
+    def _refuse_idle_references(self) -> None:
+        """Raise InputError where the reference is renewed so soon that an actor that waits has not moved meanwhile."""
+        kept = {"periodic": self.reference_period, "algorithm1": 1}.get(self.reference_policy)
+        least = {
+            "relative_entropy_weight auto": 2 * self.policy_delay if self.relative_entropy_weight == "auto" else 1,
+            "critic_reference earlier": self.policy_delay if self.critic_reference == "earlier" else 1,
+        }
+        for option, updates in least.items():
+            if kept and self.policy_delay > 1 and kept < updates:
+                raise InputError(
+                    f"{option} with policy_delay {self.policy_delay} needs a reference that is kept for at least "
+                    f"{updates} updates, not {kept}: an actor that waits may not have moved meanwhile"
+                )

@@ -35,6 +35,9 @@ WIDTHS = Limit(
 )
 
 
+LARGEST = 2**31 - 1  # compiled programs count in 32 bits
+
+
 def take_hyperparameters(algorithm: Any, not_together: Iterable[tuple[Mapping[str, Sequence[Any]], str]] = ()) -> None:
     """Take an algorithm's fields as plain Python values, and refuse one outside its range or its choices.
 
@@ -42,8 +45,8 @@ def take_hyperparameters(algorithm: Any, not_together: Iterable[tuple[Mapping[st
     `not_together` are values of fields that make no sense together, and why.
 
     Raises:
-        InputError: the first such field, its value and what it may be; fields that make no sense together; or a replay
-            that holds less than a batch.
+        InputError: the first such field, its value and what it may be; fields that make no sense together; a replay
+            that holds less than a batch; or a batch of one to normalise over.
     """
     hints = get_type_hints(type(algorithm), include_extras=True)
     for field in dataclasses.fields(algorithm):
@@ -55,6 +58,8 @@ def take_hyperparameters(algorithm: Any, not_together: Iterable[tuple[Mapping[st
         if all(getattr(algorithm, name) in refused for name, refused in values.items()):
             told = " with ".join(f"{name} {getattr(algorithm, name)}" for name in values)
             raise InputError(f"{told} makes no sense: {why}")
+    if getattr(algorithm, "critic_normalisation", "none") == "batch" and algorithm.batch_size == 1:
+        raise InputError("critic_normalisation batch needs a batch_size of at least 2: one transition has no spread")
     if hasattr(algorithm, "replay_size") and algorithm.replay_size < algorithm.batch_size:
         raise InputError(
             f"replay_size must be at least batch_size, {algorithm.batch_size:,}, not {algorithm.replay_size:,}"
@@ -73,6 +78,8 @@ def _what_it_must_be(value: Any, hint: Any) -> str | None:
         return "true or false"
     if hint is int and not _is_whole(value):
         return "a whole number"
+    if hint is int and value > LARGEST:
+        return f"at most {LARGEST:,}"
     if hint in (float, float | None) and not _is_finite(value) and not (value is None and hint == float | None):
         return "a finite number"
     return next((limit.words for limit in limits if not limit.accepts(value)), None)
@@ -89,4 +96,9 @@ def _is_whole(value: Any) -> bool:
 
 
 def _is_finite(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number that no float reaches
+        return False

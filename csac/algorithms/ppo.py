@@ -261,7 +261,7 @@ class PPO:
             observations=Statistics.create((spec.observation_size,)),
             returns=Statistics.create(()),
             discounted_return=jnp.zeros(()),
-            total_updates=jnp.float32(max(steps // self.rollout_steps, 1)),
+            total_updates=jnp.float32(self.cadence.updates(steps)),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:

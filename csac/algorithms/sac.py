@@ -21,6 +21,9 @@ from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
+# From which an automatic temperature can still rise: a run whose temperature was fixed at 0 may go on with one.
+LEAST_LOG_TEMPERATURE = -18.420680743952367  # log 1e-8
+
 
 class State(NamedTuple):
     """Everything that one seed of SAC learns."""
@@ -77,9 +80,9 @@ class SAC:
     update_interval: Annotated[int, COUNT] = 1
     """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
-    """Share of its average gradient that Adam keeps at each update (its beta1)."""
+    """Share of its average gradient that the networks' Adam keeps at each update (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
+    """Bound on the global norm of each network's gradient, both critics counting as one; 0 leaves gradients alone."""
 
     name: ClassVar[str] = "sac"
 
@@ -153,10 +156,11 @@ class SAC:
 
         log_temperature, temperature_optimiser = state.log_temperature, state.temperature_optimiser
         if self.temperature == "automatic":
+            log_temperature = jnp.maximum(log_temperature, LEAST_LOG_TEMPERATURE)
             target_entropy = self.target_entropy if self.target_entropy is not None else -float(noise.shape[-1])
             temperature_loss = partial(self.temperature_loss, target_entropy=target_entropy)
             mean_entropy = metrics["entropy"][None]  # the loss is linear in it: one example stands for all
-            optimiser = self._optimiser(self.temperature_learning_rate)
+            optimiser = make_optimiser(self.temperature_learning_rate)
             log_temperature, temperature_optimiser, _ = descend(
                 optimiser, temperature_loss, log_temperature, temperature_optimiser, mean_entropy
             )
@@ -191,7 +195,7 @@ class SAC:
             log_temperature=log_temperature,
             actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
             critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
-            temperature_optimiser=begin_descent(self._optimiser(self.temperature_learning_rate), log_temperature),
+            temperature_optimiser=begin_descent(make_optimiser(self.temperature_learning_rate), log_temperature),
             observations=begin_statistics(spec.observation_size, self.normalise_observations),
             actor_metrics=begin_metrics(("actor_loss", "entropy"), self.policy_delay),
         )

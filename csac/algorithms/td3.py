@@ -82,7 +82,7 @@ class TD3:
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
     """Share of its average gradient that Adam keeps at each update (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
+    """Bound on the global norm of each network's gradient, both critics counting as one; 0 leaves gradients alone."""
 
     name: ClassVar[str] = "td3"
 

@@ -293,6 +293,7 @@ class Group:
         self._files = [SeedFiles(checkpoint.folder, seed, checkpoint.files) for seed in self.seeds]
         self._observations, self._actions = self.environments.observations, actions
         if anew:
+            self.learner.break_off(anew, self.step)
             self._actions[anew] = self.learner.next_actions(self._observations, self.step)[anew]
 
 

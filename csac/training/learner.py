@@ -154,6 +154,15 @@ class Learner:
         self._waiting = np.stack([seed.arrays["waiting"] for seed in saved])
         self._updates_summed = int(saved[0].values["updates_summed"])
 
+    def break_off(self, indices: Sequence[int], step: int) -> None:
+        """Mark the last transition of these seeds, after `step` steps, as truncated: what follows is another episode.
+
+        One that an update has learnt from already stays as it was. Only rollouts look across episodes.
+        """
+        interval = self._cadence.update_interval
+        if step % interval:
+            self._waiting[indices, (step - 1) % interval, -1] = 1.0  # `pack` ends with it
+
     def first_bad(self, index: int) -> str | None:
         """Return the name of the first of a seed's arrays that is not finite, or None."""
         for name, array in by_name(self._axis.of(self._states(), index)).items():
@@ -240,9 +249,8 @@ class OneSeed:
 
     def _updates_before(self, step: jax.Array) -> jax.Array:
         """Return how many updates came before those that follow environment step `step`."""
-        interval = self.algorithm.cadence.update_interval
-        first_step = -(-max(self.algorithm.cadence.warmup_steps, 1) // interval) * interval
-        return (step - first_step) // interval * self.algorithm.cadence.updates_per_interval
+        cadence = self.algorithm.cadence
+        return (step - cadence.first_update) // cadence.update_interval * cadence.updates_per_interval
 
     def _act(self, state: Any, key_data: jax.Array, observation: jax.Array, step: jax.Array) -> jax.Array:
         return self.algorithm.act(state, observation, _keys(key_data, step)[2], True)
@@ -256,6 +264,10 @@ def misfit(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str
         if given is None or given.shape != leaf.shape or given.dtype != leaf.dtype:
             found = "no such array" if given is None else f"{given.dtype} {given.shape}"
             return f"{name} is to be {leaf.dtype} {leaf.shape} and the checkpoint has {found}"
+    cadence = algorithm.cadence
+    planned = saved.arrays.get("state.total_updates", cadence.updates(steps))
+    if cadence.has_schedule and planned != cadence.updates(steps):
+        return f"its schedule is of {cadence.updates(steps):,} updates and the checkpoint's of {planned:,.0f}"
     rows = saved.arrays["waiting"]
     if rows.shape != (algorithm.cadence.update_interval, row_width(spec)):
         return f"the checkpoint has rollouts of {len(rows)} steps of width {rows.shape[1]}"

@@ -176,6 +176,10 @@ class Source(NamedTuple):
             found.append(f"it has no seeds {', '.join(map(str, missing))}")
         elif set(wanted.seeds) <= {int(seed) for seed in self.checkpoint.values["failures"]}:
             found.append(f"every seed asked for had failed by step {self.checkpoint.step}; begin with an earlier step")
+        if not found and has_schedule and wanted.steps != before.steps:
+            found.append(
+                f"it was planned for {before.steps:,} steps, and its learning rate with it (a schedule): give as many"
+            )
         if not found:
             with taken_back(self.checkpoint):
                 problem = misfit(self.checkpoint.seed(wanted.seeds[0]).part("learner"))
@@ -189,11 +193,6 @@ class Source(NamedTuple):
         if wanted.steps <= self.checkpoint.step:
             raise InputError(
                 f"steps counts from the beginning: give more than the {self.checkpoint.step:,} made already"
-            )
-        if has_schedule and wanted.steps != before.steps:
-            raise InputError(
-                f"{self.run.path} was planned for {before.steps:,} steps, and its learning rate with it "
-                "(a schedule): give as many"
             )
 
     def described(self, wanted: Manifest, defaults: Mapping[str, Any]) -> Origin:

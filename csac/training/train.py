@@ -341,7 +341,9 @@ def _defaults(algorithm: Algorithm) -> dict[str, Any]:
 
 
 def _warmup_note(plan: Plan) -> list[str]:
-    steps, warmup = plan.steps, plan.algorithm.cadence.warmup_steps
-    if steps >= warmup:
+    steps, warmup, first = plan.steps, plan.algorithm.cadence.warmup_steps, plan.algorithm.cadence.first_update
+    if steps >= first:
         return []
-    return [f"note: nothing will be learnt, since all {steps:,} steps are warm-up (warmup_steps={warmup:,})"]
+    is_warmup = f"all {steps:,} steps are warm-up (warmup_steps={warmup:,})"
+    why = is_warmup if steps < warmup else f"the first update comes after step {first:,}"
+    return [f"note: nothing will be learnt, since {why}"]

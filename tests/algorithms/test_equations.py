@@ -162,6 +162,24 @@ def test_a_fixed_temperature_stays():
     assert float(state.log_temperature) == pytest.approx(math.log(0.2))
 
 
+def test_the_temperature_has_an_adam_of_its_own():
+    """Neither the networks' momentum nor their bound on gradients is its: the first step is the rate, by any slack."""
+    algorithm = SAC(
+        target_entropy=100.0, temperature_learning_rate=0.1, adam_momentum=0.5, max_gradient_norm=1e-12, **LINEAR
+    )
+    state, _ = update(algorithm, algorithm.init(jax.random.key(0), ONE, 1000), batch_of(transition()))
+    (moments, _) = state.temperature_optimiser
+    assert float(moments.mu) < -1.0  # a tenth of the slack of about -100
+    assert float(state.log_temperature) == pytest.approx(0.1, abs=1e-5)
+
+
+def test_a_temperature_that_was_fixed_at_zero_can_rise():
+    fixed = SAC(temperature="fixed", entropy_weight=0.0, **LINEAR).init(jax.random.key(0), ONE, 1000)
+    algorithm = SAC(target_entropy=100.0, temperature_learning_rate=0.1, **LINEAR)
+    state, _ = update(algorithm, fixed, batch_of(transition()))
+    assert float(state.log_temperature) == pytest.approx(math.log(1e-8) + 0.1, abs=1e-5)
+
+
 def test_a_fixed_temperature_may_be_zero_and_its_state_is_finite():
     algorithm = SAC(temperature="fixed", entropy_weight=0.0, **LINEAR)
     state, metrics = update(algorithm, algorithm.init(jax.random.key(0), ONE, 1000), batch_of(transition()))

@@ -110,6 +110,25 @@ def test_every_number_has_a_range():
                     algorithm(**settings)
 
 
+def test_numbers_beyond_what_programs_count_with():
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"reference_period": 10**10}, "reference_period must be at most 2,147,483,647, not 10000000000"),
+        ({"policy_delay": 2**31}, "policy_delay must be at most 2,147,483,647"),
+        ({"discount": 10**400}, "discount must be a finite number"),
+        ({"actor_learning_rate": 10**400}, "actor_learning_rate must be a finite number"),
+    ]
+    for settings, words in cases:
+        with pytest.raises(InputError, match=words):
+            CSAC(**settings)
+
+
+@pytest.mark.parametrize("algorithm", [CSAC, SAC, TD3])
+def test_one_transition_has_no_spread_to_normalise_by(algorithm):
+    with pytest.raises(InputError, match="critic_normalisation batch needs a batch_size of at least 2"):
+        algorithm(critic_normalisation="batch", batch_size=1)
+    algorithm(critic_normalisation="batch", batch_size=2)
+
+
 @pytest.mark.parametrize("algorithm", [CSAC, SAC, TD3, SD3])
 def test_a_replay_holds_a_batch(algorithm):
     with pytest.raises(InputError, match="replay_size must be at least batch_size, 256, not 255"):

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from csac import SAC, train
+from csac import PPO, SAC, train
 from csac.training.options import Options, PlanOptions, checked_options
 from csac.training.plan import Plan
+from csac.training.train import _warmup_note
 from csac.types import InputError
 
 
@@ -82,6 +83,22 @@ def test_a_batch_that_does_not_fit_is_refused_with_what_it_needs(tmp_path):
     with pytest.raises(InputError, match=r"needs about [\d,.]+ GiB of memory and [\d.]+ GiB are available"):
         train(SAC(batch_size=10**9, replay_size=2 * 10**9), "Pendulum-v1", steps=100, directory=tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "steps", "why"),
+    [
+        (SAC(warmup_steps=100), 99, "since all 99 steps are warm-up (warmup_steps=100)"),
+        (SAC(warmup_steps=100, update_interval=500), 499, "since the first update comes after step 500"),
+        (PPO(rollout_steps=64, minibatches=4), 63, "since the first update comes after step 64"),
+    ],
+)
+def test_a_run_in_which_nothing_is_learnt_says_so(algorithm, steps, why):
+    def notes(steps: int) -> list[str]:
+        return _warmup_note(Plan(algorithm=algorithm, task="t", task_name="t", groups=((0,),), steps=steps))
+
+    assert notes(steps) == [f"note: nothing will be learnt, {why}"]
+    assert notes(steps + 1) == []
 
 
 def test_numpy_numbers_are_numbers():

@@ -224,6 +224,31 @@ def test_an_episode_that_cannot_be_saved_is_said(tmp_path):
     assert not finished.manifest.history[0].exact
 
 
+def test_a_rollout_ends_where_its_episode_was_broken_off(tmp_path):
+    """Pendulum's state cannot be saved, so the second seed's next episode follows the checkpoint at once."""
+    first = group(tmp_path, ROLLOUT, (0, 1), 400, task="Pendulum-v1")
+    step = 2 * ROLLOUT.rollout_steps + 3
+    advance(first, step)
+    before = [first.learner.waiting(index).copy() for index in (0, 1)]
+    assert not any(rows[:3, -1].any() for rows in before)
+    Checkpoints(tmp_path, 2).commit(step, first.save().files, {})
+    again = group(tmp_path, ROLLOUT, (0, 1), 400, begin=step, task="Pendulum-v1")
+    for index, rows in enumerate(before):
+        rows[2, -1] = 1.0  # truncated: no advantage is carried back from what follows
+        np.testing.assert_array_equal(again.learner.waiting(index), rows)
+
+
+def test_a_schedule_is_of_the_run_s_own_length(tmp_path):
+    """A run that grew without a schedule was planned for fewer updates: one that falls to 0 would go on below it."""
+    constant = replace(ROLLOUT, learning_rate_schedule="constant")
+    run(tmp_path / "run", constant, steps=130)
+    resume(tmp_path / "run", steps=260)
+    scheduled = replace(ROLLOUT, learning_rate_schedule="linear")
+    updates = 260 // ROLLOUT.rollout_steps
+    with pytest.raises(InputError, match=f"its schedule is of {updates} updates and the checkpoint's of"):
+        run(tmp_path / "fork", scheduled, steps=260, start_from=f"{tmp_path / 'run'}@240")
+
+
 def test_a_failed_seed_stays_failed_and_the_others_go_on(tmp_path):
     task = "probes:Failing-v0"
     arguments = {"where": "step", "at": 130, "seeds": [probes_seed(0, episode) for episode in range(200)]}
