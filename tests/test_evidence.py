@@ -199,6 +199,23 @@ def test_each_stage_is_written_from_the_results_of_those_before(folder):
     assert EVIDENCE.counterpart(study, study.methods[1]).label == chosen[2]
 
 
+def test_a_best_form_in_the_actor_only_is_given_what_it_has_not(folder):
+    def best(cell: Cell, step: int) -> float:
+        return 500.0 if cell.hyperparameters.get("relative_entropy_form") == "actor_only" else returns(cell, step)
+
+    source = MadeRecords(best)
+    EVIDENCE.write("weights", folder, source)
+    EVIDENCE.write("options", folder, source)
+    form = "CSAC, periodic 1000, in the actor only"
+    methods = {method.label: method for method in read_study(folder / "options.toml").methods[2:]}
+    assert list(methods)[1] == form
+    assert f"{form}, in the actor only" not in methods
+    implicit = methods[f"{form}, implicit, log-densities bounded"].hyperparameters_on("Hopper-v4")
+    assert implicit["relative_entropy_form"] == "implicit"
+    two = methods["CSAC, periodic 1000, two references"].hyperparameters_on("Hopper-v4")
+    assert (two["relative_entropy_form"], two["critic_reference"]) == ("explicit", "earlier")
+
+
 def test_nothing_is_chosen_before_every_cell_has_run(folder):
     source = MadeRecords(lambda cell, step: None if cell.seed == 2 else returns(cell, step))
     with pytest.raises(InputError, match=r"SAC, 0.2 on Hopper-v4, seed 2, has not run: run it first"):

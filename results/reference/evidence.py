@@ -320,11 +320,14 @@ def weights(forms: Sequence[Method]) -> list[Method]:
 
 
 def options(forms: Sequence[Method]) -> list[Method]:
-    """Return the best form, and each option on it alone; two references need `periodic`."""
+    """Return the best form, and each option alone that it has not; two references need `periodic` in the target."""
     (form,) = forms
-    base = form if form.hyperparameters["reference_policy"] == "periodic" else PERIODIC
+    told = form.hyperparameters
+    is_explicit = told.get("relative_entropy_form", "explicit") == "explicit"
+    base = form if told["reference_policy"] == "periodic" and is_explicit else PERIODIC
     two = _changed(base, "two references", {"critic_reference": "earlier"})
-    return [form, *(_changed(form, words, changes) for words, changes in OPTIONS.items()), two]
+    new = {words: changes for words, changes in OPTIONS.items() if {**told, **changes} != told}
+    return [form, *(_changed(form, words, changes) for words, changes in new.items()), two]
 
 
 def write(stage: str, folder: Path, source: Source) -> list[Path]:

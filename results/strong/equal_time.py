@@ -3,8 +3,8 @@
     python results/strong/equal_time.py
 
 The runs are those of `python -m benchmarks.equal_time`, in equal-time/; the candidate's are those of stage 1, in
-results/studies. The return at equal time of a run is the mean of its two evaluations: a peer's at 0.9 of the time T and at T,
-the candidate's at 90,000 and 100,000 steps, of which T is the time.
+results/studies. The return at equal time of a run is the mean of its two evaluations: a peer's at 0.9 of the time T and
+at T, the candidate's at 90,000 and 100,000 steps, of which T is the time.
 """
 
 from __future__ import annotations
