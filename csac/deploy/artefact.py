@@ -6,13 +6,14 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from csac.deploy.artefact_contract import CONTRACT, ArtefactContract
+from csac.deploy.artefact_contract import CONTRACT, POLICY_FILES, ArtefactContract
 from csac.deploy.c_source import is_header
 from csac.deploy.contract import read_file
 from csac.deploy.policy import noise_generator
@@ -20,6 +21,8 @@ from csac.deploy.templates import LOADER
 from csac.types import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from csac.deploy.artefact_contract import Format
 
 C_STANDARD = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
@@ -130,6 +133,24 @@ def compile_c(*arguments: str | Path, program: str = "cc") -> None:
         raise InputError(f"{program} does not compile policy.h: {' '.join(complaint.split())}")
 
 
+@contextmanager
+def header_alone(folder: Path, contract: ArtefactContract) -> Iterator[Path]:
+    """Yield a new folder to compile in, which holds the header of an artefact as it was read and looked at.
+
+    Of the artefact's own folder a compiler sees nothing: a `math.h` in it would be taken for the system's.
+
+    Raises:
+        InputError: the header cannot be read, or is not csac's own.
+    """
+    path = folder / contract.file
+    text = read_file(path).decode(errors="replace")
+    if not is_header(text, contract):
+        raise InputError(f"{path} is not a header of this csac, which compiles no other code: export it again")
+    with tempfile.TemporaryDirectory(prefix="csac-") as name:
+        Path(name, POLICY_FILES["c"]).write_bytes(text.encode())
+        yield Path(name)
+
+
 class _NumPy:
     """Runs the loader that lies in the folder, after a look that it is csac's own."""
 
@@ -190,15 +211,12 @@ class _C:
 
     def __init__(self, folder: Path, contract: ArtefactContract) -> None:
         compiler()
-        path = folder / contract.file
-        if not is_header(read_file(path).decode(errors="replace"), contract):
-            raise InputError(f"{path} is not a header of this csac, which compiles no other code: export it again")
         guard = "csac_guard(&state, observation, action);" if contract.guards.is_any else ""
         noisy_entry = _NOISY_ENTRY.format(guard=guard) if contract.noise_seed is not None else ""
-        with tempfile.TemporaryDirectory(prefix="csac-") as name:
-            source, library = Path(name, "artefact.c"), Path(name, "artefact.so")
+        with header_alone(folder, contract) as place:
+            source, library = place / "artefact.c", place / "artefact.so"
             source.write_text(_ENTRIES + noisy_entry)
-            compile_c(*C_STANDARD, "-I", folder, "-fPIC", "-shared", "-O3", source, "-o", library, "-lm")
+            compile_c(*C_STANDARD, "-fPIC", "-shared", "-O3", source, "-o", library, "-lm")
             self._library = ctypes.CDLL(str(library))  # stays in memory without its file
         self._action_size = contract.policy.spec.action_size
         self._step, self._reset = self._library.artefact_step, self._library.artefact_reset

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import tempfile
-from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from csac.deploy.artefact import C_STANDARD, compile_c
+from csac.deploy.artefact import C_STANDARD, compile_c, header_alone
+from csac.deploy.artefact_contract import ArtefactContract
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 TARGETS = {
     "this machine": ("cc", "size", ()),
@@ -46,22 +48,23 @@ def sizes(folder: Path) -> list[Size]:
     """Return the sizes of the C artefact in a folder, compiled with -O2 for each target whose compiler is here.
 
     Raises:
-        InputError: a compiler that does not take it.
+        InputError: no artefact there, a header that is not csac's own, or a compiler that does not take it.
     """
+    contract = ArtefactContract.load(folder)
     return [
-        _size(folder, target, compiler, lister, options)
+        _size(folder, contract, target, compiler, lister, options)
         for target, (compiler, lister, options) in TARGETS.items()
         if shutil.which(compiler) and shutil.which(lister)
     ]
 
 
-def _size(folder: Path, target: str, compiler: str, lister: str, options: tuple[str, ...]) -> Size:
-    with tempfile.TemporaryDirectory(prefix="csac-") as name:
-        source, made = Path(name, "probe.c"), Path(name, "probe.o")
+def _size(
+    folder: Path, contract: ArtefactContract, target: str, compiler: str, lister: str, options: tuple[str, ...]
+) -> Size:
+    with header_alone(folder, contract) as place:
+        source, made = place / "probe.c", place / "probe.o"
         source.write_text(_PROBE)
-        compile_c(
-            *C_STANDARD, *options, "-O2", "-fstack-usage", "-I", folder, "-c", source, "-o", made, program=compiler
-        )
+        compile_c(*C_STANDARD, *options, "-O2", "-fstack-usage", "-c", source, "-o", made, program=compiler)
         listed = subprocess.run([lister, "-A", made], capture_output=True, text=True, check=True).stdout
         stack = sum(int(line.split("\t")[1]) for line in made.with_suffix(".su").read_text().splitlines())
     bytes_of = {"text": 0, "rodata": 0, "data": 0, "bss": 0}

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import tempfile
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from csac.deploy.artefact import C_STANDARD, compile_c, open_artefact
+from csac.deploy.artefact import C_STANDARD, compile_c, header_alone, open_artefact
 from csac.deploy.templates import LATENCY
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from csac.deploy.artefact import Artefact
 
@@ -121,12 +120,12 @@ def _in_parts(make_calls: Measure, calls: int, part: int, period: int) -> tuple[
 
 def _measure_c(artefact: Artefact) -> Measure:
     """Return what makes calls inside of a compiled program, so that none of Python's time is in them."""
-    with tempfile.TemporaryDirectory(prefix="csac-") as name:
-        library = Path(name, "latency.so")
+    with header_alone(artefact.folder, artefact.contract) as place:
+        library = place / "latency.so"
         compile_c(
             *C_STANDARD,
             "-I",
-            artefact.folder,
+            place,
             "-fPIC",
             "-shared",
             "-O3",

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from policies import ALGORITHMS, DICT_PARTS, algorithm_policy, contract, random_policy
 
-from csac.deploy.artefact import Artefact, compile_c, open_artefact
+from csac.deploy.artefact import Artefact, compile_c, header_alone, open_artefact
 from csac.deploy.artefact_contract import ArtefactContract, Format, sha256_of
 from csac.deploy.c_source import noise_state, quantised
 from csac.deploy.contract import Contract
@@ -333,6 +333,31 @@ def test_a_contract_cannot_bring_code_into_its_header(tmp_path):
     write_contract(tmp_path, dataclasses.replace(artefact.contract, policy=policy, sha256=sha256_of(path)))
     with pytest.raises(InputError, match="is not a header of this csac"):
         open_artefact(tmp_path)
+
+
+@needs_compiler
+@pytest.mark.parametrize("header", ["float.h", "math.h", "stdint.h", "time.h"])
+def test_a_header_of_the_system_s_that_lies_beside_is_not_compiled(tmp_path, monkeypatch, header):
+    from csac.deploy.c_size import sizes
+    from csac.evaluation import latency
+
+    monkeypatch.setattr(latency, "WARM_UP", 1)
+    leave(tmp_path, algorithm_policy("csac"), "c")
+    (tmp_path / header).write_text("#error a stranger's\n")
+    assert np.isfinite(open_artefact(tmp_path).act(np.zeros(5))).all()
+    assert len(latency.measure(tmp_path, calls=3, seconds=0)[0].durations) == 3
+    assert isinstance(sizes(tmp_path), list)
+
+
+@needs_compiler
+def test_what_is_compiled_is_what_was_looked_at(tmp_path):
+    artefact = leave(tmp_path, algorithm_policy("csac"), "c")
+    with header_alone(tmp_path, artefact.contract) as place:
+        (tmp_path / "policy.h").write_text("#error exchanged meanwhile\n")
+        assert [path.name for path in place.iterdir()] == ["policy.h"]
+        assert "csac_step" in (place / "policy.h").read_text()
+    with pytest.raises(InputError, match="is not a header of this csac"), header_alone(tmp_path, artefact.contract):
+        pass
 
 
 def test_an_observation_of_another_size_is_refused(tmp_path, format):
