@@ -99,7 +99,10 @@ class GuardState:
 def guarded(
     guards: Guards, state: GuardState, contract: Contract, observation: np.ndarray, action: np.ndarray
 ) -> np.ndarray:
-    """Return what leaves instead of the policy's `action` [action] at `observation` [observation]; changes `state`."""
+    """Return what leaves instead of the policy's `action` [action] at `observation` [observation]; changes `state`.
+
+    With guards it is an array of the caller's own: neither the fallback nor the state changes with it.
+    """
     if not guards.is_any:
         return action
     is_inside = (observation >= guards.observation_low) & (observation <= guards.observation_high)
@@ -114,7 +117,7 @@ def guarded(
         action = np.clip(action, state.last - guards.largest_change, state.last + guards.largest_change)
         action = np.clip(action, contract.action_low, contract.action_high)
     state.last = action.copy()
-    return action
+    return action.copy()
 
 
 def make_guards(

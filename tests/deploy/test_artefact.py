@@ -238,6 +238,29 @@ def test_every_format_guards_as_defined(tmp_path, format, given):
     assert np.isfinite(expected).all() or chosen.fallback is None
 
 
+@pytest.mark.parametrize(
+    "given", [{"fallback": "0.25,-0.5,2"}, {"fallback": "last"}, {"fallback": "0.25,-0.5,2", "rate_limit": 1.0}]
+)
+def test_an_action_is_the_callers_own(tmp_path, format, given):
+    policy = algorithm_policy("csac")
+    chosen = make_guards(policy.contract, **given)
+    artefact, state = leave(tmp_path, policy, format, guards=chosen), GuardState()
+    good, bad = np.zeros(5, np.float32), np.full(5, np.nan, np.float32)
+    answers = []
+    for observation in (good, bad, bad, good, bad):
+        action = policy.contract.to_environment(policy.act(observation[None])[0])
+        expected = guarded(chosen, state, policy.contract, observation, action)
+        answer = artefact.act(observation)
+        answers.append(answer.copy())
+        np.testing.assert_allclose(answer, expected, atol=2e-5)
+        answer *= 100.0  # as a controller may, in place
+        expected *= 100.0
+    np.testing.assert_array_equal(answers[1], answers[2])
+    np.testing.assert_array_equal(answers[1], answers[4])
+    if given["fallback"] != "last":
+        np.testing.assert_array_equal(answers[1], np.array([0.25, -0.5, 2.0], np.float32))
+
+
 def test_guards_come_back_out_of_the_contract(tmp_path):
     policy = algorithm_policy("csac")
     chosen = make_guards(policy.contract, "last", LOW, HIGH, 4, 0.02)

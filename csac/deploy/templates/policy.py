@@ -85,7 +85,7 @@ class Policy:
             action = np.minimum(np.maximum(action, low), high)
             action = np.minimum(np.maximum(action, self.low), self.high)
         self.last = np.array(action)
-        return action
+        return np.array(action)  # the caller's own: to change it must not change the fallback
 
     def _networks(self, kind):
         """Return the layers of each actor or critic, in order: weight [in, out] and bias [out]."""
