@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from csac.deploy import tensors
 from csac.deploy.artefact_contract import CONTRACT, POLICY_FILES, sha256_of
+from csac.deploy.contract import read_json
 from csac.deploy.parameters import to_tensors
 from csac.deploy.templates import LOADER
 from csac.record.atomic import write_atomically
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
 CARD = "README.md"
 CURVE = "curve.png"
 
-# With what Python leaves where the loader was imported.
-_OURS = {CONTRACT, CARD, CURVE, LOADER.name, *POLICY_FILES.values(), "__pycache__"}
+# What may lie beside an artefact's policy, with what Python leaves where the loader was imported.
+_BESIDE = {CONTRACT, CARD, CURVE, LOADER.name, "__pycache__"}
 
 
 def write_artefact(folder: Path, network: PolicyNetwork, contract: ArtefactContract) -> ArtefactContract:
@@ -64,8 +65,21 @@ def check_place(place: Path) -> None:
     if place.exists() and not place.is_dir():
         raise InputError(f"{place} is a file: choose a folder for the artefact")
     names = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
-    if names and not (CONTRACT in names and names <= _OURS):
-        raise InputError(f"{place} holds more than an artefact: choose a new or an empty folder")
+    if names and names - _BESIDE != {_policy_file(place)}:
+        raise InputError(f"{place} holds something else than an artefact: choose a new or an empty folder")
+
+
+def _policy_file(folder: Path) -> str | None:
+    """Return the policy's file that an artefact's contract in a folder names, of whatever version; None without one.
+
+    A policy that was saved by itself has a contract too, which names no file.
+    """
+    try:
+        fields = read_json(folder / CONTRACT)
+    except InputError:
+        return None
+    is_artefact = isinstance(fields, dict) and "artefact_version" in fields
+    return next((name for name in POLICY_FILES.values() if is_artefact and name == fields.get("file")), None)
 
 
 @contextmanager

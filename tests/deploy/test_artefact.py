@@ -19,7 +19,7 @@ from csac.deploy.c_source import noise_state, quantised
 from csac.deploy.contract import Contract
 from csac.deploy.guards import Guards, GuardState, guarded, make_guards
 from csac.deploy.policy import Policy, noise_generator
-from csac.deploy.writing import placed, write_artefact, write_contract
+from csac.deploy.writing import check_place, placed, write_artefact, write_contract
 from csac.types import InputError
 
 FORMATS: tuple[Format, ...] = ("numpy", "onnx", "c")
@@ -591,21 +591,50 @@ def test_what_is_raised_on_the_way_leaves_nothing_behind(tmp_path):
 
 
 def test_an_older_artefact_is_replaced_and_nothing_else(tmp_path):
-    place = tmp_path / "made"
-    for number in range(2):
+    place, policy = tmp_path / "made", algorithm_policy("td3")
+
+    def put(version: int) -> None:
         with placed(place) as folder:
-            (folder / "contract.json").write_text(str(number))
-    assert (place / "contract.json").read_text() == "1"
+            write_artefact(folder, policy.network, ArtefactContract(policy.contract, "numpy"))
+            fields = json.loads((folder / "contract.json").read_text())
+            (folder / "contract.json").write_text(json.dumps(fields | {"artefact_version": version}))
+
+    def version() -> int:
+        return json.loads((place / "contract.json").read_text())["artefact_version"]
+
+    put(0)  # one that an older csac wrote
+    put(2)
+    assert version() == 2
     (place / "__pycache__").mkdir()  # which Python leaves where the loader was imported
-    with placed(place) as folder:
-        (folder / "contract.json").write_text("2")
-    assert {path.name for path in place.iterdir()} == {"contract.json"}
+    put(3)
+    assert version() == 3
+    assert {path.name for path in place.iterdir()} == {"contract.json", "policy.py", "policy.safetensors"}
     (place / "notes.txt").touch()
-    with pytest.raises(InputError, match="holds more than an artefact"), placed(place):
+    with pytest.raises(InputError, match="holds something else than an artefact"), placed(place):
         pass
     with pytest.raises(InputError, match="is a file"), placed(place / "notes.txt"):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == ["made"]
+
+
+@pytest.mark.parametrize(
+    "kept", ["a saved policy", "a contract of somebody's", "no JSON", "no policy", "another policy"]
+)
+def test_what_only_looks_like_an_artefact_is_not_replaced(tmp_path, kept):
+    place, policy = tmp_path / "kept", algorithm_policy("td3")
+    if kept == "a saved policy":
+        policy.save(place)
+    elif kept in ("no policy", "another policy"):
+        leave(place, policy, "numpy")
+        (place / "policy.safetensors").rename(place / ("policy.h" if kept == "another policy" else "README.md"))
+    else:
+        place.mkdir()
+        (place / "contract.json").write_text("{" if kept == "no JSON" else '{"file": "policy.h", "parties": 2}')
+        (place / "README.md").write_text("Ours.")
+    before = {path.name: path.read_bytes() for path in place.iterdir()}
+    with pytest.raises(InputError, match="holds something else than an artefact"):
+        check_place(place)
+    assert {path.name: path.read_bytes() for path in place.iterdir()} == before
 
 
 def test_noise_is_a_stream_of_its_own():

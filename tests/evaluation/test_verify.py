@@ -388,7 +388,7 @@ def test_the_card_has_the_header_of_the_hub_and_the_numbers_of_the_run(tmp_path)
         ("export run --seed worst", "--seed worst: give best, or the label of a seed"),
         ("export run --episodes 0", "--episodes 0: give at least 1, or --no-rollouts"),
         ("export run --weights int4", "--weights: 'int4' is not one of"),
-        ("export run --out run", "run holds more than an artefact"),
+        ("export run --out run", "run holds something else than an artefact"),
         ("export run --rate-limit 2", "a rate limit of 2.0"),
     ],
 )
