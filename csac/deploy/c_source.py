@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from csac.deploy.parameters import check_network
 from csac.deploy.templates import template
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters
 
@@ -95,21 +96,26 @@ def _in_comment(text: str) -> str:
 def is_header(text: str, contract: ArtefactContract) -> bool:
     """Whether a header is what `c_header` writes for this contract, but for the numbers of its arrays.
 
-    So it can be compiled and run without running anybody else's code.
+    So it can be compiled and run without running anybody else's code, and reads no number beyond an array.
     """
     sizes = {name: int(size) for name, size in _ARRAY.findall(text)}
     if sum(sizes.values()) > len(text):  # each number takes a letter at least
         return False
     try:
-        expected = c_header(_network_of_zeros(sizes, contract), contract)
-    except (KeyError, ValueError, ZeroDivisionError):  # arrays that no network has
+        network = _network_of_zeros(sizes, contract)
+        check_network(network, contract.policy)
+        expected = c_header(network, contract)
+    except (KeyError, ValueError, ArithmeticError):  # arrays that no network has, or that do not fit each other
         return False
     return _NUMBERS.sub("", text) == _NUMBERS.sub("", expected)
 
 
 def _network_of_zeros(sizes: Mapping[str, int], contract: ArtefactContract) -> PolicyNetwork:
-    """Return a network whose header has arrays of these sizes."""
+    """Return a network whose header has arrays of these sizes; its own take no memory, whatever sizes they claim."""
     observation_size, action_size = contract.policy.spec
+
+    def filled(number: float, *shape: int) -> np.ndarray:
+        return np.broadcast_to(np.float32(number), shape)
 
     def networks(kind: str, outputs: int) -> tuple[tuple[Layer, ...], ...]:
         found: list[tuple[Layer, ...]] = []
@@ -117,18 +123,18 @@ def _network_of_zeros(sizes: Mapping[str, int], contract: ArtefactContract) -> P
             prefix, layers = f"{kind}_{len(found)}", []
             while (name := f"{prefix}_{len(layers)}") + "_bias" in sizes:
                 width = sizes[name + "_bias"]
-                layers.append(Layer(np.zeros((sizes[name + "_weight"] // width, width)), np.zeros(width)))
-            last = np.zeros((len(layers[-1].weight), outputs))
-            found.append((*layers[:-1], Layer(last, np.zeros(outputs))))
+                layers.append(Layer(filled(0, sizes[name + "_weight"] // width, width), filled(0, width)))
+            last = filled(0, len(layers[-1].weight), outputs)
+            found.append((*layers[:-1], Layer(last, filled(0, outputs))))
         return tuple(found)
 
     outputs = 2 * action_size if contract.policy.head == "tanh_gaussian" else action_size
-    zeros, ones = np.zeros(observation_size), np.ones(observation_size)
+    mean, std, limit = filled(0, observation_size), filled(1, observation_size), filled(1)
     parameters = PolicyParameters(
         networks("actor", outputs),
         networks("critic", 1),
-        Normaliser(zeros, ones, np.ones(1)) if "observation_mean" in sizes else None,
-        np.zeros(action_size) if contract.policy.head == "clipped_gaussian" else None,
+        Normaliser(mean, std, limit) if "observation_mean" in sizes else None,
+        filled(0, action_size) if contract.policy.head == "clipped_gaussian" else None,
     )
     return PolicyNetwork(parameters, contract.policy.activation, contract.policy.head)
 

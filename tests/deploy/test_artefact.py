@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from policies import ALGORITHMS, DICT_PARTS, algorithm_policy, contract, random_policy
+from policies import ALGORITHMS, DICT_PARTS, algorithm_policy, contract, random_layers, random_policy
 
 from csac.deploy.artefact import Artefact, compile_c, header_alone, open_artefact
 from csac.deploy.artefact_contract import ArtefactContract, Format, sha256_of
@@ -20,7 +20,7 @@ from csac.deploy.contract import Contract
 from csac.deploy.guards import Guards, GuardState, guarded, make_guards
 from csac.deploy.policy import Policy, noise_generator
 from csac.deploy.writing import check_place, placed, write_artefact, write_contract
-from csac.types import InputError
+from csac.types import InputError, PolicyParameters
 
 FORMATS: tuple[Format, ...] = ("numpy", "onnx", "c")
 HAS_COMPILER = shutil.which("cc") is not None
@@ -354,6 +354,32 @@ def test_a_contract_cannot_bring_code_into_its_header(tmp_path):
     path.write_text(f"{first.replace(known, task)}\n{rest}")
     assert "evil" in path.read_text()
     write_contract(tmp_path, dataclasses.replace(artefact.contract, policy=policy, sha256=sha256_of(path)))
+    with pytest.raises(InputError, match="is not a header of this csac"):
+        open_artefact(tmp_path)
+
+
+@needs_compiler
+@pytest.mark.parametrize("sizes", [(7, 32, 3), (5, (32, 900), 3), (5, (32, 31), 3)])
+def test_a_header_whose_layers_do_not_fit_is_not_compiled(tmp_path, sizes):
+    """It would read beyond the observation, or beyond what the layer before has written."""
+    first, hidden, last = sizes
+    given, taken = hidden if isinstance(hidden, tuple) else (hidden, hidden)
+    layers = random_layers(first, given) + random_layers(taken, last)
+    policy = algorithm_policy("td3")
+    network = policy.network._replace(parameters=PolicyParameters((layers,)))
+    contract = ArtefactContract(policy.contract, "c")
+    write_artefact(tmp_path, network, contract)
+    with pytest.raises(InputError, match="is not a header of this csac"):
+        open_artefact(tmp_path)
+
+
+@needs_compiler
+@pytest.mark.parametrize("size", [10**12, 10**30])
+def test_sizes_that_nobody_has_memory_for_are_refused(tmp_path, size):
+    artefact = leave(tmp_path, algorithm_policy("ppo"), "c")
+    parts = ((None, (size,)),)
+    policy = dataclasses.replace(artefact.contract.policy, observation_parts=parts)
+    write_contract(tmp_path, dataclasses.replace(artefact.contract, policy=policy))
     with pytest.raises(InputError, match="is not a header of this csac"):
         open_artefact(tmp_path)
 
