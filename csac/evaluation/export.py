@@ -21,7 +21,7 @@ from csac.deploy.writing import CARD, CURVE, check_place, placed, write_artefact
 from csac.evaluation.verify import Compared, Returns, compare_actions, compare_returns, record, returns_as_fields
 from csac.record.atomic import write_atomically
 from csac.record.run import RunDirectory, Which
-from csac.record.statistics import evaluation_matrix
+from csac.record.statistics import evaluation_matrix, last_evaluations
 from csac.tasks.environment import Environment
 from csac.tasks.trust import refuse_untrusted
 from csac.types import InputError
@@ -192,7 +192,8 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
     """Return where a policy comes from and how good it was in training, as JSON holds it.
 
     The returns are those of the evaluation that belongs to the policy: the seed's last one, or its best; the interval
-    is over that evaluation's episodes. Those of `all_seeds` are of their last evaluations, and the interval over seeds.
+    is over that evaluation's episodes. Those of `all_seeds` are of their last evaluations, and the interval over seeds,
+    of which those that failed in training are left out as in every table.
     """
     manifest, rows = run.manifest, run.evaluations
     own = rows[rows["seed"] == seed] if len(rows) else rows
@@ -201,8 +202,9 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
         steps, _, returns = evaluation_matrix(own)
         step = int(steps[np.argmax(returns[0]) if which == "best" else -1])
         evaluation = {"step": step, **returns_as_fields(own["return"][own["step"] == step])}
-    _, seeds, returns = evaluation_matrix(rows) if len(rows) else (None, np.zeros(0), np.zeros((0, 0)))
-    over = returns_as_fields(np.array([line[~np.isnan(line)][-1] for line in returns])) if len(seeds) else {}
+    last = last_evaluations(rows, points=1) if len(rows) else {}
+    sound = [value for label, value in last.items() if label not in manifest.failures]
+    over = returns_as_fields(np.array(sound)) if sound else {}
     over = {"seeds" if name == "episodes" else name: value for name, value in over.items()}
     return {
         "task": manifest.task,
@@ -213,7 +215,7 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
         "preset": manifest.preset,
         "seed": seed,
         "checkpoint": which,
-        "steps": evaluation.get("step", manifest.steps_done) if which == "best" else manifest.steps_done,
+        "steps": evaluation.get("step", manifest.steps_done) if which == "best" else manifest.steps_of(seed),
         "commit": manifest.commit,
         "versions": manifest.versions,
         "command": manifest.command,

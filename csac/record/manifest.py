@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import types
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -129,6 +130,11 @@ class Manifest:
             raise InputError(f"evaluation has the first seed {self.evaluation.first_seed}, which no episode can have")
         if self.checkpoints.interval < 0 or self.checkpoints.keep < 0:
             raise InputError("checkpoints have an interval or a number to keep below 0")
+
+    def steps_of(self, seed: int) -> int:
+        """Return how many environment steps a seed has made: those of the run, or those until it failed."""
+        failed = re.match(r"step (\d{1,15}):", self.failures.get(seed, ""))
+        return int(failed[1]) if failed else self.steps_done
 
 
 # What every csac has written: where it is missing, its default would be a guess.

@@ -23,7 +23,7 @@ from csac.deploy.policy import Policy
 from csac.deploy.writing import write_artefact
 from csac.evaluation import verify
 from csac.evaluation.evaluator import evaluate
-from csac.evaluation.export import ExportOptions, control_rate, export_run
+from csac.evaluation.export import ExportOptions, control_rate, export_run, provenance
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.tasks.seeds import FRESH_EVALUATION_SEED
@@ -231,6 +231,20 @@ def test_the_best_policy_of_a_seed_comes_with_its_own_evaluation(tmp_path):
     origin = export(tmp_path / "run", seed=0, which="best", options=QUICK).contract.provenance
     assert (origin["seed"], origin["steps"]) == (0, 100)
     assert origin["evaluation"]["mean_return"] == 7.0
+
+
+def test_seeds_that_failed_count_in_no_mean_and_end_where_they_failed(tmp_path):
+    run = make_run(tmp_path / "run")
+    run.update_manifest(failures={0: "step 120: its reward is nan"})
+    origin = provenance(RunDirectory.open(run.path), 1, "last")
+    assert origin["all_seeds"]["seeds"] == 1
+    assert origin["all_seeds"]["mean_return"] == 4.0  # that of seed 1 alone: 3, 4 and 5
+    assert origin["steps"] == 200
+    assert provenance(RunDirectory.open(run.path), 0, "last")["steps"] == 120
+    run.update_manifest(failures={0: "step 120: its reward is nan", 1: "lost"})
+    origin = provenance(RunDirectory.open(run.path), 1, "last")
+    assert origin["all_seeds"] == {}
+    assert origin["steps"] == 200  # nobody says when it was
 
 
 @needs_compiler
