@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rich import box
-from rich.table import Table
-
-from csac.console.tables import number
+from csac.console.tables import Fitted, number
+from csac.record.rendering import Cell, Row, Table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,17 +32,13 @@ def export_lines(exported: Exported) -> list[str]:
     return [*lines, f"  {told}"]
 
 
-def size_table(exported: Sequence[Exported]) -> Table | None:
+def size_table(exported: Sequence[Exported]) -> Fitted | None:
     """Return what a C artefact takes, in bytes; None where there is none, or nothing here to measure it with."""
     sizes = [size for one in exported for size in one.sizes]
     if not sizes:
         return None
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    for heading in ("C, bytes", "code", "constants", "data", "stack at most"):
-        table.add_column(heading, justify="left" if heading == "C, bytes" else "right")
-    for size in sizes:
-        table.add_row(size.target, *(f"{count:,}" for count in size[1:]))
-    return table
+    rows = [Row((Cell(size.target), *(Cell(f"{count:,}", count) for count in size[1:]))) for size in sizes]
+    return Fitted(Table(("C, bytes", "code", "constants", "data", "stack at most"), tuple(rows)))
 
 
 def _returns_line(returns: Returns) -> str:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich import box
-from rich.table import Table
+
+from csac.console.tables import Fitted
+from csac.record.rendering import EMPTY, Cell, Row, Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -16,15 +17,15 @@ if TYPE_CHECKING:
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
 
-def latency_table(measured: Mapping[str, Sequence[Latency]]) -> Table:
+def latency_table(measured: Mapping[str, Sequence[Latency]]) -> Fitted:
     """Return the microseconds of single calls, a row for each artefact and way to call it."""
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    for heading in ("μs for one action", "calls", "", *PERCENTILES, "begun late: p99", "max"):
-        table.add_column(heading, justify="left" if heading in ("μs for one action", "calls") else "right")
-    for name, several in measured.items():
-        for latency in several:
-            table.add_row(name, way_of(latency), f"{len(latency.durations):,}", *latency_cells(latency))
-    return table
+    headings = ("μs for one action", "calls", *PERCENTILES, "late: p99", "late: max")
+    rows = [
+        Row((Cell(f"{name}, {way_of(latency)}"), *map(_cell, [f"{len(latency.durations):,}", *latency_cells(latency)])))
+        for name, several in measured.items()
+        for latency in several
+    ]
+    return Fitted(Table(headings, tuple(rows), note="late: how long after its time a call began"))
 
 
 def way_of(latency: Latency) -> str:
@@ -36,6 +37,10 @@ def latency_cells(latency: Latency) -> list[str]:
     """Return the percentiles of the durations, and the two of the lateness, in microseconds."""
     late = ["", ""] if latency.lateness is None else _microseconds(latency.lateness, (99.0, 100.0))
     return _microseconds(latency.durations, PERCENTILES.values()) + late
+
+
+def _cell(text: str) -> Cell:
+    return Cell(text, float(text.replace(",", ""))) if text else EMPTY
 
 
 def _microseconds(nanoseconds: np.ndarray, percentiles: Iterable[float]) -> list[str]:

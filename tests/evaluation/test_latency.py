@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import shlex
 import shutil
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from policies import algorithm_policy
+from rich.console import Console
 
 from csac.cli import main
-from csac.console.latencies import latency_cells
+from csac.console.exports import size_table
+from csac.console.latencies import latency_cells, latency_table
 from csac.deploy.artefact_contract import ArtefactContract
+from csac.deploy.c_size import Size
 from csac.deploy.writing import write_artefact
 from csac.evaluation import latency
+from csac.evaluation.export import Exported
 from csac.evaluation.latency import Latency, measure, measure_python
 from csac.types import InputError
 
@@ -91,10 +97,25 @@ def test_the_command_prints_a_row_for_each_and_draws(tmp_path, monkeypatch, caps
     folder, picture = leave(tmp_path / "numpy", "numpy"), tmp_path / "latency.png"
     assert main(shlex.split(f"latency {folder} --calls 20 --rate 1000 --seconds 0.01 --plot {picture}")) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    rows = [line[1:] for line in lines if line and line[0].endswith("/numpy")]
+    rows = [line[1:] for line in lines if line and line[0].endswith("/numpy,")]
     assert [row[:3] for row in rows] == [["flat", "out", "20"], ["at", "1000", "Hz"]]
     assert [len(row) for row in rows] == [7, 10]
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 200])
+def test_no_number_is_cut_at_any_width(width):
+    console = Console(file=io.StringIO(), width=width)
+    several = [Latency(np.full(100_000, 3_800)), Latency(np.full(500, 4_000), np.full(500, 123_456_789), 50.0)]
+    console.print(latency_table({"runs/cheetah/export/numpy": several}))
+    size = Size("this machine", 2_345, 1_234_567, 0, 1_024)
+    console.print(size_table([Exported(Path(), None, [], None, [size])]))  # pyright: ignore[reportArgumentType]
+    text = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+    words = [word for line in text.splitlines() for word in line.split()]
+    for word in ("100,000", "500", "3.8", "4.0", "123,457", "2,345", "1,234,567", "1,024", "p99.9"):
+        assert word in words
+    assert "…" not in text
+    assert all(len(line) <= width for line in text.splitlines())
 
 
 @pytest.mark.parametrize(
