@@ -137,7 +137,7 @@ class Evaluator:
         if self._environments and self._environments[0].has_memory:
             self.close()
         self._make_environments()
-        _check_contract(policy, self._environments[0])
+        check_contract(policy, self._environments[0])
         return self._run_batch(policy, range(first, min(first + EPISODES_AT_ONCE, self.episodes)), deterministic)
 
     def close(self) -> None:
@@ -310,7 +310,8 @@ def _check_episodes(episodes: int, first_seed: int) -> None:
     check_whole("first_seed", first_seed, 0, SEED_LIMIT - episodes)
 
 
-def _check_contract(policy: Policy, environment: Environment) -> None:
+def check_contract(policy: Policy, environment: Environment) -> None:
+    """Raise InputError where a policy was trained on other observations or actions than a task has now."""
     parts = environment.contract_parts
     known = (policy.contract.observation_parts, policy.contract.action_shape)
     given = (parts.observation_parts, parts.action_shape)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.deploy.choosing import load
-from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator
+from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
@@ -126,6 +126,7 @@ def play(
     )
     longest, done = _longest_episode(environment), 0
     try:
+        check_contract(policy, environment)
         environment.perturb(perturbed)
         _follow(environment)
         with _recording(environment, picture, frames_per_second, video) as record:
@@ -134,8 +135,8 @@ def play(
                 episode_return, length, ended = 0.0, 0, False
                 record()
                 while not ended:
-                    action = policy.act(observation[None])[0]
-                    observation, reward, terminated, truncated, _ = environment.step(action)
+                    action = policy.contract.to_environment(policy.act(observation[None])[0])
+                    observation, reward, terminated, truncated, _ = environment.step_environment_scale(action)
                     episode_return, length = episode_return + reward, length + 1
                     ended = terminated or truncated or length >= longest
                     record()

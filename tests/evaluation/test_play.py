@@ -11,15 +11,20 @@ import pytest
 from gymnasium import spaces
 from policies import contract, random_policy
 
+from csac.deploy.contract import Contract
 from csac.evaluation import play as playing
 from csac.evaluation.play import evaluate_run, play
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
+from csac.types import InputError
 
 # JAX may be loaded here; where csac plays, it is not.
 pytestmark = pytest.mark.filterwarnings(
     "ignore:os.fork:RuntimeWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
+
+
+ACTIONS: list[list[float]] = []  # that reached the task
 
 
 class Stripes(gymnasium.Env):
@@ -39,6 +44,7 @@ class Stripes(gymnasium.Env):
 
     def step(self, action):
         self.steps += 1
+        ACTIONS.append(action.tolist())
         return np.zeros(2, np.float32), 1.0, False, False, {}
 
     def render(self):
@@ -47,14 +53,15 @@ class Stripes(gymnasium.Env):
 
 @pytest.fixture
 def run_of(tmp_path):
-    def make(steps: int | None) -> RunDirectory:
+    def make(steps: int | None, agreement: Contract | None = None) -> RunDirectory:
+        agreement = agreement or contract()
         task = f"Stripes-v{steps or 0}"
         if task not in gymnasium.registry:
             gymnasium.register(task, entry_point=f"{__name__}:Stripes", max_episode_steps=steps)
         run = RunDirectory.create(tmp_path / "run", Manifest(task=task, algorithm="csac", seeds=(0,), steps=9))
         run.contract.parent.mkdir()
-        contract().save(run.contract)
-        random_policy(contract()).save_layers(run.policy(0))
+        agreement.save(run.contract)
+        random_policy(agreement).save_layers(run.policy(0))
         return run
 
     return make
@@ -78,6 +85,38 @@ def test_play_breaks_off_an_episode_that_never_ends(run_of, tmp_path, monkeypatc
     )
     assert episode.length == 5
     assert told[-1] == (5, 5)
+
+
+@pytest.mark.parametrize(
+    ("agreement", "message"),
+    [
+        (
+            contract(((None, (3,)),)),
+            r"trained on observations \(3,\) and actions \(1,\); Stripes-v3 has \(2,\) and \(1,\)",
+        ),
+        (
+            contract(action_shape=(2,)),
+            r"trained on observations \(2,\) and actions \(2,\); Stripes-v3 has \(2,\) and \(1,\)",
+        ),
+    ],
+)
+def test_a_task_whose_spaces_have_changed_is_not_played(run_of, tmp_path, agreement, message):
+    with pytest.raises(InputError, match=message):
+        list(play(run_of(3, agreement).path, video=tmp_path / "film.mp4"))
+    assert not (tmp_path / "film.mp4").exists()
+
+
+def test_what_is_played_is_what_is_evaluated(run_of, tmp_path):
+    """Both scale by the bounds that the policy was trained with: here the task's have become wider since."""
+    run = run_of(3, contract(low=-0.25, high=0.5))
+    del ACTIONS[:]
+    list(play(run.path, video=tmp_path / "film.mp4"))
+    (expected,) = np.unique(ACTIONS)
+    del ACTIONS[:]
+    list(evaluate_run(run.path, episodes=1, processes=1))
+    np.testing.assert_allclose(np.unique(ACTIONS), [expected], rtol=1e-6)
+    inside = random_policy(contract(low=-0.25, high=0.5)).act(np.zeros((1, 2), np.float32))[0]
+    assert expected == pytest.approx(0.125 + 0.375 * inside[0])
 
 
 def test_evaluating_a_run_tells_how_far_it_is(run_of):
