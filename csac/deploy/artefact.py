@@ -16,7 +16,8 @@ import numpy as np
 from csac.deploy.artefact_contract import CONTRACT, POLICY_FILES, ArtefactContract
 from csac.deploy.c_source import is_header
 from csac.deploy.contract import read_file
-from csac.deploy.policy import noise_generator
+from csac.deploy.onnx_graph import graph_sizes
+from csac.deploy.policy import Policy, noise_generator
 from csac.deploy.templates import LOADER
 from csac.types import InputError
 
@@ -152,19 +153,20 @@ def header_alone(folder: Path, contract: ArtefactContract) -> Iterator[Path]:
 
 
 class _NumPy:
-    """Runs the loader that lies in the folder, after a look that it is csac's own."""
+    """Runs the loader that lies in the folder, after a look that it is csac's own and that the policy is one."""
 
     def __init__(self, folder: Path, contract: ArtefactContract) -> None:
         path = folder / LOADER.name
         content = read_file(path)
         if content != LOADER.read_bytes():
             raise InputError(f"{path} is not the loader of this csac, which runs no other code: export it again")
+        Policy.load(folder / contract.file, contract.policy)  # reads strictly what the loader takes for granted
         module = ModuleType("csac_exported_policy")
         module.__file__ = str(path)
         exec(compile(content, path, "exec"), vars(module))
         try:
             self._policy = vars(module)["Policy"](folder)
-        except (KeyError, ValueError, IndexError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{folder} is damaged ({error!r:.100}): export it again") from error
         self.act, self.reset = self._policy.act, self._policy.reset
 
@@ -189,14 +191,30 @@ class _ONNX:
         self._has_state = contract.guards.has_state
         self._generator = None if contract.noise_seed is None else noise_generator(contract.noise_seed)
         self._inputs: dict[str, np.ndarray] = {}
+        inputs, outputs = graph_sizes(contract)
+        self._outputs = list(outputs)
+        self._try(path, inputs, outputs)
         self.reset()
+
+    def _try(self, path: Path, inputs: dict[str, int], outputs: dict[str, int]) -> None:
+        """Run it once on zeros. Raises InputError where its inputs or outputs are not what the contract says."""
+        try:
+            given: Any = self._session.run(
+                self._outputs, {name: np.zeros((1, size), np.float32) for name, size in inputs.items()}
+            )
+        except Exception as error:  # its own kinds
+            reason = " ".join(str(error).split())
+            raise InputError(f"{path} is not the graph of its {CONTRACT} ({reason}): export it again") from error
+        found = [(np.shape(array), np.asarray(array).dtype) for array in given]
+        if found != [((1, size), np.float32) for size in outputs.values()]:
+            raise InputError(f"{path} is not the graph of its {CONTRACT} (it gives {found}): export it again")
 
     def act(self, observation: np.ndarray, noise: np.ndarray | None) -> np.ndarray:
         self._inputs["observation"] = observation[None]
         if self._generator:
             drawn = self._generator.standard_normal(self._action_size, np.float32) if noise is None else noise
             self._inputs["noise"] = drawn[None]
-        outputs: Any = self._session.run(None, self._inputs)
+        outputs: Any = self._session.run(self._outputs, self._inputs)
         if self._has_state:
             self._inputs["state"] = outputs[1]
         return outputs[0][0]

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from csac.deploy.contract import Contract, read_json
+from csac.deploy.contract import FLOAT32_MAX, Contract, read_json
 from csac.deploy.guards import NO_GUARDS, Guards
+from csac.record.manifest import SEED_LIMIT
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ class ArtefactContract:
         policy = Contract.of_fields(fields, path)
         try:
             contract = _artefact_contract(fields, policy)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else error
             raise InputError(f"{path} is not the contract of an artefact ({reason}): export it again") from error
         file = folder / contract.file
@@ -110,8 +111,10 @@ def _artefact_contract(fields: Any, policy: Contract) -> ArtefactContract:
         raise ValueError(f"artefact_version {version!r} where this csac reads {ARTEFACT_VERSION}")
     if fields["format"] not in get_args(Format) or fields["weights"] not in get_args(Weights):
         raise ValueError(f"format {fields['format']!r} or weights {fields['weights']!r} are not known")
-    if type(seed) not in (int, type(None)) or type(rate) not in (int, float, type(None)):
-        raise ValueError(f"noise_seed {seed!r} or control_rate_hz {rate!r} is no number")
+    if seed is not None and not (type(seed) is int and 0 <= seed < SEED_LIMIT):
+        raise ValueError(f"noise_seed {seed!r:.40} is no seed")
+    if rate is not None and not (type(rate) in (int, float) and 0 < rate <= FLOAT32_MAX):
+        raise ValueError(f"control_rate_hz {rate!r:.40} is no rate")
     if not isinstance(fields["provenance"], dict) or not isinstance(fields["verification"], dict):
         raise TypeError("provenance or verification is no JSON object")
     low, high = (_read_bounds(fields[f"observation_{end}"], end, policy) for end in ("low", "high"))

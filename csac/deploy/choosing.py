@@ -7,6 +7,7 @@ from numbers import Integral
 from pathlib import Path
 from typing import get_args
 
+from csac.deploy.artefact_contract import ArtefactContract
 from csac.deploy.contract import Contract, read_json
 from csac.deploy.policy import CONTRACT, SAVED, Policy
 from csac.record.run import RunDirectory, Which, is_run
@@ -44,11 +45,14 @@ def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
     if seed is not None or which != "last":
         raise InputError(f"{folder} holds one policy and no run: leave out seed and which")
     fields = read_json(folder / CONTRACT)
-    contract = Contract.of_fields(fields, folder / CONTRACT)
-    guards = fields.get("guards") or {}
-    if not isinstance(guards, dict) or any(value not in (None, 0) for value in guards.values()):
+    if not isinstance(fields, dict) or "artefact_version" not in fields:
+        return Policy.load(folder / SAVED, Contract.of_fields(fields, folder / CONTRACT))
+    artefact = ArtefactContract.load(folder)
+    if artefact.guards.is_any:
         raise InputError(f"{folder} is an artefact with guards: csac.deploy.artefact.open_artefact keeps them")
-    return Policy.load(folder / SAVED, contract)
+    if artefact.file != SAVED:
+        raise InputError(f"{folder} is an artefact of the format {artefact.format}: csac.load takes those of numpy")
+    return Policy.load(folder / SAVED, artefact.policy)
 
 
 def choose_seed(run: RunDirectory, seed: int | None = None) -> int:

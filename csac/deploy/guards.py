@@ -75,8 +75,10 @@ class Guards:
             fields["watchdog"],
             numbers("largest_change", action_size),
         )
-        if guards.fallback not in (None, *get_args(Fallback)) or type(guards.watchdog) is not int:
-            raise ValueError(f"fallback {guards.fallback!r} or watchdog {guards.watchdog!r} is not known")
+        if guards.fallback not in (None, *get_args(Fallback)):
+            raise ValueError(f"fallback {guards.fallback!r:.40} is not known")
+        if type(guards.watchdog) is not int or guards.watchdog < 0:
+            raise ValueError(f"watchdog {guards.watchdog!r:.40} is no number of steps")
         belongs = (guards.observation_low, guards.observation_high, guards.fallback_action)
         if any((array is None) != (guards.fallback is None) for array in belongs):
             raise ValueError("fallback and observation bounds disagree")

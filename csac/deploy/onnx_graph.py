@@ -22,6 +22,17 @@ OPSET = 17  # of 2022: every runtime in use has it
 IR_VERSION = 8  # the oldest that goes with it
 
 
+def graph_sizes(contract: ArtefactContract) -> tuple[dict[str, int], dict[str, int]]:
+    """Return how many numbers the inputs and the outputs of an artefact's graph have, by name."""
+    spec = contract.policy.spec
+    inputs, outputs = {"observation": spec.observation_size}, {"action": spec.action_size}
+    if contract.noise_seed is not None:
+        inputs["noise"] = spec.action_size
+    if contract.guards.has_state:
+        inputs["state"] = outputs["next_state"] = spec.action_size + 2
+    return inputs, outputs
+
+
 def onnx_model(network: PolicyNetwork, contract: ArtefactContract) -> bytes:
     """Return the file of an ONNX model.
 
@@ -37,12 +48,8 @@ def onnx_model(network: PolicyNetwork, contract: ArtefactContract) -> bytes:
         from onnx import TensorProto, checker, helper
     except ImportError:
         raise InputError("an ONNX artefact needs the package onnx: pip install 'csac[onnx]'") from None
-    graph, spec, guards = _Graph(), contract.policy.spec, contract.guards
-    inputs, outputs = {"observation": spec.observation_size}, {"action": spec.action_size}
-    if contract.noise_seed is not None:
-        inputs["noise"] = spec.action_size
-    if guards.has_state:
-        inputs["state"] = outputs["next_state"] = spec.action_size + 2
+    graph, guards = _Graph(), contract.guards
+    inputs, outputs = graph_sizes(contract)
     action = _policy(graph, network, contract)
     if guards.is_any:
         action = _guarded(graph, guards, contract, action)

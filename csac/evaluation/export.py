@@ -14,7 +14,7 @@ from csac.deploy.artefact_contract import ArtefactContract, Format, Weights
 from csac.deploy.c_size import Size, sizes
 from csac.deploy.card import model_card
 from csac.deploy.choosing import choose_seed
-from csac.deploy.contract import Contract
+from csac.deploy.contract import FLOAT32_MAX, Contract
 from csac.deploy.guards import Guards, make_guards
 from csac.deploy.policy import Policy
 from csac.deploy.writing import CARD, CURVE, check_place, placed, write_artefact, write_contract
@@ -182,8 +182,8 @@ def control_rate(raw: Any) -> float | None:
     if isinstance(ratio := getattr(raw.unwrapped, "env_step_ratio", None), int):
         return 120.0 / ratio
     step = getattr(raw.unwrapped, "dt", None)
-    if isinstance(step, int | float) and step > 0:
-        return round(1.0 / float(step), 6)
+    if isinstance(step, int | float) and step > 0 and 0 < (rate := round(1.0 / float(step), 6)) <= FLOAT32_MAX:
+        return rate
     pictures = raw.metadata.get("render_fps")
     return float(pictures) if isinstance(pictures, int | float) and pictures > 0 else None
 

@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from policies import ALGORITHMS, DICT_PARTS, algorithm_policy, contract, random_layers, random_policy
 
+from csac.deploy import tensors
 from csac.deploy.artefact import Artefact, compile_c, header_alone, open_artefact
 from csac.deploy.artefact_contract import ArtefactContract, Format, sha256_of
 from csac.deploy.c_source import noise_state, quantised
 from csac.deploy.contract import Contract
-from csac.deploy.guards import Guards, GuardState, guarded, make_guards
+from csac.deploy.guards import NO_GUARDS, Guards, GuardState, guarded, make_guards
+from csac.deploy.parameters import to_tensors
 from csac.deploy.policy import Policy, noise_generator
 from csac.deploy.writing import check_place, placed, write_artefact, write_contract
 from csac.types import InputError, PolicyParameters
@@ -292,6 +294,10 @@ def test_another_policy_under_this_contract_is_refused(tmp_path, format):
         ({"format": "torch"}, "'torch'"),
         ({"guards": {}}, "no 'observation_low'"),
         ({"noise_seed": "x"}, "'x'"),
+        ({"noise_seed": -1}, "noise_seed -1"),
+        ({"control_rate_hz": 0}, "control_rate_hz 0"),
+        ({"control_rate_hz": float("inf")}, "control_rate_hz inf"),
+        ({"observation_high": [10**400] * 5}, "too large"),
         ({"observation_low": [0.0]}, "is not 5 numbers"),
         ({"action_low": [0.0]}, "disagree"),
         ({"provenance": []}, "no JSON object"),
@@ -303,6 +309,63 @@ def test_a_contract_that_is_none_is_refused(tmp_path, change, message):
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(InputError, match=message):
         open_artefact(tmp_path)
+
+
+def sign(folder: Path) -> None:
+    """Have a folder's contract name the hash of the file that is there now, as somebody else would."""
+    path = folder / "contract.json"
+    fields = json.loads(path.read_text())
+    path.write_text(json.dumps(fields | {"sha256": sha256_of(folder / fields["file"])}))
+
+
+def saved(header: bytes, numbers: bytes = b"") -> bytes:
+    return len(header).to_bytes(8, "little") + header + numbers
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (saved(b"[]"), "its header is not a JSON object"),
+        (saved(b"{}"), "the policy has no actor"),
+        (saved(b"[" * 5000 + b"]" * 5000), "its header is nested too deeply"),
+        (saved(b'{"actor.0.0.weight":{"dtype":"F32","data_offsets":[0,"x"],"shape":[1]}}'), "are not sizes"),
+        (saved(b'{"actor.0.0.weight":{"data_offsets":[0,4],"shape":[1]}}', bytes(4)), "is not one of an array"),
+        (tensors.encode(to_tensors(random_policy(contract()).network.parameters)), "after 5 inputs"),
+    ],
+)
+def test_a_numpy_policy_that_cannot_be_run_is_refused_when_it_is_opened(tmp_path, content, message):
+    leave(tmp_path, algorithm_policy("csac"), "numpy")
+    (tmp_path / "policy.safetensors").write_bytes(content)
+    sign(tmp_path)
+    with pytest.raises(InputError, match=message) as caught:
+        open_artefact(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("foreign", ["more observations", "fewer actions", "a state", "noise", "no guards", "no ONNX"])
+def test_another_graph_is_refused_when_it_is_opened(tmp_path, foreign):
+    pytest.importorskip("onnxruntime")
+    policy = algorithm_policy("csac")
+    limited = make_guards(policy.contract, "last")
+    leave(tmp_path, policy, "onnx", guards=limited if foreign == "no guards" else NO_GUARDS)
+    other, fields = policy, {}
+    match foreign:
+        case "more observations":
+            other = algorithm_policy("csac", ((None, (7,)),))
+        case "fewer actions":
+            other = algorithm_policy("csac", action_shape=(2,))
+        case "a state":
+            fields = {"guards": limited}
+        case "noise":
+            fields = {"noise_seed": 0}
+    leave(tmp_path / "other", other, "onnx", **fields)
+    content = (tmp_path / "other" / "policy.onnx").read_bytes()
+    (tmp_path / "policy.onnx").write_bytes(b"no graph" if foreign == "no ONNX" else content)
+    sign(tmp_path)
+    expected = "does not take" if foreign == "no ONNX" else "is not the graph of its contract"
+    with pytest.raises(InputError, match=expected) as caught:
+        open_artefact(tmp_path)
+    assert "\n" not in str(caught.value)
 
 
 def test_what_is_no_artefact_is_refused(tmp_path):

@@ -166,6 +166,12 @@ def test_an_artefact_without_guards_is_loaded_and_one_with_guards_is_not(tmp_pat
         (tmp_path / name).mkdir()
         write_artefact(tmp_path / name, policy.network, ArtefactContract(policy.contract, "numpy", guards=guards))
     assert same(load(tmp_path / "bare"), policy)
+    path = tmp_path / "bare" / "policy.safetensors"
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 1
+    path.write_bytes(bytes(content))
+    with pytest.raises(InputError, match="is not the file that its contract"):
+        load(tmp_path / "bare")
     with pytest.raises(InputError, match="is an artefact with guards"):
         load(tmp_path / "guarded")
     (tmp_path / "bare" / "contract.json").write_text("[]")
