@@ -61,12 +61,31 @@ def write_contract(folder: Path, contract: ArtefactContract) -> None:
 
 
 def check_place(place: Path) -> None:
-    """Raise InputError where an artefact cannot be put: over anything but an artefact."""
-    if place.exists() and not place.is_dir():
-        raise InputError(f"{place} is a file: choose a folder for the artefact")
-    names = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
+    """Raise InputError where an artefact cannot be put: over anything but an artefact, or where nothing is written."""
+    try:
+        _check_writable(place)
+        names = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
+    except OSError as error:
+        raise _not_written(place, error) from None
     if names and names - _BESIDE != {_policy_file(place)}:
         raise InputError(f"{place} holds something else than an artefact: choose a new or an empty folder")
+
+
+def _check_writable(place: Path) -> None:
+    """Raise OSError, or InputError, where no folder can be put aside for a new one."""
+    if place.exists() and not place.is_dir():
+        raise InputError(f"{place} is a file: choose a folder for the artefact")
+    if place.exists() and (place.is_mount() or place.samefile(os.curdir)):
+        raise InputError(
+            f"{place} is where you are, or where a disk is mounted, and cannot be replaced: choose another"
+        )
+    parent = next(folder for folder in Path(os.path.realpath(place)).parents if folder.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise InputError(f"cannot write into {parent}: choose a folder that is yours to write")
+
+
+def _not_written(place: Path, error: OSError) -> InputError:
+    return InputError(f"cannot write to {place}: {error.strerror or error}; choose another place")
 
 
 def _policy_file(folder: Path) -> str | None:
@@ -90,21 +109,23 @@ def placed(place: Path) -> Iterator[Path]:
         InputError: as `check_place`, or the place cannot be written.
     """
     check_place(place)
+    place = Path(os.path.realpath(place))  # a link stays one
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
     except OSError as error:
-        raise InputError(f"cannot write to {place}: {error.strerror}; choose another place") from None
+        raise _not_written(place, error) from None
+    new, old = aside / "new", aside / "old"
     try:
-        folder = aside / "new"
-        folder.mkdir()
-        yield folder
+        new.mkdir()
+        yield new
         with suppress(FileNotFoundError):
-            os.rename(place, aside / "old")
-        try:
-            os.rename(folder, place)
-        except OSError:
-            os.rename(aside / "old", place)
-            raise
+            os.rename(place, old)
+        os.rename(new, place)
+    except OSError as error:
+        raise _not_written(place, error) from error
     finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        with suppress(OSError):  # what was raised is told; an older artefact that cannot be put back stays aside
+            if old.exists() and not place.exists():
+                os.rename(old, place)
+            shutil.rmtree(aside, ignore_errors=True)
