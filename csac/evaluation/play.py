@@ -13,6 +13,7 @@ import numpy as np
 from csac.deploy.choosing import load
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
+from csac.record.atomic import check_name
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
 from csac.tasks.known import adapter_of
@@ -198,6 +199,7 @@ def _draw_off_screen() -> None:
 def _check_video(path: Path) -> None:
     if path.suffix.lower() != ".mp4":
         raise InputError(f"the video is an .mp4 file: name it {path.with_suffix('.mp4')}")
+    check_name(path, _aside(path))
     if path.is_dir():
         raise InputError(f"{path} is a directory: give the name of a file for the video")
 
@@ -233,7 +235,7 @@ def _recording(
         yield lambda again=False: None
         return
     path = Path(video)
-    aside = path.with_name(f".{os.getpid()}.{path.name}")
+    aside = _aside(path)
     writer: list[Generator[None, Any, None]] = []
     frame = np.zeros((0, 0, 3), np.uint8)
 
@@ -255,7 +257,12 @@ def _recording(
     finally:
         for open_writer in writer:
             open_writer.close()
-        aside.unlink(missing_ok=True)
+        with suppress(OSError):  # what was raised is told
+            aside.unlink()
+
+
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{os.getpid()}.{path.name}")
 
 
 def _frame(environment: Environment, picture: Callable[[], Any]) -> np.ndarray:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from typing import TYPE_CHECKING
+
+from csac.types import InputError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,6 +23,15 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def check_name(path: Path, aside: Path) -> None:
+    """Raise InputError where no file can be called `aside`, as `path` is until it is whole: it may not exist yet."""
+    try:
+        with suppress(FileNotFoundError):
+            aside.lstat()
+    except OSError as error:  # the name is too long, or a part of the path is no folder
+        raise InputError(f"cannot write {path}: {error.strerror}; choose another place or name") from None
 
 
 def create_atomically(path: Path, data: bytes) -> None:

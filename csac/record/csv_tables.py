@@ -7,11 +7,13 @@ import io
 import operator
 import os
 import textwrap
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from csac.record.atomic import check_name
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -58,6 +60,7 @@ def check_new(path: Path, what: str = "table", suffix: str = ".csv") -> None:
     """Raise InputError where there is a file already or none can be, before anything has been computed for it."""
     if path.suffix.lower() != suffix:
         raise InputError(f"the {what} is a {suffix} file: name it {path.with_suffix(suffix)}")
+    check_name(path, _aside(path))
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
     folder = path.parent
@@ -71,14 +74,19 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
     Raises:
         InputError: it cannot be written.
     """
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    aside = _aside(path)
     try:
         append_rows(aside, columns, rows)
         aside.replace(path)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}; choose another place") from error
     finally:
-        aside.unlink(missing_ok=True)
+        with suppress(OSError):  # what was raised is told
+            aside.unlink()
+
+
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}")
 
 
 def read_rows(path: str | Path) -> np.ndarray:

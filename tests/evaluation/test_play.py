@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from typing import Any
 
 import gymnasium
@@ -117,6 +118,29 @@ def test_what_is_played_is_what_is_evaluated(run_of, tmp_path):
     np.testing.assert_allclose(np.unique(ACTIONS), [expected], rtol=1e-6)
     inside = random_policy(contract(low=-0.25, high=0.5)).act(np.zeros((1, 2), np.float32))[0]
     assert expected == pytest.approx(0.125 + 0.375 * inside[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("x" * 251 + ".mp4", "File name too long"), ("file/film.mp4", "Not a directory")]
+)
+def test_a_video_that_cannot_be_is_refused_before_the_episodes(run_of, tmp_path, name, reason):
+    """The first has a name that is short enough, but for what is put before it until the video is whole."""
+    (tmp_path / "file").touch()
+    del ACTIONS[:]
+    with pytest.raises(InputError) as caught:
+        list(play(run_of(3).path, video=tmp_path / name))
+    assert str(caught.value) == f"cannot write {tmp_path / name}: {reason}; choose another place or name"
+    assert ACTIONS == []
+
+
+def test_a_folder_that_goes_meanwhile_is_told_in_one_line(run_of, tmp_path):
+    (tmp_path / "films").mkdir()
+    played = play(run_of(3).path, episodes=2, video=tmp_path / "films" / "film.mp4")
+    next(played)
+    shutil.rmtree(tmp_path / "films")
+    (tmp_path / "films").touch()
+    with pytest.raises(InputError, match=r"cannot write .*film\.mp4: Not a directory; choose another place"):
+        list(played)
 
 
 def test_evaluating_a_run_tells_how_far_it_is(run_of):

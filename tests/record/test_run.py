@@ -11,7 +11,7 @@ import pytest
 
 from csac.record import run as record
 from csac.record.atomic import write_atomically
-from csac.record.csv_tables import read_rows
+from csac.record.csv_tables import COLUMNS, check_new, read_rows, write_rows
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory, default_directory, find_runs
 from csac.types import InputError
@@ -377,6 +377,20 @@ def test_no_row_is_added_to_what_is_no_table(run):
         with pytest.raises(InputError, match="its first line is no header"):
             run.append("episodes", [{"seed": 0, "step": 1, "return": 1.0, "length": 1}])
         assert (run.path / "episodes.csv").read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("x" * 251 + ".csv", "File name too long"), ("file/table.csv", "Not a directory")]
+)
+def test_a_table_that_cannot_be_is_refused_at_once_and_told_in_one_line(tmp_path, name, reason):
+    (tmp_path / "file").touch()
+    path = tmp_path / name
+    with pytest.raises(InputError) as caught:
+        check_new(path)
+    assert str(caught.value) == f"cannot write {path}: {reason}; choose another place or name"
+    with pytest.raises(InputError) as caught:
+        write_rows(path, COLUMNS["evaluations"], [evaluation()])
+    assert str(caught.value) == f"cannot write {path}: {reason}; choose another place"
 
 
 def test_log_lines_follow_each_other(run):
