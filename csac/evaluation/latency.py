@@ -24,6 +24,7 @@ USUAL_RATE = 100.0  # Hz, where neither the contract nor anybody says one
 OBSERVATIONS = 1024  # that are gone through in turn
 WARM_UP = 1_000  # calls that nobody counts
 MOST_CALLS = 100_000_000  # of one measurement: each takes 16 bytes
+MOST_SECONDS = 1e9  # that are waited for a call: more nanoseconds would not be a number in C
 SECONDS_OF_A_PART = 0.25  # of a measurement at a rate: between two parts a Ctrl-C is heard
 
 
@@ -57,7 +58,7 @@ def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, s
         path: the artefact's folder.
         calls: how many follow each other flat out, from 1 to 100,000,000.
         rate: Hz; by default the control rate of the task, or 100 where it is not known.
-        seconds: how long calls are made at the rate, of which there may be as many; 0 leaves that out.
+        seconds: how long calls are made at the rate, at least one and at most as many; 0 leaves that out.
 
     Raises:
         InputError: no artefact there, nothing here to run it with, or arguments out of their range.
@@ -68,10 +69,14 @@ def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, s
         raise InputError(f"calls must be at most {MOST_CALLS:,}, not {calls:,}")
     if rate is not None and not 0 < rate <= NANOSECONDS:
         raise InputError(f"the rate must be more than 0 Hz and at most 1e9, not {rate:g}")
-    if not 0 <= seconds < float("inf"):
-        raise InputError(f"seconds must be 0 or more, not {seconds:g}")
+    if not 0 <= seconds <= MOST_SECONDS:
+        raise InputError(f"seconds must be 0 or more and at most {MOST_SECONDS:g}, not {seconds:g}")
     artefact = open_artefact(path)
     rate = rate or artefact.contract.control_rate or USUAL_RATE
+    if seconds > 0 and rate * seconds < 1:
+        raise InputError(
+            f"{seconds:g} seconds at {rate:g} Hz are less than one call: give more seconds or a higher rate"
+        )
     if rate * seconds > MOST_CALLS:
         raise InputError(f"{seconds:g} seconds at {rate:g} Hz are more than {MOST_CALLS:,} calls: take fewer seconds")
     make_calls = (
@@ -82,7 +87,7 @@ def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, s
     several = [Latency(durations)]
     if seconds:
         part, period = max(1, round(rate * SECONDS_OF_A_PART)), round(NANOSECONDS / rate)
-        several.append(Latency(*_in_parts(make_calls, max(1, round(rate * seconds)), part, period), rate))
+        several.append(Latency(*_in_parts(make_calls, round(rate * seconds), part, period), rate))
     return several
 
 

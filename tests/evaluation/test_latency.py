@@ -130,7 +130,16 @@ def test_no_number_is_cut_at_any_width(width):
             "1e+09 seconds at 1e+06 Hz are more than 100,000,000 calls: take fewer seconds",
         ),
         ("numpy --rate 0", "the rate must be more than 0 Hz and at most 1e9, not 0"),
-        ("numpy --seconds nan", "seconds must be 0 or more, not nan"),
+        ("numpy --seconds nan", "seconds must be 0 or more and at most 1e+09, not nan"),
+        ("numpy --rate 1e-11 --seconds 1e12", "seconds must be 0 or more and at most 1e+09, not 1e+12"),
+        (
+            "numpy --rate 0.05 --seconds 10",
+            "10 seconds at 0.05 Hz are less than one call: give more seconds or a higher rate",
+        ),
+        (
+            "numpy --rate 1e-300",
+            "10 seconds at 1e-300 Hz are less than one call: give more seconds or a higher rate",
+        ),
         ("numpy --plot curve.pdf", "the picture is a .png file: name it curve.png"),
     ],
 )

@@ -1,5 +1,6 @@
 /* Times single steps of policy.h, flat out or at a fixed rate, by a clock that is read right before and after each. */
 #define _POSIX_C_SOURCE 200112L
+#include <errno.h>
 #include <stdint.h>
 #include <time.h>
 
@@ -29,7 +30,7 @@ void latency_measure(const float *observations, int64_t count, int64_t calls, in
             struct timespec until;
             until.tv_sec = (time_t)(due / 1000000000);
             until.tv_nsec = (long)(due % 1000000000);
-            while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, 0)) {
+            while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, 0) == EINTR) {
             }
         }
         began = now();
