@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -32,7 +33,7 @@ class ArtefactContract:
     `observation_low` and `observation_high` [observation] are the task's own bounds, infinite where it has none, and
     None where nobody has asked the task. `control_rate` is how many actions the task takes a second, `noise_seed` what
     sampled actions are drawn by (None: the deterministic policy). `provenance` says where the policy comes from and
-    `verification` what was found when it was exported; both are for people, and hold what JSON can.
+    `verification` what was found when it was exported; both are for people: an infinite number in them leaves as text.
     """
 
     policy: Contract
@@ -67,8 +68,8 @@ class ArtefactContract:
             "control_rate_hz": self.control_rate,
             "noise_seed": self.noise_seed,
             "guards": self.guards.fields(),
-            "provenance": self.provenance,
-            "verification": self.verification,
+            "provenance": _as_json(self.provenance),
+            "verification": _as_json(self.verification),
         }
 
     def text(self) -> str:
@@ -98,6 +99,18 @@ class ArtefactContract:
         if sha256_of(file) != contract.sha256:
             raise InputError(f"{file} is not the file that its {CONTRACT} was written for: export it again")
         return contract
+
+
+def _as_json(value: Any) -> Any:
+    """Return a value with the text `Infinity`, `-Infinity` or `NaN` for numbers that JSON has no word for."""
+    match value:
+        case dict():
+            return {name: _as_json(item) for name, item in value.items()}
+        case list() | tuple():
+            return [_as_json(item) for item in value]
+        case float() if not math.isfinite(value):
+            return json.dumps(value)
+    return value
 
 
 def sha256_of(path: Path) -> str:

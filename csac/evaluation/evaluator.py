@@ -66,7 +66,8 @@ class Evaluator:
     Episodes run side by side in batches of one fixed shape, so that an episode's numbers depend neither on when the
     others end nor on how many there are. The environments are made at the first `run` and kept, but for tasks whose
     resets do not forget what was before: they are made anew for each batch. `info_names` are the names of all numbers
-    that the last steps of episodes have held in `info` so far, `perturbed` what `perturb` was last given.
+    that the last steps of episodes have held in `info` so far, `perturbed` what `perturb` was last given. `watch`,
+    where there is one, is called with each step's observations [running episode, observation].
 
     Args:
         task: as `Environment`'s.
@@ -93,6 +94,7 @@ class Evaluator:
         self._environments: list[Environment] = []
         self.info_names: set[str] = set()
         self.perturbed: dict[str, float] = {}
+        self.watch: Callable[[np.ndarray], object] | None = None
 
     def perturb(self, values: Mapping[str, float]) -> None:
         """Change the task from the next `run` on, as `Environment.perturb`; what the task cannot be, `run` refuses."""
@@ -168,6 +170,8 @@ class Evaluator:
             observations[row] = episode.start()
         running = list(enumerate(episodes))
         while running:
+            if self.watch:
+                self.watch(observations[[row for row, _ in running]])
             if noise is not None:
                 for row, episode in running:
                     episode.generator.standard_normal(dtype=np.float32, out=noise[row])

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from csac.deploy.guards import GuardState, guarded
-from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import Evaluator, evaluate_episodes
 from csac.record.statistics import FEWEST_FOR_INTERVAL, mean_and_interval
 from csac.tasks.seeds import FRESH_EVALUATION_SEED
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
 
     from csac.deploy.artefact import Artefact
     from csac.deploy.contract import Contract
+    from csac.deploy.policy import Policy
     from csac.tasks.making import Task
 
 TOLERANCE = 1e-5  # of an action's range
@@ -93,25 +93,13 @@ def record(
     Raises:
         InputError, EvaluationFailure: as `Evaluator.run`.
     """
-    watched = _Watched(policy)
-    evaluator = Evaluator(task, environment_arguments, episodes, FRESH_EVALUATION_SEED)
+    evaluator, seen = Evaluator(task, environment_arguments, episodes, FRESH_EVALUATION_SEED), []
+    evaluator.watch = seen.append
     try:
-        played = evaluator.run(watched, deterministic)
+        played = evaluator.run(policy, deterministic)
     finally:
         evaluator.close()
-    seen = np.concatenate(watched.seen)
-    seen = seen[seen.any(axis=1)]  # the rows of a batch that no episode uses are zero
-    return Recording(seen, np.array([episode.episode_return for episode in played]))
-
-
-class _Watched(Policy):
-    def __init__(self, policy: Policy) -> None:
-        super().__init__(policy.network, policy.contract)
-        self.seen: list[np.ndarray] = []
-
-    def act(self, observations: np.ndarray, deterministic: bool = True, noise: np.ndarray | None = None) -> np.ndarray:
-        self.seen.append(observations.copy())
-        return super().act(observations, deterministic, noise)
+    return Recording(np.concatenate(seen), np.array([episode.episode_return for episode in played]))
 
 
 def compare_actions(artefact: Artefact, policy: Policy, recorded: np.ndarray | None = None) -> list[Compared]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import shlex
 import shutil
@@ -170,10 +171,59 @@ def test_in_closed_loop_the_episodes_are_those_of_csac_evaluate(tmp_path):
     recording = verify.record(policy, "Follow-v0", episodes=3)
     expected = evaluate(policy, "Follow-v0", 3, FRESH_EVALUATION_SEED)
     np.testing.assert_array_equal(recording.returns, expected)
-    assert recording.observations.shape[1] == 5
+    assert recording.observations.shape == (3 * 20, 5)  # and no row of the seven episodes that a batch has room for
     assert recording.observations.any(axis=1).all()
     returns = verify.compare_returns(artefact_of(tmp_path / "a", policy), recording, "Follow-v0")
     np.testing.assert_allclose(returns.artefact, expected, rtol=1e-4)
+
+
+class Still(gymnasium.Env):
+    """Nothing but zeros, for two to five steps."""
+
+    observation_space = Box(-np.inf, np.inf, (5,), np.float64)
+    action_space = Box(-0.5, 2.0, (3,), np.float32)
+
+    def __init__(self, farthest: float = 1.0) -> None:
+        assert farthest > 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = int(self.np_random.integers(2, 6))
+        return np.zeros(5), {}
+
+    def step(self, action):
+        self.left -= 1
+        return np.zeros(5), 1.0, self.left == 0, False, {}
+
+
+gymnasium.register("Still-v0", entry_point=f"{__name__}:Still") if "Still-v0" not in gymnasium.registry else None
+
+
+def test_observations_that_are_all_zero_are_observations(tmp_path):
+    recording = verify.record(algorithm_policy("csac"), "Still-v0", episodes=8)
+    assert {*recording.returns} == {2.0, 3.0}  # they do not end together
+    # One row for each step that an episode makes, and none once it has ended.
+    np.testing.assert_array_equal(recording.observations, np.zeros((int(recording.returns.sum()), 5)))
+    make_run(tmp_path / "run", task="Still-v0")
+    options = dataclasses.replace(QUICK, fallback="zero", observation_range="recorded")
+    guards = export(tmp_path / "run", options=options).contract.guards
+    np.testing.assert_array_equal(guards.observation_high, np.zeros(5))
+
+
+def test_infinite_arguments_of_a_task_stand_in_its_contract_as_text(tmp_path):
+    def refuse(word: str) -> None:
+        raise ValueError(word)
+
+    run = make_run(tmp_path / "run", task="Still-v0")
+    arguments = {"farthest": float("inf")}
+    run.update_manifest(environment_arguments=arguments, hyperparameters={"bounds": [float("-inf"), 1.0, float("nan")]})
+    formats = ("numpy", "onnx") if importlib.util.find_spec("onnxruntime") else ("numpy",)
+    options = dataclasses.replace(QUICK, card=True)
+    for one in export_run(tmp_path / "run", formats, options=options):
+        told = json.loads((one.place / "contract.json").read_text(), parse_constant=refuse)
+        assert told["provenance"]["environment_arguments"] == {"farthest": "Infinity"}
+        assert told["provenance"]["hyperparameters"] == {"bounds": ["-Infinity", 1.0, "NaN"]}
+        assert open_artefact(one.place).contract.provenance["environment_arguments"] == {"farthest": "Infinity"}
 
 
 def test_returns_that_chance_does_not_explain_are_refused(tmp_path):
