@@ -186,8 +186,8 @@ class Export:
     """Numbers that the weights of a C artefact are kept in; the error that smaller ones make is stated."""
     stochastic: FlagCreatePairsOff[bool] = False
     """Sample actions as in training. In ONNX the noise becomes a second input: a graph cannot be seeded."""
-    noise_seed: int = 0
-    """Seed of the noise that actions are sampled with."""
+    noise_seed: Annotated[int | None, arg(help_behavior_hint="(default: 0)")] = None
+    """Seed of the noise that --stochastic samples actions with."""
     fallback: Annotated[str | None, arg(metavar="zero|middle|last|X,...", help_behavior_hint="(default: no guard)")] = (
         None
     )
@@ -196,7 +196,7 @@ class Export:
         Literal["bounds", "recorded"] | None, arg(help_behavior_hint="(default: anything finite is good)")
     ] = None
     """Guard as well against what is out of the task's bounds, or of what the episodes of the export have shown."""
-    range_margin: float = 0.5
+    range_margin: Annotated[float | None, arg(help_behavior_hint="(default: 0.5)")] = None
     """How far beyond what was recorded is still good, as a share of its width."""
     watchdog: Annotated[int | None, arg(help_behavior_hint="(default: never)")] = None
     """Keep to the fallback after so many bad observations in a row, until a reset."""
@@ -218,8 +218,10 @@ class Export:
 
         if self.episodes < 1:
             raise InputError(f"--episodes {self.episodes}: give at least 1, or --no-rollouts")
+        if self.noise_seed is not None and not self.stochastic:
+            raise InputError(f"--noise-seed {self.noise_seed} is of noise that --stochastic samples with: give both")
         return ExportOptions(
-            self.noise_seed if self.stochastic else None,
+            (self.noise_seed or 0) if self.stochastic else None,
             self.weights,
             self.fallback,
             self.observation_range,

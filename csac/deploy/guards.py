@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 Fallback = Literal["zero", "middle", "last", "given"]
 
+LONGEST_WATCHDOG = 2**24  # an ONNX graph counts in float32, where one more would be no more
+
 
 @dataclass(frozen=True, eq=False)
 class Guards:
@@ -77,7 +79,7 @@ class Guards:
         )
         if guards.fallback not in (None, *get_args(Fallback)):
             raise ValueError(f"fallback {guards.fallback!r:.40} is not known")
-        if type(guards.watchdog) is not int or guards.watchdog < 0:
+        if type(guards.watchdog) is not int or not 0 <= guards.watchdog <= LONGEST_WATCHDOG:
             raise ValueError(f"watchdog {guards.watchdog!r:.40} is no number of steps")
         belongs = (guards.observation_low, guards.observation_high, guards.fallback_action)
         if any((array is None) != (guards.fallback is None) for array in belongs):
@@ -138,7 +140,7 @@ def make_guards(
             action, or numbers with commas between them, one for each action. None looks at no observation.
         observation_low: [observation], the least that is taken for good; infinite, or None, where anything finite is.
         observation_high: [observation], the most.
-        watchdog: after so many bad observations in a row only the fallback is left, until a reset.
+        watchdog: after so many bad observations in a row, at most 2^24, only the fallback is left, until a reset.
         rate_limit: how much an action may change in a step, as a share of its range. It needs a fallback, since an
             action that is not a number cannot be limited; without one it is `last`.
 
@@ -151,6 +153,8 @@ def make_guards(
         )
     if watchdog is not None and watchdog < 1:
         raise InputError(f"a watchdog that waits for {watchdog} bad observations: give at least 1")
+    if watchdog is not None and watchdog > LONGEST_WATCHDOG:
+        raise InputError(f"a watchdog that waits for {watchdog:,} bad observations: give at most {LONGEST_WATCHDOG:,}")
     change = None
     if rate_limit is not None:
         if not 0.0 < rate_limit <= 1.0:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 ObservationRange = Literal["bounds", "recorded"]
 
+USUAL_MARGIN = 0.5  # of the width of what the episodes have shown
+
 
 @dataclass(frozen=True)
 class ExportOptions:
@@ -47,8 +49,8 @@ class ExportOptions:
     """The action in place of one for a bad observation: `zero`, `middle`, `last` or numbers; None lets all pass."""
     observation_range: ObservationRange | None = None
     """What else is bad beside NaN and infinity: what is out of the task's bounds, or of what the episodes show."""
-    range_margin: float = 0.5
-    """How far beyond what the episodes have shown is still good, as a share of its width."""
+    range_margin: float | None = None
+    """How far beyond what the episodes have shown is still good, as a share of its width; None is 0.5."""
     watchdog: int | None = None
     """Bad observations in a row after which only the fallback is left."""
     rate_limit: float | None = None
@@ -261,8 +263,12 @@ def _check(formats: Sequence[Format], options: ExportOptions, policy: Policy) ->
         raise InputError("a range of observations comes from the task: it needs episodes to verify with")
     if options.observation_range is not None and options.fallback is None:
         raise InputError("a range of observations needs a --fallback action: zero, middle, last or numbers")
-    if not 0.0 <= options.range_margin < np.inf:
+    if options.range_margin is not None and not 0.0 <= options.range_margin < np.inf:
         raise InputError(f"a range margin of {options.range_margin}: give a share of the width, 0 or more")
+    if options.range_margin is not None and options.observation_range != "recorded":
+        raise InputError(
+            "a range margin widens what the episodes have shown: give --observation-range recorded with it"
+        )
     make_guards(policy.contract, options.fallback, None, None, options.watchdog, options.rate_limit)
     if "c" in formats:
         compiler()
@@ -289,7 +295,8 @@ def _guards(contract: Contract, options: ExportOptions, told: _Told, recording: 
             raise InputError(f"{contract.task} has no bounds of its observations: give --observation-range recorded")
     elif options.observation_range == "recorded" and recording is not None:
         least, most = recording.observations.min(axis=0), recording.observations.max(axis=0)
-        margin = np.float32(options.range_margin) * (most - least)
+        share = USUAL_MARGIN if options.range_margin is None else options.range_margin
+        margin = np.float32(share) * (most - least)
         low, high = least - margin, most + margin
     return make_guards(contract, options.fallback, low, high, options.watchdog, options.rate_limit)
 

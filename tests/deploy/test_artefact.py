@@ -199,6 +199,7 @@ def test_the_rate_limit_is_a_share_of_the_range_and_holds_for_fallbacks_too():
         ({"fallback": "1,nan"}, "outside of the action's bounds"),
         ({"watchdog": 3}, "need a --fallback"),
         ({"watchdog": 0, "fallback": "zero"}, "at least 1"),
+        ({"watchdog": 2**24 + 1, "fallback": "zero"}, "16,777,217 bad observations: give at most 16,777,216"),
         ({"rate_limit": 0.0}, "more than 0, at most 1"),
         ({"rate_limit": float("nan")}, "more than 0, at most 1"),
     ],
@@ -263,6 +264,19 @@ def test_an_action_is_the_callers_own(tmp_path, format, given):
     np.testing.assert_array_equal(answers[1], answers[4])
     if given["fallback"] != "last":
         np.testing.assert_array_equal(answers[1], np.array([0.25, -0.5, 2.0], np.float32))
+
+
+def test_the_longest_watchdog_trips_in_a_graph_too(tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    policy = algorithm_policy("csac")
+    leave(tmp_path, policy, "onnx", guards=make_guards(policy.contract, "zero", watchdog=2**24))
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    good, bad = np.zeros((1, 5), np.float32), np.full((1, 5), np.nan, np.float32)
+    state = np.array([[0, 0, 0, 1, 2**24 - 1]], np.float32)  # one bad step before it
+    before = session.run(["action"], {"observation": good, "state": state})[0]
+    np.testing.assert_allclose(before, policy.predict(good)[0], atol=2e-5)
+    _, state = session.run(None, {"observation": bad, "state": state})
+    np.testing.assert_array_equal(session.run(["action"], {"observation": good, "state": state})[0], np.zeros((1, 3)))
 
 
 def test_guards_come_back_out_of_the_contract(tmp_path):

@@ -369,6 +369,8 @@ def test_a_module_that_nobody_has_named_is_not_run(tmp_path, monkeypatch):
         ({"observation_range": "recorded", "fallback": "zero", "episodes": 0}, "needs episodes"),
         ({"watchdog": 2}, "need a --fallback"),
         ({"range_margin": -1.0}, "0 or more"),
+        ({"range_margin": 0.5}, "give --observation-range recorded with it"),
+        ({"range_margin": 0.5, "fallback": "zero", "observation_range": "bounds"}, "range recorded with it"),
         ({"noise_seed": -1}, "from 0 to"),
         ({"fallback": "1,2"}, "2 numbers where the task has 3 actions"),
     ],
@@ -456,6 +458,9 @@ def test_the_card_has_the_header_of_the_hub_and_the_numbers_of_the_run(tmp_path)
         ("export run --weights int4", "--weights: 'int4' is not one of"),
         ("export run --out run", "run holds something else than an artefact"),
         ("export run --rate-limit 2", "a rate limit of 2.0"),
+        ("export run --noise-seed 0", "--noise-seed 0 is of noise that --stochastic samples with: give both"),
+        ("export run --range-margin 0.5", "a range margin widens what the episodes have shown"),
+        ("export run --fallback zero --watchdog 16777217", "a watchdog that waits for 16,777,217 bad observations"),
     ],
 )
 def test_what_is_typed_wrong_is_told_in_one_line(tmp_path, monkeypatch, capsys, line, complaint):
