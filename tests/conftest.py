@@ -4,6 +4,7 @@ import os
 import signal
 import tempfile
 
+import hypothesis
 import pytest
 
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
@@ -20,6 +21,11 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 
 # A shell has its background jobs ignore Ctrl-C, and what they start inherits that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# How long an example takes says how busy the machine is.
+hypothesis.settings.register_profile("untimed", deadline=None)
+hypothesis.settings.load_profile("untimed")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -198,7 +198,7 @@ def _draw_off_screen() -> None:
 
 def _check_video(path: Path) -> None:
     if path.suffix.lower() != ".mp4":
-        raise InputError(f"the video is an .mp4 file: name it {path.with_suffix('.mp4')}")
+        raise InputError(f"the video is an .mp4 file: name it {Path(path.stem or 'video').with_suffix('.mp4')}")
     check_name(path, _aside(path))
     if path.is_dir():
         raise InputError(f"{path} is a directory: give the name of a file for the video")

@@ -59,7 +59,7 @@ def _header(path: Path, line: bytes) -> list[str]:
 def check_new(path: Path, what: str = "table", suffix: str = ".csv") -> None:
     """Raise InputError where there is a file already or none can be, before anything has been computed for it."""
     if path.suffix.lower() != suffix:
-        raise InputError(f"the {what} is a {suffix} file: name it {path.with_suffix(suffix)}")
+        raise InputError(f"the {what} is a {suffix} file: name it {Path(path.stem or what).with_suffix(suffix)}")
     check_name(path, _aside(path))
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")

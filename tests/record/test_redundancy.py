@@ -32,7 +32,7 @@ def test_the_parity_of_a_large_file_is_a_64th_of_it():
     assert len(parity_of(bytes(PIECES * 80_000))) == 80_000
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(1, 3_000_000), st.floats(0, 1, exclude_max=True), st.floats(0, 1), st.integers(0, 9))
 def test_bytes_that_lie_together_are_mended(size, where, share, seed):
     content = random_bytes(size, seed)

@@ -49,7 +49,7 @@ from csac.training.train import resume, train
 from csac.types import InputError, Ring, Snapshot
 
 WIDTH = 3
-few = settings(max_examples=25, deadline=None)
+few = settings(max_examples=25)
 names = st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1, max_size=8).filter(
     lambda name: name != "__metadata__"
 )
