@@ -176,7 +176,7 @@ class _Scheduler:
             if not self.stopping and self.should_stop():
                 self.stopping = True
                 self._set_target()
-            elif self.settings.saves and self.timer.is_due():
+            elif not self.stopping and self.settings.saves and self.timer.is_due() and not self._is_awaited():
                 self._set_target()
             ready = wait([worker.connection for worker in running], timeout=0.1)
             for index, worker in enumerate(self.workers):
@@ -254,6 +254,12 @@ class _Scheduler:
         waiting, self.waiting = self.waiting, []
         for worker in waiting:
             self._next(worker)
+
+    def _is_awaited(self) -> bool:
+        """Whether a group has saved at the target and another has not: moved, that checkpoint would never be whole."""
+        if not any(worker.saved >= self.target for worker in self.workers):
+            return False
+        return any(worker.saved < self.target for worker in self.workers if not worker.over)
 
     def _end_of_turn(self, worker: _Worker) -> int:
         if worker.cores is None:

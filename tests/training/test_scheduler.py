@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections import deque
+from types import SimpleNamespace
 from typing import Any
 
+import plans
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
 from resuming import SMALL, run
 
 from csac.algorithms import SAC
+from csac.training import scheduler as scheduler_module
+from csac.training.messages import Boundary, Ended, Saved
 
 
 @pytest.mark.parametrize("interval", [100, 130])
@@ -23,3 +28,49 @@ def test_a_run_that_has_enough_ends_at_that_very_step(tmp_path, interval):
     finished = run(tmp_path / "run", SAC(**SMALL), 500, "Pendulum-v1", evaluation_interval=interval, stop_when=enough)
     assert told == [interval, 2 * interval]
     assert (finished.manifest.steps_done, finished.manifest.state) == (2 * interval, "finished")
+
+
+class SlowWorkers:
+    """Workers that make their turns at once, on a clock of their own: each turn takes so many seconds."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+        self.clock = 0.0
+        clock = SimpleNamespace(monotonic=lambda: self.clock)
+
+        class Worker:
+            def __init__(self, settings: Any, seeds: Any) -> None:
+                self.connection, self.seeds, self.cores = self, seeds, None
+                self.over = self.is_starting = False
+                self.step = self.saved = self.made = 0
+                self.answers: deque[Any] = deque()
+
+            def tell(worker, order: Any) -> None:  # noqa: N805
+                if order == "save":
+                    worker.answers.append(Saved(worker.made, {}, {}))
+                elif order == "stop":
+                    worker.answers.append(Ended(worker.made, {}))
+                else:
+                    worker.made += 250
+                    self.clock += seconds
+                    worker.answers.append(Boundary(worker.made))
+
+            def recv(self) -> Any:
+                return self.answers.popleft()
+
+        monkeypatch.setattr(scheduler_module, "time", clock)
+        monkeypatch.setattr(scheduler_module, "_Worker", Worker)
+        monkeypatch.setattr(scheduler_module, "usable_cores", lambda: [0, 1])
+        monkeypatch.setattr(
+            scheduler_module, "wait", lambda all_of_them, timeout: [w for w in all_of_them if w.answers]
+        )
+
+
+def test_a_slow_run_stops_where_all_groups_were_saved(tmp_path, monkeypatch):
+    """The clock asked for a checkpoint while the run stopped, at a step that the faster group had left behind."""
+    SlowWorkers(monkeypatch, seconds=700.0)
+    settings = plans.settings(SAC(), "Hopper-v4", 100_000, tmp_path, checkpoint_interval=50_000)
+    scheduler: Any = scheduler_module._Scheduler(settings, [[0], [1]], lambda: True, None)
+    scheduler.workers[0].step = scheduler.workers[0].made = 1_250  # as far ahead as a group may be
+    told = [(group, message) for group, message in scheduler.run()]
+    assert {(group, message.step) for group, message in told if isinstance(message, Saved)} == {(0, 1_250), (1, 1_250)}
+    assert {(group, message.step) for group, message in told if isinstance(message, Ended)} == {(0, 1_250), (1, 1_250)}
