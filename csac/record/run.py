@@ -77,6 +77,10 @@ class RunDirectory:
         except InputError as error:
             raise InputError(f"{path / MANIFEST} is broken: {error}; restore it or train again") from None
 
+    def read_again(self) -> None:
+        """Take the manifest as it is on disk now. Raises InputError where it is gone or broken."""
+        self.manifest = RunDirectory.open(self.path).manifest
+
     def update_manifest(self, **changes: Any) -> None:
         """Change fields of the manifest, on disk and in `manifest`, at one stroke."""
         content = manifests.written(dataclasses.replace(self.manifest, **changes))

@@ -124,6 +124,9 @@ def train(
     else:
         run = RunDirectory.create(before.path(plan), wanted)
     with run.locked(), storage_failures_told(run):
+        if before.existing:
+            run.read_again()  # another process may have gone on with it, and ended, before we had the lock
+            refuse_differences(run, wanted, has_schedule, defaults)
         if before.source:
             before.source.copy_to(run, plan.keep_checkpoints)
         if before.existing or before.source:

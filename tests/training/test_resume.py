@@ -311,6 +311,20 @@ def test_two_processes_do_not_share_a_run(tmp_path, finished):
         resume(tmp_path / "run", steps=260)
 
 
+def test_what_another_process_did_before_the_run_was_locked_is_not_undone(tmp_path, finished, monkeypatch):
+    """The manifest is read before the lock is taken, and was written back as it had been."""
+
+    def meanwhile(*_: Any) -> str:
+        RunDirectory.open(finished).update_manifest(steps=200, inexact_seeds=(0,))
+        return ""
+
+    monkeypatch.setattr("csac.training.train.memory_needed", meanwhile)
+    with pytest.raises(InputError, match="a run of 200 steps, which 150 would shorten"):
+        run(finished, steps=150, resume=True)
+    found = RunDirectory.open(finished).manifest
+    assert (found.steps, found.state, found.inexact_seeds) == (200, "finished", (0,))
+
+
 def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(tmp_path, uninterrupted):
     with pytest.raises(Crash):
         run(tmp_path / "run", on_evaluation=crash_at(400))
