@@ -167,6 +167,14 @@ def written(manifest: Manifest) -> bytes:
         raise InputError(f"the manifest cannot hold this: {error}; use numbers, strings, lists and dicts") from None
 
 
+def as_kept(manifest: Manifest) -> Manifest:
+    """Return the manifest as it is read back: with lists for arrays and tuples, and texts for paths.
+
+    So it can be compared with one from a file. Raises InputError for what JSON cannot hold.
+    """
+    return read(written(manifest))
+
+
 def differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Return "name is X, not Y" for each value that differs, in nested dicts too."""
     lines = []
@@ -174,7 +182,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str =
         old, new = _listed(before.get(name)), _listed(now.get(name))
         if isinstance(old, dict) and isinstance(new, dict):
             lines += differences(old, new, f"{name}." if name == "evaluation" else "")
-        elif old != new:
+        elif not _is_same(old, new):
             lines.append(f"{prefix}{name} is {old!r}, not {new!r}")
     return lines
 
@@ -224,6 +232,15 @@ def _called(kind: Any) -> str:
     names = {int: "a whole number", str: "a text", bool: "true or false", tuple: "a list", dict: "a JSON object"}
     origin = get_origin(kind) or kind
     return names.get(origin) or f"one of {', '.join(map(str, get_args(kind)))}"
+
+
+def _is_same(old: Any, new: Any) -> bool:
+    """Whether two values from JSON are equal; one that is not a number equals itself here."""
+    if isinstance(old, list) and isinstance(new, list):
+        return len(old) == len(new) and all(map(_is_same, old, new))
+    if isinstance(old, dict) and isinstance(new, dict):
+        return old.keys() == new.keys() and all(_is_same(old[key], new[key]) for key in old)
+    return old == new or (old != old and new != new)
 
 
 def _listed(value: Any) -> Any:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.checks import check_callable
 from csac.processes import end_if_unguarded
+from csac.record.manifest import as_kept
 from csac.record.run import RunDirectory
 from csac.record.wandb import WandbLog, import_wandb, logs_to_wandb
 from csac.tasks.perturbations import by_step, perturbations_of
@@ -111,7 +112,7 @@ def train(
     before = Before.find(directory, resume, start_from)
     plan, spec = make_plan(algorithm, task, options, before, may_evaluate_beside=stop_when is None)
     notes = [memory_needed(plan, spec), *_warmup_note(plan)]
-    wanted = plan.manifest(**provenance(task, command))
+    wanted = as_kept(plan.manifest(**provenance(task, command)))
     has_schedule, defaults = algorithm.cadence.has_schedule, _defaults(algorithm)
     if before.existing:
         run = before.existing

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import random
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from csac.record.manifest import Continuation, EvaluationPlan, Machine, Manifest, Origin, differences, read, written
+from csac.record.manifest import (
+    Continuation,
+    EvaluationPlan,
+    Machine,
+    Manifest,
+    Origin,
+    as_kept,
+    differences,
+    read,
+    written,
+)
 from csac.types import InputError
 
 FULL = Manifest(
@@ -131,3 +144,19 @@ def test_differences_are_told_by_name():
     changed = dataclasses.replace(FULL, steps=2_000, evaluation=EvaluationPlan(500, 3))
     ours, theirs = (json.loads(written(manifest)) for manifest in (FULL, changed))
     assert differences(ours, theirs) == ["evaluation.episodes is 2, not 3", "steps is 1000, not 2000"]
+
+
+def test_what_is_wanted_is_compared_as_it_would_be_kept():
+    arguments = {
+        "target": np.array([1.0, math.nan]),
+        "grid": ((1, 2), (3, 4)),
+        "model": Path("a/model.xml"),
+        "weights": {1: np.float32(0.1)},
+        "parts": [{"limit": math.nan}],
+    }
+    wanted = dataclasses.replace(FULL, environment_arguments=arguments)
+    before, now = read(written(wanted)), as_kept(wanted)
+    assert differences(vars(before), vars(now)) == []
+    other = as_kept(dataclasses.replace(wanted, environment_arguments={**arguments, "grid": ((1, 2), (3, 5))}))
+    told = differences(before.environment_arguments, other.environment_arguments)
+    assert told == ["grid is [[1, 2], [3, 4]], not [[1, 2], [3, 5]]"]

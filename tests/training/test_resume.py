@@ -551,6 +551,20 @@ def test_a_run_of_a_function_goes_on_through_train(tmp_path):
     assert run(tmp_path / "run", task=probes.Endless, resume=True).manifest.state == "finished"
 
 
+def test_a_run_whose_arguments_are_arrays_goes_on_and_is_forked(tmp_path):
+    """What JSON has no word for comes back as lists and texts, which were compared with the arrays themselves."""
+
+    def given(directory: str, steps: int, **options: Any) -> RunDirectory:
+        arguments = {"where": "step", "at": 1_000_000, "seeds": np.array([1, 2])}
+        return run(tmp_path / directory, LEARNERS[1], steps, probes.Failing, environment_arguments=arguments, **options)
+
+    given("run", 30)
+    assert given("run", 60, resume=True).manifest.steps_done == 60
+    origin = given("fork", 90, start_from=tmp_path / "run").manifest.forked_from
+    assert origin
+    assert origin.changes == ()
+
+
 def test_a_manifest_that_lacks_something_is_refused(tmp_path, finished):
     path = tmp_path / "run" / "manifest.json"
     fields = json.loads(path.read_text())
