@@ -161,6 +161,8 @@ class Group:
             if boundary:
                 yield Boundary(self.step)
         yield from self.settle()
+        if not self.settings.ends_turn(self.step):
+            yield from self._stop_diverged()  # what is saved of a stop between two turns is looked at as well
         yield Ended(self.step, self.policies())
 
     def policies(self) -> dict[int, Policy]:

@@ -24,6 +24,7 @@ from csac.record.run import RunDirectory
 from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, steps_in
 from csac.training.group import Group
+from csac.training.learner import Learner
 from csac.training.resume import Source
 from csac.training.scheduler import run_groups
 from csac.training.train import resume
@@ -582,3 +583,13 @@ def test_a_diverged_seed_names_its_first_bad_array_and_is_not_saved(tmp_path):
     assert "actor.layers.0.weight is not finite" in failed.reason
     assert 40 <= failed.step <= 50
     assert not [message for message in told if isinstance(message, messages.Saved) and message.step >= failed.step]
+
+
+def test_what_a_stop_between_two_turns_saves_is_looked_at(tmp_path, monkeypatch):
+    monkeypatch.setattr(Learner, "first_bad", lambda *_: "target_critics.layers.0.weight")
+    given = settings(LEARNERS[1], "Pendulum-v1", 300, tmp_path / "checkpoint", checkpoint_interval=250)
+    stops = iter([False] * 30 + [True])
+    told = [message for _, message in run_groups(given, [[0]], lambda: next(stops))]
+    (failed,) = [message for message in told if isinstance(message, messages.Failed)]
+    assert (failed.step, failed.reason[:45]) == (30, "target_critics.layers.0.weight is not finite:")
+    assert not [message for message in told if isinstance(message, messages.Saved)]
