@@ -301,9 +301,11 @@ def _checked_files(files: Any) -> Files:
 
 
 def _checked_values(values: Any) -> dict[str, Any]:
-    values = {"log_bytes": 0, "failures": {}, "pinned": [], **values}
+    values = {"log_bytes": 0, "failures": {}, "pinned": [], "groups": [], **values}
     if not _is_count(values["log_bytes"]) or not all(map(_is_count, values["pinned"])):
         raise TypeError("the log's size or pinned steps are not numbers")
+    if not isinstance(values["groups"], list):
+        raise TypeError("groups are not a list")
     if not all(re.fullmatch(_NUMBER, seed) and isinstance(text, str) for seed, text in values["failures"].items()):
         raise TypeError("failures are not texts by the numbers of seeds")
     return values

@@ -67,7 +67,7 @@ class Recorder:
         self.run, self.groups, self.reporter, self.logs = run, groups, reporter, logs
         self.checkpoints = checkpoints
         self.failures: dict[int, str] = dict(failures)
-        self._failed_at = dict.fromkeys(failures, begin)
+        self._begin, self._failed_at = begin, dict.fromkeys(failures, begin)
         self.inexact: set[int] = set()
         self.evaluated: list[tuple[int, dict[int, float]]] = []  # since the caller last emptied it
         self._passed = [begin] * len(groups)
@@ -125,7 +125,11 @@ class Recorder:
         """Write what still waits."""
         self._passed = [OVER] * len(self.groups)
         self._flush()
-        self.run.update_manifest(steps_done=max(self._steps.values()))
+        self.run.update_manifest(steps_done=self._furthest())
+
+    def _furthest(self) -> int:
+        """Return the most steps that a seed has made, those of the beginning where none is left to make any."""
+        return max(self._steps.values(), default=self._begin)
 
     def _take(self, group: int, table: Table, rows: list[dict[str, Any]]) -> None:
         """Let rows wait for their turn, but for those that a restarted group makes for the second time."""
@@ -158,7 +162,8 @@ class Recorder:
         """Commit what every group has saved that had not failed by then."""
         for step in sorted(self._saved):
             needed = {group for group in range(len(self.groups)) if not self._had_failed(group, step)}
-            is_whole = self._saved[step] and needed <= self._saved[step].keys()
+            # Where every seed had failed there is nothing to go on with: the checkpoint before stays the newest.
+            is_whole = needed and needed <= self._saved[step].keys()
             if is_whole and self._written <= step:  # else the tables have rows already that are not part of it
                 self._commit(step)
 
@@ -250,7 +255,7 @@ class Recorder:
 
     def _flush(self, until: int = OVER) -> None:
         """Write the rows that no group can precede any more, as far as step `until`."""
-        limit = min(until, *self._passed)
+        limit = min([until, *self._passed])
         self._written = max(limit, self._written)
         written: dict[Table, list[dict[str, Any]]] = {}
         for table in get_args(Table):
@@ -266,7 +271,7 @@ class Recorder:
             for log in self.logs:
                 self.tell(log.write(written))
             self._announce(written.get("evaluations", []))
-        self._tell_perturbations(min(limit, max(self._steps.values())))
+        self._tell_perturbations(min(limit, self._furthest()))
 
     def _announce(self, rows: list[dict[str, Any]]) -> None:
         """Tell whoever watches of each evaluation that every group has passed."""

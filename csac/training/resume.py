@@ -14,7 +14,7 @@ from csac.training.restore import copy, restore
 from csac.types import InputError, Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from csac.record.manifest import Manifest
     from csac.tasks.perturbations import Perturbation
@@ -39,6 +39,20 @@ class Restart(NamedTuple):
     failures: dict[int, str]
     complaints: list[str]  # what was wrong with newer checkpoints, and what was mended
     pinned: list[int]  # steps of checkpoints to keep for good
+    groups: Sequence[Sequence[int]] = ()  # the seeds that each process had trained together by then
+
+    def parts(self, groups: Sequence[Sequence[int]]) -> list[list[int]]:
+        """Return what is left of these groups to be trained, without the seeds that had failed.
+
+        A group that is as it was keeps them: they are at rest in its files, and the numbers of the others depend on
+        them at rounding level.
+        """
+        parts = []
+        for group in map(list, groups):
+            living = [seed for seed in group if seed not in self.failures]
+            if living:
+                parts.append(group if group in self.groups else living)
+        return parts
 
     def notes(self, before: Manifest, now: Manifest) -> list[str]:
         """Return what the user should know of this continuation, a line each."""
@@ -137,7 +151,7 @@ def roll_back(run: RunDirectory) -> Restart:
     step, pinned = checkpoint.step, checkpoint.values["pinned"]
     Checkpoints(run.checkpoints, run.manifest.checkpoints.keep, pinned).discard_after(step)
     failures = {int(seed): reason for seed, reason in checkpoint.values["failures"].items()}
-    return Restart(step, failures, complaints, pinned)
+    return Restart(step, failures, complaints, pinned, checkpoint.values["groups"])
 
 
 class Source(NamedTuple):
@@ -172,9 +186,10 @@ class Source(NamedTuple):
         names = ("algorithm", "events")  # of whose tables the new run's are a continuation
         found = differences({name: getattr(before, name) for name in names}, {n: getattr(wanted, n) for n in names})
         missing = sorted(set(wanted.seeds) - set(before.seeds))
+        living = [seed for seed in wanted.seeds if str(seed) not in self.checkpoint.values["failures"]]
         if missing:
             found.append(f"it has no seeds {', '.join(map(str, missing))}")
-        elif set(wanted.seeds) <= {int(seed) for seed in self.checkpoint.values["failures"]}:
+        elif not living:
             found.append(f"every seed asked for had failed by step {self.checkpoint.step}; begin with an earlier step")
         if not found and has_schedule and wanted.steps != before.steps:
             found.append(
@@ -182,7 +197,7 @@ class Source(NamedTuple):
             )
         if not found:
             with taken_back(self.checkpoint):
-                problem = misfit(self.checkpoint.seed(wanted.seeds[0]).part("learner"))
+                problem = misfit(self.checkpoint.seed(living[0]).part("learner"))
                 tasks = f" ({before.task}, and {wanted.task} now)" if before.task != wanted.task else ""
                 found += [problem + tasks] if problem else []
         kept, size = (m.hyperparameters.get("replay_size", 0) for m in (before, wanted))

@@ -251,7 +251,7 @@ def _follow(
 ) -> Recorder:
     """Train until the last step, a request to stop or a failure, and write down what happens."""
     reporter, begin, failures = watchers.reporter, restart.step, restart.failures
-    groups = [list(group) for group in plan.groups if not set(group) <= set(failures)]
+    groups = restart.parts(plan.groups)
     notes = [*notes, *filter(None, [tidy_programs()])]
     if reporter:
         reporter.start(plan.task_name, plan.algorithm.name, plan.labels, plan.steps, run.path, notes)

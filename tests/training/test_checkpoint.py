@@ -505,6 +505,16 @@ def test_the_last_checkpoint_comes_though_every_seed_of_the_slower_group_failed(
     assert steps_in(recorder.run.path / "checkpoint") == [300, 600]
 
 
+def test_a_step_by_which_every_seed_had_failed_is_no_checkpoint(recorder):
+    for group in (0, 1):
+        saves(recorder, group, 300)
+    saves(recorder, 0, 600)
+    recorder.handle(0, GroupCrashed("killed", ""))
+    recorder.handle(1, Progress(450))
+    recorder.handle(1, GroupCrashed("killed", ""))
+    assert steps_in(recorder.run.path / "checkpoint") == [300]
+
+
 class DeadWorker:
     """A worker that was killed in the middle of a message."""
 

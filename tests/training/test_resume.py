@@ -273,6 +273,36 @@ def test_a_failed_seed_stays_failed_and_the_others_go_on(tmp_path):
     assert Checkpoint.open(finished.path / "checkpoint", 120).seed(0).values["environment"]["alive"]
 
 
+@pytest.mark.filterwarnings("ignore:seed . of .* failed:RuntimeWarning")
+@pytest.mark.parametrize("has_files", [False, True])
+def test_a_seed_that_had_failed_alone_is_left_out_of_another_grouping(tmp_path, has_files):
+    """Its process had died for good: before the checkpoint, or at its very step, so that its files look alive."""
+    run(tmp_path / "run", LEARNERS[1], 60, probes.Endless, seeds=2)
+    fail(tmp_path / "run", 60, {"1": "step 50: killed"}, has_files)
+    forked = run(tmp_path / "fork", LEARNERS[1], 90, probes.Endless, seeds=2, start_from=tmp_path / "run")
+    finished = run(tmp_path / "run", LEARNERS[1], 90, probes.Endless, seeds=2, resume=True)
+    for known in (finished, forked):
+        assert (known.manifest.state, known.manifest.failures) == ("failed", {1: "step 50: killed"})
+        last = known.evaluations[known.evaluations["step"] == 90]
+        assert set(last["seed"]) == {0}
+
+
+@pytest.mark.filterwarnings("ignore:seed . of .* failed:RuntimeWarning")
+def test_a_run_of_which_every_seed_had_failed_ends_as_it_was(tmp_path):
+    run(tmp_path / "run", LEARNERS[1], 60, probes.Endless, seeds=2)
+    fail(tmp_path / "run", 60, {"0": "step 60: killed", "1": "step 50: killed"}, has_files=True)
+    known = run(tmp_path / "run", LEARNERS[1], 90, probes.Endless, seeds=2, resume=True)
+    assert (known.manifest.state, list(known.manifest.failures), known.manifest.steps_done) == ("failed", [0, 1], 60)
+
+
+def fail(directory: Path, step: int, failures: dict[str, str], has_files: bool) -> None:
+    """Let seeds have failed by a checkpoint, each of which had a process of its own."""
+    saved = Checkpoint.open(directory / "checkpoint", step)
+    files = {name: facts for name, facts in saved.files.items() if has_files or "seed_1." not in name}
+    values = {**saved.values, "failures": failures, "groups": [[0], [1]]}
+    Checkpoints(directory / "checkpoint", 2).commit(step, files, values)
+
+
 def probes_seed(seed: int, episode: int) -> int:
     from csac.tasks.seeds import training_seed
 
