@@ -78,9 +78,11 @@ def run_groups(
 ) -> Generator[tuple[int, Message], None, None]:
     """Train every group and yield (group, what happened) as it comes. A single group is trained in this process.
 
+    One that is left of several, since the others had failed, has its own as before: the last bits depend on its cores.
+
     All groups are saved at the same steps. Whoever takes the messages commits to `checkpoints`; here it is only read.
     """
-    if len(groups) == 1:
+    if len(groups) == 1 and len(settings.plan.groups) <= 1:
         yield from ((0, message) for message in _run_here(settings, groups[0], should_stop))
         return
     scheduler = _Scheduler(settings, groups, should_stop, checkpoints)
@@ -164,7 +166,8 @@ class _Scheduler:
             raise
         self.restarted: set[int] = set()
         cores = usable_cores()
-        sets = min(len(self.workers), len(cores))
+        planned = max(len(settings.plan.groups), len(groups))  # also those of which nothing is left
+        sets = min(planned, len(cores))
         self.free = [cores[i::sets] for i in range(sets)]
         self.waiting = list(self.workers)
         self.stopping, self.target = False, -1

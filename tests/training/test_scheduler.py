@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,7 +35,7 @@ class SlowWorkers:
     """Workers that make their turns at once, on a clock of their own: each turn takes so many seconds."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-        self.clock = 0.0
+        self.clock, self.cores = 0.0, []
         clock = SimpleNamespace(monotonic=lambda: self.clock)
 
         class Worker:
@@ -51,11 +52,15 @@ class SlowWorkers:
                     worker.answers.append(Ended(worker.made, {}))
                 else:
                     worker.made += 250
+                    self.cores.append(order)
                     self.clock += seconds
                     worker.answers.append(Boundary(worker.made))
 
             def recv(self) -> Any:
                 return self.answers.popleft()
+
+            def kill(self) -> None:
+                pass
 
         monkeypatch.setattr(scheduler_module, "time", clock)
         monkeypatch.setattr(scheduler_module, "_Worker", Worker)
@@ -74,3 +79,12 @@ def test_a_slow_run_stops_where_all_groups_were_saved(tmp_path, monkeypatch):
     told = [(group, message) for group, message in scheduler.run()]
     assert {(group, message.step) for group, message in told if isinstance(message, Saved)} == {(0, 1_250), (1, 1_250)}
     assert {(group, message.step) for group, message in told if isinstance(message, Ended)} == {(0, 1_250), (1, 1_250)}
+
+
+def test_what_is_left_of_several_groups_keeps_its_number_of_cores(tmp_path, monkeypatch):
+    """A seed whose fellow had failed had all cores after a resume, and so other last bits than without one."""
+    workers = SlowWorkers(monkeypatch, seconds=1.0)
+    settings = plans.settings(SAC(), "Hopper-v4", 250, tmp_path, checkpoint_interval=250)
+    settings = settings._replace(plan=replace(settings.plan, groups=((0,), (1,))))
+    told = [message for _, message in scheduler_module.run_groups(settings, [[0]], lambda: False)]
+    assert (told[-1], workers.cores) == (Ended(250, {}), [[0]])
