@@ -118,7 +118,7 @@ class Reporter:
         evaluations = run.evaluations
         if len(evaluations):
             self._print(results_table(run))
-            if (events := events_table(evaluations)) is not None:
+            if (events := events_table(run.sound_evaluations)) is not None:
                 self._print(events)
             for table in recovery_tables(run):
                 self._print(table)

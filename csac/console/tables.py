@@ -181,7 +181,9 @@ def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[st
 
 
 def print_runs(console: Console, runs: Sequence[RunDirectory]) -> None:
-    """Print what was trained in each run, how far it is, its last return (mean over its seeds) and where it is.
+    """Print what was trained in each run, how far it is, its last return and where it is.
+
+    The last return is the mean over the seeds that have not failed.
 
     A table where it fits, else a few lines for each run: a path that is cut could not be copied.
     """
@@ -230,7 +232,7 @@ def _state(run: RunDirectory) -> str:
 
 def _last_return(run: RunDirectory) -> str:
     try:
-        returns = last_evaluations(run.evaluations, points=1)
+        returns = last_evaluations(run.sound_evaluations, points=1)
     except InputError:
         return "damaged"
     return number(float(np.mean(list(returns.values())))) if returns else ""

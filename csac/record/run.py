@@ -135,6 +135,12 @@ class RunDirectory:
         """The rows of evaluations.csv: one per evaluation episode, in the order written."""
         return self.rows("evaluations")
 
+    @property
+    def sound_evaluations(self) -> np.ndarray:
+        """The rows of evaluations.csv without those of seeds that have failed: what means over seeds are made of."""
+        rows = self.evaluations
+        return rows[~np.isin(rows["seed"], list(self.manifest.failures))]
+
     def log(self, line: str) -> None:
         """Add a line to log.txt, after the time of now."""
         moment = datetime.now().astimezone().isoformat(timespec="seconds")

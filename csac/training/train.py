@@ -329,7 +329,9 @@ def _finish(run: RunDirectory, recorder: Recorder, state: State, reporter: Repor
 
 
 def _draw(run: RunDirectory) -> None:
-    rows = run.evaluations
+    rows = run.sound_evaluations
+    if not len(rows):
+        rows = run.evaluations  # of a run of which every seed has failed there is a picture too
     if len(rows):
         perturbed = by_step(perturbations_of(run.manifest.perturbations))
         marks = [(step, text) for step, text in perturbed if step <= rows["step"].max()]

@@ -132,6 +132,16 @@ def test_runs_are_listed_with_what_is_known_of_them(tmp_path, plain):
     ]
 
 
+def test_the_last_return_of_a_run_is_of_the_seeds_that_have_not_failed(tmp_path, plain):
+    failed = make_run(tmp_path / "a", [[1.0, 4.0], [2.0, -900.0], [3.0, 6.0]], failures=[1])
+    print_runs(plain, [failed, make_run(tmp_path / "b", [[1.0]], failures=[0])])
+    assert [line.strip().split("steps, ")[1] for line in lines(plain)[1::2]] == [
+        "finished, last return 5.00",
+        "finished",
+    ]
+    assert set(failed.sound_evaluations["seed"]) == {0, 2}
+
+
 def test_runs_are_a_table_where_there_is_room_for_it(tmp_path):
     run = make_run(tmp_path / "a", [[1.0, 4.0], [2.0, 8.0]])
     console = Console(file=io.StringIO(), width=200)
