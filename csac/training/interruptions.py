@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from csac.record.run import RunDirectory, StorageFailure
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Collection, Iterator
 
 _CANNOT_WRITE = (
     errno.ENOSPC,
@@ -128,11 +128,21 @@ def _is_main_thread() -> bool:
 
 
 @contextmanager
-def storage_failures_told(run: RunDirectory) -> Iterator[None]:
-    """Raise StorageFailure where the run can no longer be written."""
+def callers_own(failures: list[OSError]) -> Iterator[None]:
+    """Note an error that a function of the caller's raises: it says nothing of the run, and is theirs to see."""
     try:
         yield
     except OSError as error:
-        if error.errno in _CANNOT_WRITE:
+        failures.append(error)
+        raise
+
+
+@contextmanager
+def storage_failures_told(run: RunDirectory, others: Collection[OSError] = ()) -> Iterator[None]:
+    """Raise StorageFailure where the run can no longer be written; `others` are errors that come from elsewhere."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _CANNOT_WRITE and not any(error is other for other in others):
             raise StorageFailure(f"{run.path} cannot be written: {error.strerror}") from error
         raise

@@ -19,7 +19,7 @@ from csac.tasks.trust import refuse_untrusted
 from csac.training.checkpoint import Checkpoints
 from csac.training.compilation import tidy_programs
 from csac.training.footprint import memory_needed
-from csac.training.interruptions import Interrupted, caught_signals, storage_failures_told
+from csac.training.interruptions import Interrupted, callers_own, caught_signals, storage_failures_told
 from csac.training.learner import misfit
 from csac.training.messages import Settings
 from csac.training.plan import Before, Plan, algorithm_of, check_algorithm, make_plan, options_of
@@ -108,7 +108,7 @@ def train(
     check_callable("stop_when", stop_when)
     if wandb:
         import_wandb()
-    watchers = Watchers(reporter, tensorboard, wandb, on_evaluation, stop_when)
+    watchers = Watchers(reporter, tensorboard, wandb, on_evaluation, stop_when, [])
     before = Before.find(directory, resume, start_from)
     plan, spec = make_plan(algorithm, task, options, before, may_evaluate_beside=stop_when is None)
     notes = [memory_needed(plan, spec), *_warmup_note(plan)]
@@ -124,7 +124,7 @@ def train(
         run = RunDirectory.create(before.path(plan), dataclasses.replace(wanted, forked_from=origin))
     else:
         run = RunDirectory.create(before.path(plan), wanted)
-    with run.locked(), storage_failures_told(run):
+    with run.locked(), storage_failures_told(run, watchers.failures):
         if before.existing:
             run.read_again()  # another process may have gone on with it, and ended, before we had the lock
             refuse_differences(run, wanted, has_schedule, defaults)
@@ -197,15 +197,18 @@ class Watchers(NamedTuple):
     wandb: bool | str
     on_evaluation: OnEvaluation | None
     stop_when: StopWhen | None
+    failures: list[OSError]
+    """What the caller's functions raised that is no failure of the run directory."""
 
     def tell(self, evaluated: list[tuple[int, dict[int, float]]]) -> bool:
         """Call the caller's functions for each new evaluation; return whether the run is to end early."""
         enough = False
         while evaluated:
             step, returns = evaluated.pop(0)
-            if self.on_evaluation:
-                self.on_evaluation(step, returns)
-            enough = bool(self.stop_when and self.stop_when(step, returns)) or enough
+            with callers_own(self.failures):
+                if self.on_evaluation:
+                    self.on_evaluation(step, returns)
+                enough = bool(self.stop_when and self.stop_when(step, returns)) or enough
         return enough
 
 

@@ -582,6 +582,16 @@ def test_a_run_of_a_function_goes_on_through_train(tmp_path):
     assert run(tmp_path / "run", task=probes.Endless, resume=True).manifest.state == "finished"
 
 
+def test_an_error_of_the_caller_s_own_function_is_theirs(tmp_path):
+    """That a file of theirs is not there was told as: the run cannot be written."""
+
+    def read(*_: Any) -> None:
+        (tmp_path / "theirs" / "notes.txt").read_text()
+
+    with pytest.raises(FileNotFoundError):
+        run(tmp_path / "run", LEARNERS[1], 30, probes.Endless, on_evaluation=read)
+
+
 def test_a_run_whose_arguments_are_arrays_goes_on_and_is_forked(tmp_path):
     """What JSON has no word for comes back as lists and texts, which were compared with the arrays themselves."""
 
