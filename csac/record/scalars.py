@@ -35,6 +35,10 @@ class Log(Protocol):
         """Take rows of each table, later ones than before; return what the user should know, a line each."""
         ...
 
+    def flush(self) -> None:
+        """Have on disk what a run counts on that goes on from now, as far as this log can say. Raises OSError."""
+        ...
+
     def close(self) -> Sequence[str]:
         """Write what still waits and let go; return what the user should know, a line each. May be called again."""
         ...

@@ -31,8 +31,7 @@ class TensorBoardLog:
     def __init__(
         self, path: Path, seeds: Sequence[int], begin: int = 0, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        purge = begin + 1 if begin else None  # what a run wrote after the step that it goes on from
-        self._files = {seed: _SeedFile(path / f"seed_{seed}", purge) for seed in seeds}
+        self._files = {seed: _SeedFile(path / f"seed_{seed}", begin) for seed in seeds}
         self._scalars = Scalars(seeds, begin, clock)
 
     def write(self, tables: Tables) -> Sequence[str]:
@@ -42,6 +41,11 @@ class TensorBoardLog:
                 record = TensorBoardEvent(step=step, summary=Summary(value=[_value(tag, value)]))
                 self._files[seed].add(record)
         return ()
+
+    def flush(self) -> None:
+        """Have everything in the files: what comes before a checkpoint is not made again after a crash."""
+        for file in self._files.values():
+            file.flush()
 
     def close(self) -> Sequence[str]:
         """Write what still waits and close the files. May be called again."""
@@ -56,20 +60,25 @@ class _SeedFile:
     Not tensorboardX's own writer: its thread dies of a full disk, and whoever adds to its queue then waits for ever.
     """
 
-    def __init__(self, folder: Path, purge_step: int | None) -> None:
+    def __init__(self, folder: Path, begin: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
+        has_earlier = any(folder.glob("events.*"))
         self._writer: EventsWriter | None = EventsWriter(str(folder / "events"))
         self._flushed = time.monotonic()
-        if purge_step is not None:
-            self.add(TensorBoardEvent(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
+        if begin or has_earlier:  # TensorBoard drops what was written after the step that the run goes on from
+            self.add(TensorBoardEvent(step=begin + 1, session_log=SessionLog(status=SessionLog.START)))
 
     def add(self, record: TensorBoardEvent) -> None:
         assert self._writer
         record.wall_time = time.time()
         self._writer.write_event(record)
         if time.monotonic() - self._flushed >= FLUSH_SECONDS:
-            self._writer.flush()
-            self._flushed = time.monotonic()
+            self.flush()
+
+    def flush(self) -> None:
+        assert self._writer
+        self._writer.flush()
+        self._flushed = time.monotonic()
 
     def close(self) -> None:
         """Close the file; what cannot be written is left out, since nothing depends on it."""

@@ -78,6 +78,9 @@ class WandbLog:
             self._waiting.put(points)
         return self._told()
 
+    def flush(self) -> None:
+        """Do nothing: W&B writes its own files, and training never waits for it."""
+
     def close(self) -> Sequence[str]:
         """Wait for W&B, but not for ever; return what there is to say of it. May be called again."""
         self._waiting.put(None)

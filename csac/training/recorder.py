@@ -173,6 +173,8 @@ class Recorder:
     def _commit(self, step: int) -> None:
         assert self.checkpoints
         self._flush(step)
+        for log in self.logs:
+            log.flush()
         # In order of the groups, not of who was saved first, so that equal runs have equal checkpoints.
         parts = [part for _, part in sorted(self._saved[step].items())]
         files = {name: facts for part in parts for name, facts in part.items()}

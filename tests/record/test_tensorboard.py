@@ -1,5 +1,5 @@
 import pytest
-from scalars import scalars
+from scalars import purges, scalars
 
 from csac.record.tensorboard import TensorBoardLog
 
@@ -63,3 +63,18 @@ def test_evaluations_are_averaged_per_seed_and_step(log, tmp_path):
 def test_closing_twice_is_harmless(log):
     log.close()
     log.close()
+
+
+def test_what_is_flushed_is_there_though_nothing_was_closed(log, tmp_path):
+    log.write({"episodes": [{"seed": 7, "step": 5, "return": 1.0, "length": 10}]})
+    log.flush()
+    assert scalars(tmp_path / "seed_7")["rollout/ep_rew_mean"] == [(5, 1.0)]
+
+
+@pytest.mark.parametrize(("begin", "purged"), [(0, [1]), (40, [41])])
+def test_what_a_run_wrote_beyond_where_it_goes_on_is_dropped(tmp_path, begin, purged):
+    """Also where it begins anew, since it was killed before its first checkpoint."""
+    TensorBoardLog(tmp_path, [0]).close()
+    assert purges(tmp_path / "seed_0") == []
+    TensorBoardLog(tmp_path, [0], begin).close()
+    assert purges(tmp_path / "seed_0") == purged
