@@ -20,7 +20,7 @@ from csac.types import InputError
 SCHEMA_VERSION = 1
 
 State = Literal["running", "finished", "failed", "interrupted"]
-STEPS_LIMIT = 10**15  # no machine makes so many
+STEPS_LIMIT = 2**31 - 1  # learners count their steps in 32 bits
 SEED_LIMIT = 2**32  # a key is made of a seed's lowest 32 bits, so that a larger one would be another's twin
 
 
@@ -123,7 +123,9 @@ class Manifest:
         if not self.seeds or not all(0 <= seed < SEED_LIMIT for seed in self.seeds):
             raise InputError(f"seeds are {list(self.seeds)!r:.60}, and are one or more from 0 to {SEED_LIMIT - 1}")
         if not 1 <= self.steps <= STEPS_LIMIT or not 0 <= self.steps_done <= STEPS_LIMIT:
-            raise InputError(f"steps are {self.steps} with {self.steps_done} done, and lie between 1 and 10^15")
+            raise InputError(
+                f"steps are {self.steps} with {self.steps_done} done, and lie between 1 and {STEPS_LIMIT:,}"
+            )
         if self.evaluation.interval < 1 or self.evaluation.episodes < 1:
             raise InputError("evaluation has an interval or episodes below 1")
         if not 0 <= self.evaluation.first_seed < SEED_LIMIT:

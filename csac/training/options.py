@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from csac.tasks.perturbations import Perturbation
 
 MOST_SEEDS = 10_000
+MOST_EPISODES = 1_000_000  # as many as there are reset seeds between those of training's evaluations and of later ones
+LONGEST_INTERVAL = 10**15  # as good as never
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +53,10 @@ class Options:
             ("steps", 1, STEPS_LIMIT),
             ("seeds", 1, MOST_SEEDS),
             ("first_seed", 0, SEED_LIMIT - 1),
-            ("evaluation_interval", 1, STEPS_LIMIT),
-            ("evaluation_episodes", 1, STEPS_LIMIT),
-            ("checkpoint_interval", 0, STEPS_LIMIT),
-            ("keep_checkpoints", 0, STEPS_LIMIT),
+            ("evaluation_interval", 1, LONGEST_INTERVAL),
+            ("evaluation_episodes", 1, MOST_EPISODES),
+            ("checkpoint_interval", 0, LONGEST_INTERVAL),
+            ("keep_checkpoints", 0, LONGEST_INTERVAL),
         ):
             check_whole(name, getattr(self, name), least, most)
         if self.labels[-1] >= SEED_LIMIT:

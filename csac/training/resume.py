@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
@@ -171,7 +172,7 @@ class Source(NamedTuple):
         if not at or Path(where).exists():
             name, step = str(where), ""
         run = RunDirectory.open(name)
-        if step and not (step.isascii() and step.replace("_", "").isdecimal()):
+        if step and not (step.isascii() and re.fullmatch(r"\d+(_\d+)*", step) and len(step) <= 20):
             raise InputError(f"{where}: {step!r} is not a step; write DIRECTORY@STEP")
         if step:
             return cls(run, sound_at(run.checkpoints, int(step)))

@@ -103,3 +103,11 @@ def test_a_run_in_which_nothing_is_learnt_says_so(algorithm, steps, why):
 
 def test_numpy_numbers_are_numbers():
     assert Options(steps=np.int64(5)).steps == 5  # pyright: ignore[reportArgumentType]
+
+
+def test_numbers_that_no_run_can_have_are_refused_with_their_limit():
+    with pytest.raises(InputError, match=r"steps must be at most 2,147,483,647, not 2.15e\+09"):
+        Options(steps=2**31)
+    assert Options(steps=2**31 - 1).steps == 2**31 - 1
+    with pytest.raises(InputError, match=r"evaluation_episodes must be at most 1,000,000, not 2e\+09"):
+        Options(evaluation_episodes=2_000_000_000)

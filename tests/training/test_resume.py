@@ -537,6 +537,8 @@ def test_a_fork_with_some_of_the_seeds_has_nothing_of_the_others(tmp_path):
     [
         ("@100", {}, "no checkpoint of step 100; it has 120, 130"),
         ("@soon", {}, "'soon' is not a step"),
+        ("@10_", {}, "'10_' is not a step"),
+        ("@1__0", {}, "'1__0' is not a step"),
         ("x", {}, "does not exist"),
         ("", {"algorithm": replace(LEARNERS[0], actor_hidden_sizes=(9, 9))}, r"actor.*is to be float32 \(11, 9\)"),
         ("", {"algorithm": LEARNERS[1]}, "algorithm is 'csac', not 'sac'"),
