@@ -53,10 +53,14 @@ def _processor() -> str:
 def _commit() -> str | None:
     """Return the commit of csac's own checkout, if it runs from one."""
     try:
-        folder = Path(__file__).parent
-        result = subprocess.run(
-            ["git", "-C", folder, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=True
-        )
+        # Installed into an environment inside of somebody's repository, its files are none of that repository's.
+        _git("ls-files", "--error-unmatch", Path(__file__).name)
+        return _git("rev-parse", "HEAD").strip() or None
     except (OSError, subprocess.SubprocessError):
         return None
-    return result.stdout.strip() or None
+
+
+def _git(*arguments: str) -> str:
+    """Return what git says in the folder of this file. Raises OSError or SubprocessError."""
+    command = ["git", "-C", Path(__file__).parent, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import subprocess
 from typing import Any
 
 import numpy as np
 import pytest
 
 from csac import PPO, SAC, train
+from csac.training import provenance
 from csac.training.options import Options, PlanOptions, checked_options
 from csac.training.plan import Plan
 from csac.training.train import _warmup_note
@@ -103,6 +105,26 @@ def test_a_run_in_which_nothing_is_learnt_says_so(algorithm, steps, why):
 
 def test_numpy_numbers_are_numbers():
     assert Options(steps=np.int64(5)).steps == 5  # pyright: ignore[reportArgumentType]
+
+
+def test_a_commit_is_csac_s_own(tmp_path, monkeypatch):
+    """Installed inside of somebody's repository, csac took theirs for its own."""
+
+    def git(*arguments: str) -> str:
+        who = ["-c", "user.name=n", "-c", "user.email=e"]
+        return subprocess.run(
+            ["git", "-C", tmp_path, *who, *arguments], check=True, capture_output=True, text=True
+        ).stdout
+
+    module = tmp_path / "provenance.py"
+    module.touch()
+    monkeypatch.setattr(provenance, "__file__", str(module))
+    git("init")
+    git("commit", "--allow-empty", "-m", "theirs")
+    assert provenance._commit() is None
+    git("add", "provenance.py")
+    git("commit", "-m", "ours")
+    assert provenance._commit() == git("rev-parse", "HEAD").strip()
 
 
 def test_numbers_that_no_run_can_have_are_refused_with_their_limit():
