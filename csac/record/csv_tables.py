@@ -24,6 +24,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "episodes": ("seed", "step", "return", "length"),
     "metrics": ("seed", "step"),
 }
+LARGEST_RETURN = 1e100
 INTEGER_COLUMNS = frozenset({"seed", "step", "episode", "length"})
 
 
@@ -120,6 +121,26 @@ def read_rows(path: str | Path) -> np.ndarray:
         return structured(header, body)
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path} is damaged ({_short(error)}); remove the line that holds it") from None
+
+
+def read_evaluations(path: str | Path) -> np.ndarray:
+    """Read a table of returns by seed and step, as `read_rows` does; `success` is NaN where it does not say.
+
+    Raises:
+        InputError: as `read_rows`, of a table without returns, or of returns that are infinite or too large to square.
+    """
+    rows = read_rows(path)
+    if "return" not in (rows.dtype.names or ()):
+        raise InputError(f"{path} has no returns: give an evaluations.csv, or columns seed, step and return")
+    if (np.abs(rows["return"]) > LARGEST_RETURN).any():
+        raise InputError(f"{path} has returns beyond ±{LARGEST_RETURN:g}, which no mean can be made of: remove them")
+    if "success" in rows.dtype.names:
+        return rows
+    found = np.empty(len(rows), [*rows.dtype.descr, ("success", float)])
+    for name in rows.dtype.names:
+        found[name] = rows[name]
+    found["success"] = np.nan
+    return found
 
 
 def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarray:

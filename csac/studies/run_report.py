@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from csac.record.atomic import write_atomically
-from csac.record.csv_tables import read_rows
+from csac.record.csv_tables import read_evaluations, read_rows
 from csac.record.plots import learning_curve
 from csac.record.rendering import Cell, Row, Table, between_markers, markdown
 from csac.record.run import RunDirectory, find_runs, is_run
@@ -247,7 +247,7 @@ def _read(path: Path, label: str | None) -> list[Given]:
     if path.name == "evaluations.csv" and is_run(path.parent):
         path = path.parent
     if path.suffix == ".csv":
-        return [Given(label, path, read_rows(path), None)]
+        return [Given(label, path, read_evaluations(path), None)]
     runs = [] if is_run(path) or not path.is_dir() else find_runs(path)
     found = runs or [RunDirectory.open(path)]
     return [Given(label, run.path, run.evaluations, run.manifest) for run in found]

@@ -183,6 +183,12 @@ def test_a_run_without_evaluations_is_told(capsys):
     assert "note: there is no evaluation yet in these runs" in capsys.readouterr().out
 
 
+def test_returns_by_seed_and_step_are_enough():
+    Path("others.csv").write_text("seed,step,return\n0,10,30\n0,20,50\n")
+    text = report("others.csv")
+    assert "| 0 | 20 |" in text
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -200,6 +206,8 @@ def test_a_run_without_evaluations_is_told(capsys):
         ("report --label a=a.csv --out page.md/a.html", "cannot write page.md/a.html"),
         ("report --label a=a.csv --perturb frction=2", "no perturbation is called 'frction': did you mean friction?"),
         ("report --label a=run,other", "a: its runs learn Ant-v4 and Hopper-v4; give each a label of its own"),
+        ("report --label a=metrics.csv", "metrics.csv has no returns: give an evaluations.csv"),
+        ("report --label a=infinite.csv", "infinite.csv has returns beyond ±1e+100"),
         ("report run other --curve a.png", "these runs are of several tasks"),
     ],
 )
@@ -207,6 +215,8 @@ def test_mistakes_are_told_in_one_line(capsys, line, message):
     write_rows("a", [[1.0]])
     make_run_of("run", [[1.0]])
     make_run_of("other", [[1.0]], seeds=(1,), task="Ant-v4")
+    Path("metrics.csv").write_text("seed,step,q_mean\n0,10,1.5\n")
+    Path("infinite.csv").write_text(f"{ROWS}\n0,10,0,inf,5,\n")
     Path("page.md").write_text("<!-- it: begin -->\n<!-- it: end -->\n")
     before = sorted(path.name for path in Path().iterdir())
     assert csac(line) == 2
