@@ -130,14 +130,15 @@ def read_evaluations(path: str | Path) -> np.ndarray:
         InputError: as `read_rows`, of a table without returns, or of returns that are infinite or too large to square.
     """
     rows = read_rows(path)
-    if "return" not in (rows.dtype.names or ()):
+    names = rows.dtype.names or ()
+    if "return" not in names:
         raise InputError(f"{path} has no returns: give an evaluations.csv, or columns seed, step and return")
     if (np.abs(rows["return"]) > LARGEST_RETURN).any():
         raise InputError(f"{path} has returns beyond ±{LARGEST_RETURN:g}, which no mean can be made of: remove them")
-    if "success" in rows.dtype.names:
+    if "success" in names:
         return rows
     found = np.empty(len(rows), [*rows.dtype.descr, ("success", float)])
-    for name in rows.dtype.names:
+    for name in names:
         found[name] = rows[name]
     found["success"] = np.nan
     return found

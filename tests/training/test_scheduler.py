@@ -36,7 +36,7 @@ class SlowWorkers:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
         self.clock, self.cores = 0.0, []
-        clock = SimpleNamespace(monotonic=lambda: self.clock)
+        machine, clock = self, SimpleNamespace(monotonic=lambda: self.clock)
 
         class Worker:
             def __init__(self, settings: Any, seeds: Any) -> None:
@@ -45,16 +45,16 @@ class SlowWorkers:
                 self.step = self.saved = self.made = 0
                 self.answers: deque[Any] = deque()
 
-            def tell(worker, order: Any) -> None:  # noqa: N805
+            def tell(self, order: Any) -> None:
                 if order == "save":
-                    worker.answers.append(Saved(worker.made, {}, {}))
+                    self.answers.append(Saved(self.made, {}, {}))
                 elif order == "stop":
-                    worker.answers.append(Ended(worker.made, {}))
+                    self.answers.append(Ended(self.made, {}))
                 else:
-                    worker.made += 250
-                    self.cores.append(order)
-                    self.clock += seconds
-                    worker.answers.append(Boundary(worker.made))
+                    self.made += 250
+                    machine.cores.append(order)
+                    machine.clock += seconds
+                    self.answers.append(Boundary(self.made))
 
             def recv(self) -> Any:
                 return self.answers.popleft()
