@@ -291,7 +291,7 @@ def test_the_time_of_another_candidate_is_refused(folder):
         runner.timed(folder, study)
 
 
-def test_the_candidate_is_timed_with_every_hyperparameter_of_stage_3(monkeypatch):
+def test_the_candidate_is_timed_with_every_hyperparameter_of_stage_1(monkeypatch):
     trained: dict[str, Any] = {}
 
     def train(algorithm: Any, task: str, **options: Any) -> Any:
@@ -303,7 +303,7 @@ def test_the_candidate_is_timed_with_every_hyperparameter_of_stage_3(monkeypatch
 
     (candidate,) = [method for method in STUDY.methods if method.label == runner.CANDIDATE]
     assert dataclasses.asdict(trained["algorithm"]) == candidate.hyperparameters_on("Ant-v4")
-    assert (trained["task"], trained["steps"], trained["first_seed"]) == ("Ant-v4", 100_000, 202)
+    assert (trained["task"], trained["steps"], trained["first_seed"]) == ("Ant-v4", 100_000, 102)
     assert (trained["evaluation_interval"], trained["evaluation_episodes"]) == (100_000, 1)
 
 
@@ -326,9 +326,9 @@ def test_peers_run_seed_by_seed_and_what_is_there_is_not_run_again(folder, start
     given = [dict(zip(command[2::2], command[3::2], strict=True)) for command in started]
     assert [one["--peer"] for one in given[:6]] == [*models.PEERS, "sb3-sac"]
     assert [one["--task"] for one in given[:10]] == ["Walker2d-v4"] * 5 + ["Ant-v4"] * 5
-    assert [one["--seed"] for one in given[::10]] == ["200", "201", "202", "203", "204"]
+    assert [one["--seed"] for one in given[::10]] == ["100", "101", "102", "103", "104"]
     assert {(one["--task"], one["--seconds"]) for one in given} == {("Walker2d-v4", "20.0"), ("Ant-v4", "30.1")}
-    assert "failed: sbx-tqc on Ant-v4, seed 200: it broke" in capsys.readouterr().err
+    assert "failed: sbx-tqc on Ant-v4, seed 100: it broke" in capsys.readouterr().err
     with (folder / "load.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 45
 
@@ -339,7 +339,7 @@ def test_peers_run_seed_by_seed_and_what_is_there_is_not_run_again(folder, start
 
 
 def test_a_run_of_another_t_is_refused(folder, started, capsys):
-    path = folder / "Ant-v4" / "sbx-sac" / "seed-203.csv"
+    path = folder / "Ant-v4" / "sbx-sac" / "seed-103.csv"
     path.parent.mkdir(parents=True)
     write_rows(path, [{"limit": 29.0}])
 
