@@ -42,10 +42,13 @@ class Table(NamedTuple):
         return all(row.cells[column].value is not None for row in self.rows)
 
 
+SMALL = 0.1  # below which two decimals tell too little of a return
+
+
 def number(value: float, largest: float | None = None) -> str:
-    """Return a return as people read it; `largest` sets the decimals for a whole column."""
-    size = abs(value) if largest is None else largest
-    return f"{value:,.{1 if size >= 100 else 2}f}"
+    """Return a return as people read it, a small one with three digits; `largest` sets the form of a whole column."""
+    size = abs(value if largest is None else largest)
+    return f"{value:.3g}" if 0 < size < SMALL else f"{value:,.{1 if size >= 100 else 2}f}"
 
 
 def short(steps: float) -> str:

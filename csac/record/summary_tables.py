@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from csac.record.curve_measures import REGAINED, Recovery
-from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric, short
+from csac.record.rendering import EMPTY, SMALL, Cell, Row, Table, number, numeric, short
 from csac.record.statistics import FEWEST_FOR_BOOTSTRAP, FEWEST_FOR_INTERVAL
 from csac.record.summaries import OverSeeds, case_names, cases, over_seeds
 
@@ -202,7 +202,7 @@ def _whole(value: int) -> Cell:
 
 
 def _form(value: float) -> str:
-    return ",.0f" if abs(value) >= 20 else ".2f"
+    return ",.0f" if abs(value) >= 20 else ".3g" if 0 < abs(value) < SMALL else ".2f"
 
 
 def _seeds(run: RunSummary) -> Cell:

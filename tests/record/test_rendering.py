@@ -9,7 +9,16 @@ def test_steps_in_little_room(steps, text):
 
 
 @pytest.mark.parametrize(
-    ("value", "largest", "text"), [(1.234, None, "1.23"), (-1234.56, None, "-1,234.6"), (1.234, 5000.0, "1.2")]
+    ("value", "largest", "text"),
+    [
+        (1.234, None, "1.23"),
+        (-1234.56, None, "-1,234.6"),
+        (1.234, 5000.0, "1.2"),
+        (0.0042, None, "0.0042"),
+        (-0.00012345, 0.05, "-0.000123"),
+        (0.0042, 5.0, "0.00"),
+        (0.0, None, "0.00"),
+    ],
 )
 def test_a_column_has_one_number_of_decimals(value, largest, text):
     assert number(value, largest) == text
