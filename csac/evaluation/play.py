@@ -198,7 +198,8 @@ def _draw_off_screen() -> None:
 
 def _check_video(path: Path) -> None:
     if path.suffix.lower() != ".mp4":
-        raise InputError(f"the video is an .mp4 file: name it {Path(path.stem or 'video').with_suffix('.mp4')}")
+        better = path.with_suffix(".mp4") if path.name else path / "video.mp4"
+        raise InputError(f"the video is an .mp4 file: name it {better}")
     check_name(path, _aside(path))
     if path.is_dir():
         raise InputError(f"{path} is a directory: give the name of a file for the video")

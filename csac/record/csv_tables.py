@@ -60,7 +60,8 @@ def _header(path: Path, line: bytes) -> list[str]:
 def check_new(path: Path, what: str = "table", suffix: str = ".csv") -> None:
     """Raise InputError where there is a file already or none can be, before anything has been computed for it."""
     if path.suffix.lower() != suffix:
-        raise InputError(f"the {what} is a {suffix} file: name it {Path(path.stem or what).with_suffix(suffix)}")
+        better = path.with_suffix(suffix) if path.name else path / f"{what}{suffix}"
+        raise InputError(f"the {what} is a {suffix} file: name it {better}")
     check_name(path, _aside(path))
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")

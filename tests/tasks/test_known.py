@@ -613,6 +613,7 @@ def test_evaluate_writes_its_episodes_where_nothing_is(tmp_path, monkeypatch, ca
         ("cases.csv", "cases.csv exists: give another name"),
         ("none/cases.csv", "cannot write into none"),
         ("cases.txt", "the table is a .csv file: name it cases.csv"),
+        ("there/hopper.v4.txt", "the table is a .csv file: name it there/hopper.v4.csv"),
         (".", "the table is a .csv file: name it table.csv"),
     ):
         assert main(["evaluate", "run", "--csv", name]) == 2
