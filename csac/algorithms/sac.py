@@ -94,7 +94,7 @@ class SAC:
     def critic_target(
         self, transition: Transition, noise: Action, *, actor: MLP, target_critics: Critics, temperature: Scalar
     ) -> Scalar:
-        """Return r + γ [min Q(s', a') - α log π(a'|s')] with a' = tanh(mean + std noise) (SAC, Eq. 3)."""
+        """Return r + γ [min Q(s', a') - α log π(a'|s')] with a' = tanh(mean + std noise) (second paper, Eq. 3)."""
         policy = policy_at(actor, transition.next_observation)
         q_value = least_q_value(target_critics, transition.next_observation, policy.sample(noise))
         value = q_value - temperature * policy.log_prob(noise)
@@ -103,7 +103,7 @@ class SAC:
     def actor_loss(
         self, actor: MLP, observation: Observation, noise: Action, *, critics: Critics, temperature: Scalar
     ) -> tuple[Scalar, Metrics]:
-        """Return α log π - min Q at the reparameterised action (SAC, Eq. 9), and what to log."""
+        """Return α log π - min Q at the reparameterised action (second paper, Eq. 9), and what to log."""
         policy = policy_at(actor, observation)
         q_value = least_q_value(critics, observation, policy.sample(noise))
         log_prob = policy.log_prob(noise)
