@@ -100,11 +100,10 @@ def interactions(arm: Arm, threshold: float) -> np.ndarray:
 
 def _returns(arms: Sequence[Arm]) -> Iterator[Comparison]:
     for task, own in tasks_of(arms).items():
-        if any(arm.published and arm.published.startswith("tau") for arm in own):
+        if any(map(_is_weighed, own)):
             yield from _weights(own)
-            continue
         published = paper.RETURNS.get(task, {})
-        for arm, other in _pairs(own):
+        for arm, other in _pairs([arm for arm in own if not _is_weighed(arm)]):
             name = other.published or ""
             if name in published and published["CSAC"].mean > published[name].mean:
                 yield _better(f"{task}: a higher maximum average return than {name}", arm, other, _best)
@@ -132,13 +131,26 @@ def _closeness(arm: Arm) -> np.ndarray:
 
 def _weights(arms: Sequence[Arm]) -> Iterator[Comparison]:
     """The weight that the paper finds best against each other weight, within each variant."""
-    values = [(arm, arm.hyperparameters["relative_entropy_weight"]) for arm in arms]
+    values = [(arm, value) for arm in arms if (value := _weight(arm)) is not None]
     for best in (arm for arm, value in values if value == paper.BEST_TAU):
         for other, value in values:
             if variant_of(other.label) == variant_of(best.label) and value != paper.BEST_TAU:
                 yield _better(
                     f"tau {paper.BEST_TAU:g}: a higher maximum average return than {value:g}", best, other, _best
                 )
+
+
+def _is_weighed(arm: Arm) -> bool:
+    """Return whether it stands beside one of the paper's weights, and not beside one of its methods."""
+    return (arm.published or "").startswith("tau")
+
+
+def _weight(arm: Arm) -> float | None:
+    """Return the weight that an arm stands for: the paper's, or, of one without a column, the number it was given."""
+    if _is_weighed(arm):
+        return float((arm.published or "").removeprefix("tau "))
+    given = None if arm.published else arm.hyperparameters.get("relative_entropy_weight")
+    return given if isinstance(given, int | float) else None
 
 
 def _efficiency(arms: Sequence[Arm]) -> Iterator[Comparison]:

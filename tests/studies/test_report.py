@@ -115,6 +115,28 @@ def test_the_claims_of_the_tables():
     assert len(claims_of(NAMED["robustness"][0])) == 2 * 3 * 3
 
 
+def test_a_weight_of_the_paper_s_stands_beside_other_methods(tmp_path):
+    """Weights are told by the column, whatever the method was given; the others have the claims that they had."""
+    alone = claims_of(of_ones_own(tmp_path, "steps = 1_000_000"))
+    methods = """
+[[methods]]
+label = "weight, best"
+algorithm = "csac"
+published = "tau 0.5"
+[[methods]]
+label = "weight, most"
+algorithm = "csac"
+preset = "paper"
+published = "tau 50"
+[[methods]]
+label = "weight, learnt"
+algorithm = "csac"
+hyperparameters = { relative_entropy_weight = "auto" }"""
+    claims = claims_of(of_ones_own(tmp_path, "steps = 1_000_000", methods))
+    assert alone.items() < claims.items()
+    assert [claim for claim in claims if "tau" in claim] == ["weight: tau 0.5: a higher maximum average return than 50"]
+
+
 def test_a_steadier_method_falls_less_and_its_seeds_are_nearer_together():
     def value(cell, step):
         height, fall = (100, 50 + cell.seed) if cell.algorithm == "sac" else (1, 5)
