@@ -278,6 +278,7 @@ def _settings(manifest: Manifest) -> dict[str, Any]:
     settings |= {
         "evaluation interval": manifest.evaluation.interval,
         "evaluation episodes": manifest.evaluation.episodes,
+        "evaluation seed": manifest.evaluation.first_seed,
     }
     settings |= {f"environment: {name}": value for name, value in manifest.environment_arguments.items()}
     return settings

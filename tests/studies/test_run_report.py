@@ -8,6 +8,7 @@ import pytest
 from made import make_run_of
 
 from csac.cli import main
+from csac.record.manifest import EvaluationPlan
 
 ROWS = "seed,step,episode,return,length,success"
 
@@ -139,6 +140,16 @@ def test_runs_that_differ_in_their_seeds_alone_are_one_arm():
     assert "csac report runs --out out/report.html\n" in text
     assert "csac train Hopper-v4 --seeds 1\n" in text
     assert "Commit: 0123456" in text
+
+
+def test_what_a_trial_was_chosen_by_is_not_merged_with_fresh_seeds():
+    """The winner of a tuning differs from its repetition in the episodes that it was evaluated on."""
+    for name, seed, first in (("trial", 0, 2_000_000), ("fresh", 100, 1_000_000)):
+        make_run_of(f"runs/{name}", [[10.0 + seed]], seeds=(seed,), evaluation=EvaluationPlan(first_seed=first))
+    text = report("runs")
+    assert "| SAC, evaluation seed 2,000,000 | 10.00 | 10 | 1 |" in text
+    assert "| SAC, evaluation seed 1,000,000 | 110 | 10 | 1 |" in text
+    assert "| evaluation seed | 1,000,000 | 2,000,000 |" in text
 
 
 def test_a_report_tells_of_perturbations_success_and_what_failed():
