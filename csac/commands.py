@@ -278,7 +278,7 @@ class Report:
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="(or --label)")] = ()
     """Run directories, or directories that hold some."""
     label: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=DIR,...")] = ()
-    """More runs, which together are an arm of this name."""
+    """More runs, which together are an arm of this name on each task."""
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE@STEP")] = ()
     """What changed in these runs, where files of rows do not tell it."""
     until: Annotated[int | None, arg(help_behavior_hint="(default: the end)")] = None

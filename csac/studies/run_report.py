@@ -61,33 +61,42 @@ class Comparison:
     """The last step that counts."""
 
     def arms(self) -> list[Arm]:
-        """Return the arms: runs of one label, or else runs that differ in their seeds alone.
+        """Return the arms: runs of one label on each task, or else runs that differ in their seeds alone.
 
         Raises:
-            InputError: runs of one label have a seed in common, or learn another task.
+            InputError: runs of one label on one task have a seed in common, or differ in what no arm can.
         """
         groups: dict[str, list[Given]] = {}
         for run in self.runs:
-            own = groups.setdefault(_key(run), [])
+            key = f"label {run.label}, {self._task(run)}" if run.label else _key(run)
+            own = groups.setdefault(key, [])
             if own and _seeds([run]) & _seeds(own):
                 if run.label:
                     common = min(_seeds([run]) & _seeds(own))
                     raise InputError(
                         f"{run.label}: {own[0].path} and {run.path} both hold seed {common}; label them apart"
                     )
-                own = groups.setdefault(f"{_key(run)} {run.path}", [])
+                own = groups.setdefault(f"{key} {run.path}", [])
             own.append(run)
         return _named([self._arm(runs) for runs in groups.values()], [runs[0] for runs in groups.values()])
 
-    def _arm(self, runs: Sequence[Given]) -> Arm:
-        manifests = [run.manifest for run in runs if run.manifest]
-        tasks = {manifest.task for manifest in manifests}
+    def _task(self, run: Given) -> str:
+        """Return what a run of a label learns: a file of rows, which cannot tell, what the runs beside it learn."""
+        if run.manifest:
+            return run.manifest.task
+        tasks = sorted({one.manifest.task for one in self.runs if one.label == run.label and one.manifest})
         if len(tasks) > 1:
             raise InputError(
-                f"{runs[0].label}: its runs learn {' and '.join(sorted(tasks))}; give each a label of its own"
+                f"{run.label}: {run.path} does not tell which of {' and '.join(tasks)} it is of; label it apart"
             )
+        return tasks[0] if tasks else ""
+
+    def _arm(self, runs: Sequence[Given]) -> Arm:
+        manifests = [run.manifest for run in runs if run.manifest]
+        self._refuse_differing(runs[0].label, manifests)
         condition = manifests[0].perturbations if manifests else self.perturbations
-        arm = Arm(runs[0].label or "", tasks.pop() if tasks else "", tuple(map(str, perturbations_of(condition))))
+        task = manifests[0].task if manifests else ""
+        arm = Arm(runs[0].label or "", task, tuple(map(str, perturbations_of(condition))))
         for run in runs:
             failed = run.manifest.failures if run.manifest else {}
             rows = run.rows[~np.isin(run.rows["seed"], list(failed))]
@@ -99,8 +108,23 @@ class Comparison:
                 arm.manifests.append(run.manifest)
                 arm.times += _times(run.path, run.manifest)
         if manifests:
-            arm.algorithm, arm.hyperparameters = manifests[0].algorithm, _settings(manifests[0])
+            arm.algorithm, arm.hyperparameters = manifests[0].algorithm, _merged([_settings(one) for one in manifests])
         return arm
+
+    def _refuse_differing(self, label: str | None, manifests: Sequence[Manifest]) -> None:
+        """Raise InputError where the runs of one label cannot be one arm."""
+        told = [
+            {
+                "algorithm": one.algorithm,
+                "perturbations": ", ".join(map(str, perturbations_of(one.perturbations))) or "none",
+                "steps": one.steps if self.until is None else min(one.steps, self.until),
+                "evaluation interval": one.evaluation.interval,
+            }
+            for one in manifests
+        ]
+        for name in _differing(told)[:1]:
+            values = " and ".join(dict.fromkeys(plain(one[name]) for one in told))
+            raise InputError(f"{label}: its runs differ in {name}, {values}; give each a label of its own")
 
 
 def read_runs(paths: Sequence[Path], labels: Sequence[tuple[str, Sequence[Path]]] = ()) -> tuple[Given, ...]:
@@ -262,9 +286,7 @@ def _tests(run: Given, rows: np.ndarray, failed: Mapping[int, str]) -> list[np.n
 
 
 def _key(run: Given) -> str:
-    """Return what runs have in common that are one arm."""
-    if run.label:
-        return f"label {run.label}"
+    """Return what runs without a label have in common that are one arm."""
     one = run.manifest
     if not one:
         return f"file {run.path}"
@@ -282,6 +304,15 @@ def _settings(manifest: Manifest) -> dict[str, Any]:
     }
     settings |= {f"environment: {name}": value for name, value in manifest.environment_arguments.items()}
     return settings
+
+
+def _merged(several: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the settings of an arm; of one that is not the same in all its runs, every value that it has."""
+    told = {
+        name: "; ".join(dict.fromkeys(plain(settings.get(name)) or "none" for settings in several))
+        for name in _differing(several)
+    }
+    return {**several[0], **told}
 
 
 def _named(arms: list[Arm], firsts: Sequence[Given]) -> list[Arm]:

@@ -152,6 +152,34 @@ def test_what_a_trial_was_chosen_by_is_not_merged_with_fresh_seeds():
     assert "| evaluation seed | 1,000,000 | 2,000,000 |" in text
 
 
+def test_runs_of_one_label_that_differ_are_told_with_every_value():
+    make_run_of("a", [[10.0]], seeds=(0,))
+    make_run_of("b", [[30.0]], seeds=(1,), hyperparameters={"discount": 0.9, "policy_delay": 2})
+    make_run_of("c", [[5.0]], hyperparameters={"discount": 0.9})
+    text = report("--label both=a,b --label c=c")
+    assert "| both | 20 ± 14 | 10 | 2 |" in text
+    assert "| discount | 0.99; 0.9 | 0.9 |" in text
+    assert "| policy_delay | none; 2 |  |" in text
+
+
+def test_runs_of_one_label_are_as_long_as_what_is_left_of_them():
+    make_run_of("a", [[10.0, 20.0]], seeds=(0,))
+    make_run_of("b", [[30.0, 40.0]], seeds=(1,), steps=200)
+    assert "| both | 20 ± 14 | 10 | 2 |" in report("--label both=a,b --until 10")
+
+
+def test_a_label_on_several_tasks_is_an_arm_on_each():
+    """So that labels can be compared over tasks; a file of rows is of its label's task where there is one."""
+    for label, height in (("A", 4.0), ("B", 2.0)):
+        for task in ("Ant-v4", "Hopper-v4"):
+            make_run_of(f"{label}/{task}", [[height]], task=task)
+    text = report("--label A=A --label B=B")
+    assert "2 of 2 methods, 2 of 2 tasks, 1 of 1 seeds." in text
+    assert "| B | 0.500 | 1 seed: no interval | 2 |" in text  # shares of A's return
+    write_rows("more", [[], [4.0]])
+    assert "| A | 3.00 ± 1.41 | 10 | 2 |" in report("--label A=B/Ant-v4,more.csv")
+
+
 def test_a_report_tells_of_perturbations_success_and_what_failed():
     returns = [[100.0, 40.0, 90.0], [100.0, 60.0, 95.0], [100.0, 0.0, 0.0]]
     make_run_of("runs/a", returns, perturbations=("friction=2@10",), failures={2: "critic is not finite"}, success=1)
@@ -216,7 +244,11 @@ def test_returns_by_seed_and_step_are_enough():
         ("report --label a=a.csv --out a.pdf", "the report is a page: name it a.html"),
         ("report --label a=a.csv --out page.md/a.html", "cannot write page.md/a.html"),
         ("report --label a=a.csv --perturb frction=2", "no perturbation is called 'frction': did you mean friction?"),
-        ("report --label a=run,other", "a: its runs learn Ant-v4 and Hopper-v4; give each a label of its own"),
+        ("report --label a=run,other,b.csv", "a: b.csv does not tell which of Ant-v4 and Hopper-v4 it is of; label it"),
+        ("report --label a=run,pushed", "a: its runs differ in perturbations, none and friction=2@10; give"),
+        ("report --label a=run,longer", "a: its runs differ in steps, 100 and 200; give each a label of its own"),
+        ("report --label a=run,seldom", "a: its runs differ in evaluation interval, 5,000 and 20; give each a label"),
+        ("report --label a=run,csac", "a: its runs differ in algorithm, sac and csac; give each a label of its own"),
         ("report --label a=metrics.csv", "metrics.csv has no returns: give an evaluations.csv"),
         ("report --label a=infinite.csv", "infinite.csv has returns beyond ±1e+100"),
         ("report run other --curve a.png", "these runs are of several tasks"),
@@ -225,7 +257,12 @@ def test_returns_by_seed_and_step_are_enough():
 def test_mistakes_are_told_in_one_line(capsys, line, message):
     write_rows("a", [[1.0]])
     make_run_of("run", [[1.0]])
+    write_rows("b", [[1.0]])
     make_run_of("other", [[1.0]], seeds=(1,), task="Ant-v4")
+    make_run_of("pushed", [[1.0]], seeds=(1,), perturbations=("friction=2@10",))
+    make_run_of("longer", [[1.0]], seeds=(1,), steps=200)
+    make_run_of("seldom", [[1.0]], seeds=(1,), evaluation=EvaluationPlan(20))
+    make_run_of("csac", [[1.0]], seeds=(1,), algorithm="csac")
     Path("metrics.csv").write_text("seed,step,q_mean\n0,10,1.5\n")
     Path("infinite.csv").write_text(f"{ROWS}\n0,10,0,inf,5,\n")
     Path("page.md").write_text("<!-- it: begin -->\n<!-- it: end -->\n")
