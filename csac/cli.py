@@ -334,9 +334,8 @@ def _report(arguments: list[str]) -> int:
         reports.draw_curves(comparison, options.curve, options.title)
         _say(str(options.curve))
     if options.out or not (options.into or options.curve):
-        path = options.out or reports.default_page()
         command = shlex.join(["csac", "report", *arguments])
-        reports.write_run_report(comparison, path, options.title, [command])
+        path = reports.write_run_report(comparison, options.out or reports.default_page(), options.title, [command])
         _say(f"{path}\n{path.with_suffix('.md')}")
     if not any(len(run.rows) for run in runs):
         _say("note: there is no evaluation yet in these runs, so there is little in it")

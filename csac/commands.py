@@ -288,7 +288,7 @@ class Report:
     out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="(default: runs/reports/DATE-TIME/)")] = (
         None
     )
-    """Where the report goes; the same in Markdown and its figures go beside it."""
+    """Where the report goes (in a directory: report.html); the same in Markdown and its figures go beside it."""
     into: Annotated[str | None, arg(metavar="FILE.md#NAME", help_behavior_hint="(default: none)")] = None
     """In place of a report, write one table into a page, between <!-- NAME: begin --> and <!-- NAME: end -->."""
     table: Literal["returns", "recovery", "cases"] = "returns"

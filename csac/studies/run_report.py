@@ -144,18 +144,22 @@ def default_page() -> Path:
     return Path("runs", "reports", datetime.now().strftime("%Y%m%d-%H%M%S"), "report.html")
 
 
-def write_run_report(comparison: Comparison, path: Path, title: str | None, commands: Sequence[str]) -> None:
-    """Write the page `path`, the same in Markdown beside it, and its figures; `commands` made it.
+def write_run_report(comparison: Comparison, path: Path, title: str | None, commands: Sequence[str]) -> Path:
+    """Write the page `path`, the same in Markdown beside it, and its figures; return the page's path.
+
+    In a directory that is there the page is called report.html. `commands` made it.
 
     Raises:
         InputError: it cannot be written, or the runs do not go together.
     """
+    path = path / "report.html" if path.is_dir() else path
     if path.suffix != ".html":
         raise InputError(f"the report is a page: name it {path.with_suffix('.html')}")
     arms = comparison.arms()
     title = title or ", ".join(dict.fromkeys(arm.task for arm in arms if arm.task)) or "Runs"
     scope = Scope(path.stem, looks=report_looks([arm.label for arm in arms]))
     write(path, title, list(_parts(comparison, arms, scope, title, commands)))
+    return path
 
 
 def write_table(comparison: Comparison, page: Path, name: str, kind: TableName) -> None:

@@ -222,6 +222,15 @@ def test_a_run_without_evaluations_is_told(capsys):
     assert "note: there is no evaluation yet in these runs" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("place", [".", "out", "out.html"])
+def test_a_report_in_a_directory_is_called_report(capsys, place):
+    make_run_of("runs/a", [])
+    Path(place).mkdir(exist_ok=True)
+    assert csac(f"report runs --out {place}") == 0
+    assert capsys.readouterr().out.splitlines()[:2] == [str(Path(place, f"report.{kind}")) for kind in ("html", "md")]
+    assert Path(place, "report.html").read_text().startswith("<!doctype html>")
+
+
 def test_returns_by_seed_and_step_are_enough():
     Path("others.csv").write_text("seed,step,return\n0,10,30\n0,20,50\n")
     text = report("others.csv")
