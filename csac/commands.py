@@ -282,7 +282,7 @@ class Report:
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE@STEP")] = ()
     """What changed in these runs, where files of rows do not tell it."""
     until: Annotated[int | None, arg(help_behavior_hint="(default: the end)")] = None
-    """Leave out evaluations after this step."""
+    """Leave out evaluations after this step, and fresh rollouts of policies that have learnt for longer."""
     title: Annotated[str | None, arg(help_behavior_hint="(default: the task)")] = None
     """Of the report, or of the picture."""
     out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="(default: runs/reports/DATE-TIME/)")] = (

@@ -103,13 +103,25 @@ class Comparison:
             rows = rows if self.until is None else rows[rows["step"] <= self.until]
             arm.failures.update(failed)
             arm.evaluations.append(rows)
-            arm.tests += _tests(run, rows, failed)
+            arm.tests += self._tests(run, rows, failed)
             if run.manifest:
                 arm.manifests.append(run.manifest)
                 arm.times += _times(run.path, run.manifest)
         if manifests:
             arm.algorithm, arm.hyperparameters = manifests[0].algorithm, _merged([_settings(one) for one in manifests])
         return arm
+
+    def _tests(self, run: Given, rows: np.ndarray, failed: Mapping[int, str]) -> list[np.ndarray]:
+        """Return the fresh episodes of a run, or those of its last evaluation, where they tell of what happens.
+
+        Fresh episodes of a policy that has learnt beyond the last step that counts do not.
+        """
+        one = run.manifest
+        is_beyond = one is not None and self.until is not None and one.steps_done > self.until
+        if one and not is_beyond and (run.path / ROLLOUTS).exists():
+            rows = read_rows(run.path / ROLLOUTS)
+            rows = rows[~np.isin(rows["seed"], list(failed))]
+        return [last_rows(rows)] if case_names([rows]) else []
 
     def _refuse_differing(self, label: str | None, manifests: Sequence[Manifest]) -> None:
         """Raise InputError where the runs of one label cannot be one arm."""
@@ -234,7 +246,8 @@ def _parts(
         yield from sections.success(shown, scope)
     if any(len(arm.rollouts) for arm in shown):
         yield from sections.cases(shown, scope)
-        yield Paragraph(f"Rollouts are those of {ROLLOUTS}, and of a run that has none its last evaluation's episodes.")
+        none = "has none" if comparison.until is None else f"has none, or went on after step {comparison.until:,},"
+        yield Paragraph(f"Rollouts are those of {ROLLOUTS}, and of a run that {none} its last evaluation's episodes.")
     yield from _hyperparameters(shown)
     yield from sections.provenance(arms)
     yield from wall_times(arms)
@@ -279,14 +292,6 @@ def _read(path: Path, label: str | None) -> list[Given]:
     runs = [] if is_run(path) or not path.is_dir() else find_runs(path)
     found = runs or [RunDirectory.open(path)]
     return [Given(label, run.path, run.evaluations, run.manifest) for run in found]
-
-
-def _tests(run: Given, rows: np.ndarray, failed: Mapping[int, str]) -> list[np.ndarray]:
-    """Return the fresh episodes of a run, or those of its last evaluation, where they tell of anything that happens."""
-    if run.manifest and (run.path / ROLLOUTS).exists():
-        rows = read_rows(run.path / ROLLOUTS)
-        rows = rows[~np.isin(rows["seed"], list(failed))]
-    return [last_rows(rows)] if case_names([rows]) else []
 
 
 def _key(run: Given) -> str:

@@ -197,6 +197,16 @@ def test_a_manifest_says_what_perturbed_a_run_and_an_option_does_not():
     assert "friction x 2" not in report("runs/a --perturb friction=2@10")
 
 
+def test_fresh_rollouts_of_a_policy_that_has_learnt_for_longer_are_left_out():
+    """The run made 100 steps; in its evaluation at step 10 nothing succeeds, in its rollouts half."""
+    path = make_run_of("runs/a", [[10.0, 20.0]], success=0).path
+    (path / "rollouts.csv").write_text(f"{ROWS}\n0,0,0,30,5,1\n0,0,1,30,5,0\n")
+    assert "| success | 500.0 |" in report("runs/a --until 100")
+    text = report("runs/a --until 10")
+    assert "| success | 0.0 |" in text
+    assert "of a run that has none, or went on after step 10, its last evaluation's episodes." in text
+
+
 def test_an_arm_has_one_colour_on_all_tasks():
     make_run_of("runs/a", [[10.0]], algorithm="csac")
     for task in ("Hopper-v4", "Ant-v4"):
