@@ -324,7 +324,7 @@ def _report(arguments: list[str]) -> int:
     options = parse(Report, arguments, "csac report")
     from csac.studies import run_report as reports  # matplotlib is slow to import
 
-    runs = reports.read_runs(options.runs, options.labels())
+    runs = reports.read_runs(options.runs, options.labels(), lambda error: print(f"damaged: {error}", file=sys.stderr))
     comparison = reports.Comparison(runs, options.perturb, options.until)
     if options.into:
         page, name = options.place()

@@ -32,7 +32,7 @@ from csac.tasks.perturbations import perturbations_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from csac.record.manifest import Manifest
     from csac.studies.parts import Part
@@ -139,13 +139,19 @@ class Comparison:
             raise InputError(f"{label}: its runs differ in {name}, {values}; give each a label of its own")
 
 
-def read_runs(paths: Sequence[Path], labels: Sequence[tuple[str, Sequence[Path]]] = ()) -> tuple[Given, ...]:
+def read_runs(
+    paths: Sequence[Path],
+    labels: Sequence[tuple[str, Sequence[Path]]] = (),
+    on_damaged: Callable[[InputError], None] | None = None,
+) -> tuple[Given, ...]:
     """Return the runs at these paths and below them, and those that have a label.
 
+    `on_damaged` is told why a run below a path is left out.
+
     Raises:
-        InputError: there is no run, or one cannot be read.
+        InputError: there is no run, or one that a path names, or rows of any, cannot be read.
     """
-    runs = [run for label, some in ((None, paths), *labels) for path in some for run in _read(path, label)]
+    runs = [run for label, some in ((None, paths), *labels) for path in some for run in _read(path, label, on_damaged)]
     if not runs:
         raise InputError("there is nothing to report on: give run directories ('csac runs' lists them)")
     return tuple(runs)
@@ -283,13 +289,13 @@ def _hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
     yield Table(("the same in all", "value"), tuple(rows))
 
 
-def _read(path: Path, label: str | None) -> list[Given]:
+def _read(path: Path, label: str | None, on_damaged: Callable[[InputError], None] | None) -> list[Given]:
     """Return the run at this path, or those below it. Raises InputError where there is none."""
     if path.name == "evaluations.csv" and is_run(path.parent):
         path = path.parent
     if path.suffix == ".csv":
         return [Given(label, path, read_evaluations(path), None)]
-    runs = [] if is_run(path) or not path.is_dir() else find_runs(path)
+    runs = [] if is_run(path) or not path.is_dir() else find_runs(path, on_damaged)
     found = runs or [RunDirectory.open(path)]
     return [Given(label, run.path, run.evaluations, run.manifest) for run in found]
 

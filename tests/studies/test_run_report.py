@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -222,6 +223,18 @@ def test_equal_runs_with_equal_seeds_stand_side_by_side():
     text = report("runs/a runs/b/evaluations.csv")
     assert "| SAC, runs/a | 10.00 |" in text
     assert "| SAC, runs/b | 10.00 |" in text
+
+
+def test_a_damaged_run_is_named_and_left_out(capsys):
+    make_run_of("runs/a", [[10.0]])
+    broken = make_run_of("runs/b", [[10.0]], seeds=(1,)).path / "manifest.json"
+    broken.write_text("{")
+    assert "| SAC | 10.00 | 10 | 1 |" in report("runs")
+    (told,) = capsys.readouterr().err.splitlines()
+    assert told.startswith("damaged: runs/b/manifest.json")
+    shutil.rmtree("runs/a")
+    assert csac("report runs") == 2
+    assert capsys.readouterr().err.startswith("damaged: runs/b/manifest.json")
 
 
 def test_a_run_without_evaluations_is_told(capsys):
