@@ -110,13 +110,14 @@ def returns(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
         yield comparison_table(compare([(arm.label, arm.rows) for arm in own]))
         yield stability_table(own, scope.titled(", ".join(filter(None, (described(task, condition), "stability")))))
         for name, trend in _trends(own):
-            yield scope.figure("returns", f"{task}, over {name}", trend)
+            yield scope.figure("returns", f"{described(task, condition)}, over {name}", trend)
     yield Paragraph("Mean ± standard deviation over seeds at the evaluation where that mean is highest.")
 
 
 def returns_table(arms: Sequence[Arm], title: str) -> Table:
-    """Return the maximum average returns of the arms of one task."""
-    published = paper.RETURNS.get(arms[0].task, {}) if any(arm.published for arm in arms) else {}
+    """Return the maximum average returns of the arms of one task and condition; where nothing changes, the paper's."""
+    is_of_the_paper = not arms[0].condition and any(arm.published for arm in arms)
+    published = paper.RETURNS.get(arms[0].task, {}) if is_of_the_paper else {}
     rows = []
     for arm in arms:
         over, (_, step), told = arm.maximum(), arm.best(), published.get(arm.published or "")
@@ -130,28 +131,31 @@ def returns_table(arms: Sequence[Arm], title: str) -> Table:
 def efficiency(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
     """Interactions to the lower boundary of the maximum average returns."""
     yield Heading(scope.titled("Interactions to the lower boundary of the maximum average returns"))
-    for task, own in tasks_of(arms).items():
+    for (task, condition), own in by_condition(arms).items():
         threshold = lower_boundary(own)
         if math.isnan(threshold):
             continue
-        published, rows, bars, seeds = paper.INTERACTIONS.get(task, {}), [], [], []
+        published = {} if condition else paper.INTERACTIONS.get(task, {})
+        rows, bars, seeds = [], [], []
         for arm in own:
             steps = interactions(arm, threshold)
             median, told = float(np.median(steps)), float(published.get(arm.published or "", math.nan))
             reached = int(np.isfinite(steps).sum())
             seeds.append(len(steps))
             cells = (
-                numeric(told, f"{told:,.0f}"),
+                *[numeric(told, f"{told:,.0f}")] * bool(published),
                 numeric(median, NOT_REACHED if math.isinf(median) else f"{median:,.0f}"),
                 Cell(f"{reached} of {len(steps)}", reached),
             )
             rows.append(Row((Cell(arm.label), *cells)))
             bars.append(Bar(arm.label, median, *reach(steps), told if scope.scale == 1 else math.nan))
-        title = f"{task}, return {number(threshold)}"
-        yield Table(("method", "the paper", "measured, median seed", "reached"), tuple(rows), scope.titled(title))
+        where = described(task, condition)
+        title = f"{where}, return {number(threshold)}"
+        headings = ("method", *["the paper"] * bool(published), "measured, median seed", "reached")
+        yield Table(headings, tuple(rows), scope.titled(title))
         note = f"bars: median seed{NEXT}{seeds_note(RANGE, seeds)}"
         drawing = Bars((BarPanel(tuple(bars)),), "environment steps", NOT_REACHED, note)
-        yield scope.figure("interactions", task, drawing, title)
+        yield scope.figure("interactions", where, drawing, title)
     yield Paragraph(_BOUNDARY)
 
 
@@ -187,19 +191,19 @@ def recoveries_table(arms: Sequence[Arm], perturbed: Sequence[tuple[int, str]], 
 def cases(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
     """How fresh rollouts end, as bars and in a table, and the paper's table."""
     yield Heading(scope.titled("How rollouts end"))
-    for task, own in tasks_of(arms).items():
+    for (task, condition), own in by_condition(arms).items():
         told = [(arm, arm.rollouts) for arm in own if len(arm.rollouts)]
         table = case_comparison_table([(arm.label, rows) for arm, rows in told]) if told else None
         if not table:
             continue
-        panels = _case_panels(told, scope.scale == 1)
+        where, panels = described(task, condition), _case_panels(told, scope.scale == 1 and not condition)
         for start in range(0, len(panels), MOST_PANELS):
             some = panels[start : start + MOST_PANELS]
-            title = f"{task}, {', '.join(panel.title for panel in some)}"
+            title = ", ".join(filter(None, (where, *(panel.title for panel in some))))
             note = seeds_note(TO_EITHER_SIDE, [len(np.unique(rows["seed"])) for _, rows in told])
             yield scope.figure("cases", title, Bars(tuple(some), f"per {ROLLOUTS:,} rollouts", note=note))
-        yield table._replace(title=scope.titled(task))
-    if any(arm.published for arm in arms):
+        yield table._replace(title=scope.titled(where))
+    if any(arm.published and not arm.condition for arm in arms):
         rows = [
             Row((Cell(name), *(Cell(f"{one.mean:g} ± {one.std:g}", one.mean) for one in published.values())))
             for name, published in paper.CASES.items()
@@ -335,18 +339,18 @@ def _is_positive(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and value > 0
 
 
-def _case_panels(told: Sequence[tuple[Arm, np.ndarray]], is_whole: bool) -> list[BarPanel]:
+def _case_panels(told: Sequence[tuple[Arm, np.ndarray]], is_beside_paper: bool) -> list[BarPanel]:
     happens = case_names([rows for _, rows in told])
     names = [name for name, is_case in happens.items() if is_case and name != "success"]  # which has its own curves
     return [
-        BarPanel(tuple(_case_bar(arm, rows, name, is_whole) for arm, rows in told), name.replace("_", " "))
+        BarPanel(tuple(_case_bar(arm, rows, name, is_beside_paper) for arm, rows in told), name.replace("_", " "))
         for name in names
     ]
 
 
-def _case_bar(arm: Arm, rows: np.ndarray, name: str, is_whole: bool) -> Bar:
+def _case_bar(arm: Arm, rows: np.ndarray, name: str, is_beside_paper: bool) -> Bar:
     found = cases_of(rows, {name: True})
-    published = paper.CASES.get(name, {}).get(arm.published or "") if is_whole else None
+    published = paper.CASES.get(name, {}).get(arm.published or "") if is_beside_paper else None
     if not found:
         return Bar(arm.label, math.nan, math.nan, math.nan)
     return bar_over_seeds(arm.label, found[0].over_seeds, published.mean if published else math.nan, ROLLOUTS)

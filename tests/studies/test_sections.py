@@ -1,13 +1,17 @@
 """The sections of a report: which arms are in which picture, and how they look."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from made import MadeRecords
 
+from csac.record.rendering import Table
 from csac.studies.arms import Arm, gather
-from csac.studies.figures import Curves
+from csac.studies.figures import Bars, Curves, Trend
 from csac.studies.named import NAMED
 from csac.studies.parts import Figure
-from csac.studies.sections import Scope, curves, report_looks
+from csac.studies.sections import Scope, cases, curves, efficiency, report_looks, returns
 
 
 def pictures(arms):
@@ -66,3 +70,80 @@ def test_what_stands_before_the_comma_has_a_look_of_its_own():
     later = report_looks(["SAC, slow", "SAC"], looks)
     assert later.items() >= looks.items()
     assert later["SAC, slow"] != later["SAC"]
+
+
+# A task that is perturbed too.
+
+CONDITIONS = ((), ("friction=2@500000",))
+WHERE = ("{}", "{}, friction x 2 after step 500,000")
+
+
+def perturbed(name, **narrow):
+    """The arms of a study that has a condition more: twice the steps to each return, and half of the returns."""
+    (study,) = NAMED[name]
+    study = replace(study.narrowed(tasks=study.tasks[:1], **narrow), conditions=CONDITIONS)
+
+    def value(cell, step):
+        height = 1_000 if cell.algorithm == "ppo" else 5_000 + cell.hyperparameters.get("relative_entropy_weight", 0.0)
+        return height * step / cell.steps / (2 if cell.perturbations else 1)
+
+    return gather(study, MadeRecords(value))
+
+
+def drawn(parts, kind):
+    return {part.title: part for part in parts if isinstance(part, Figure) and isinstance(part.drawing, kind)}
+
+
+def bars_of(parts):
+    """The bars of the first panel of each picture."""
+    return [
+        part.drawing.panels[0].bars for part in parts if isinstance(part, Figure) and isinstance(part.drawing, Bars)
+    ]
+
+
+def headings(parts):
+    return [(part.title, part.headings) for part in parts if isinstance(part, Table) and part.headings[0] == "method"]
+
+
+def test_interactions_are_told_of_each_condition_by_itself():
+    """Of each to its own boundary, which PPO sets at its last step; the paper has nothing that is perturbed."""
+    parts = list(efficiency(perturbed("efficiency", seeds=2), Scope("it")))
+    plainly, pushed = (where.format("HalfCheetah-v4") for where in WHERE)
+    boundaries = [f"{plainly}, return 1,000.0", f"{pushed}, return 500.0"]
+    assert headings(parts) == [
+        (boundaries[0], ("method", "the paper", "measured, median seed", "reached")),
+        (boundaries[1], ("method", "measured, median seed", "reached")),
+    ]
+    figures = drawn(parts, Bars)
+    assert list(figures) == boundaries
+    assert len({figure.name for figure in figures.values()}) == 2
+    bars = bars_of(parts)
+    assert [len({bar.label for bar in some}) for some in bars] == [len(some) for some in bars] == [6, 6]
+    assert [bar.height for bar in bars[0]] == [bar.height for bar in bars[1]]
+    assert [np.isfinite([bar.published for bar in some]).sum() for some in bars] == [5, 0]
+
+
+def test_rollouts_end_in_each_condition_for_itself():
+    parts = list(cases(perturbed("quadx", seeds=2), Scope("it")))
+    told = ", out of bounds, collision, env complete"
+    assert list(drawn(parts, Bars)) == [where.format("PyFlyt/QuadX-Waypoints-v1") + told for where in WHERE]
+    bars = bars_of(parts)
+    assert [np.isfinite([bar.published for bar in some]).sum() for some in bars] == [5, 0]
+    tables = [part for part in parts if isinstance(part, Table)]
+    assert [table.title for table in tables] == [
+        *(where.format("PyFlyt/QuadX-Waypoints-v1") for where in WHERE),
+        "The paper",
+    ]
+    assert [len(set(table.headings)) for table in tables] == [len(table.headings) for table in tables]
+
+
+def test_the_paper_s_returns_do_not_stand_beside_perturbed_ones():
+    parts = list(returns(perturbed("mujoco", seeds=1), Scope("it")))
+    maxima = [(title, "the paper" in told) for title, told in headings(parts) if "measured" in told]
+    assert maxima == [(where.format("HalfCheetah-v4"), where == "{}") for where in WHERE]
+
+
+def test_a_sweep_has_a_picture_for_each_condition():
+    figures = drawn(returns(perturbed("ablation", seeds=1), Scope("it")), Trend)
+    assert list(figures) == [f"{where.format('Walker2d-v4')}, over tau" for where in WHERE]
+    assert len({figure.name for figure in figures.values()}) == 2
