@@ -237,6 +237,8 @@ def _improvement(own: np.ndarray, others: np.ndarray) -> Cell:
 
 
 def _with_intersections(sets: Iterable[frozenset[_Item]]) -> list[frozenset[_Item]]:
-    """Return these sets and what each two have in common, each once."""
-    once = list(dict.fromkeys(sets))
-    return list(dict.fromkeys(one & other for one in once for other in once))
+    """Return these sets and what any of them have in common, each once."""
+    found: dict[frozenset[_Item], None] = {}
+    for one in sets:
+        found |= dict.fromkeys([one, *(one & other for other in found)])
+    return list(found)

@@ -65,6 +65,19 @@ def test_tasks_that_two_methods_have_in_common():
     assert largest_block(complete) == Block(("A", "B"), ("y", "z"), (0,))
 
 
+def test_methods_that_each_lack_another_seed_are_compared_on_those_that_all_have():
+    """36 runs; of any two methods, which have four seeds in common, there are but 32."""
+    complete = {(label, task): frozenset(range(6)) - {lost} for lost, label in enumerate("ABC") for task in "wxyz"}
+    assert largest_block(complete) == Block(("A", "B", "C"), ("w", "x", "y", "z"), (3, 4, 5))
+
+
+def test_methods_that_each_lack_another_task_are_compared_on_those_that_all_have():
+    """Nine runs; of any two methods, which have four tasks in common, there are but eight."""
+    lacks = dict(zip("ABC", "xyz", strict=True))
+    complete = {(label, task): frozenset({0}) for label in lacks for task in "uvwxyz" if task != lacks[label]}
+    assert largest_block(complete) == Block(("A", "B", "C"), ("u", "v", "w"), (0,))
+
+
 def test_one_task_of_each_method_is_no_block():
     assert largest_block({("A", "x"): frozenset({0}), ("B", "y"): frozenset({0})}) is None
     assert largest_block({("A", "x"): frozenset(), ("A", "y"): frozenset()}) is None
