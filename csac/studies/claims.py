@@ -44,6 +44,8 @@ class Comparison(NamedTuple):
     """The variant of CSAC that it is about."""
     is_whole: bool = True
     """Whether the runs of both are as long as the paper's."""
+    failed: tuple[str, ...] = ()
+    """Which seeds of either are not counted, in words."""
 
 
 class Decision(NamedTuple):
@@ -61,19 +63,24 @@ def decide(comparison: Comparison) -> Decision:
     above one half, not reproduced where it lies below, and else not yet decidable; below five seeds there is none. Runs
     that are not whole decide nothing, and it is only said what holds of them.
     """
-    claim, ours, others, *_ = comparison
+    verdict, why = _verdict(comparison)
+    return Decision(comparison.claim, verdict, "; ".join([why, *comparison.failed]))
+
+
+def _verdict(comparison: Comparison) -> tuple[Verdict, str]:
+    ours, others = comparison.ours, comparison.others
     fewest = min(len(ours), len(others))
     probability, bounds = probability_of_improvement(ours, others), improvement_interval(ours, others)
     told = f"better in {probability:.0%} of the pairs of seeds"
     if bounds is None:
-        return Decision(claim, "not yet decidable", f"{told}; {no_interval(fewest)} below {FEWEST_FOR_BOOTSTRAP}")
+        return "not yet decidable", f"{told}; {no_interval(fewest)} below {FEWEST_FOR_BOOTSTRAP}"
     low, high = bounds
     verdict: Verdict = "reproduced" if low > EVEN else "not reproduced" if high < EVEN else "not yet decidable"
     told += f", 95 % interval {low:.0%} to {high:.0%}"
     if not comparison.is_whole:
         words = {"reproduced": "it holds", "not reproduced": "it does not hold", "not yet decidable": "it is open"}
-        return Decision(claim, "not yet decidable", f"of the shortened runs {words[verdict]}: {told}")
-    return Decision(claim, verdict, told)
+        return "not yet decidable", f"of the shortened runs {words[verdict]}: {told}"
+    return verdict, told
 
 
 def comparisons(study: Study, arms: Sequence[Arm]) -> list[Comparison]:
@@ -213,7 +220,13 @@ def _better(claim: str, arm: Arm, other: Arm, value: Callable[[Arm], np.ndarray]
     steps = paper.STEPS.get(arm.task, np.inf)
     is_whole = all(manifest.steps >= steps for one in (arm, other) for manifest in one.manifests)
     in_time = all(change.step == paper.FRICTION_STEP for change in perturbations_of(arm.condition))
-    return Comparison(claim, ours, others, variant_of(arm.label), is_whole and in_time)
+    failed = tuple(_lost(one) for one in (arm, other) if one.failures)
+    return Comparison(claim, ours, others, variant_of(arm.label), is_whole and in_time, failed)
+
+
+def _lost(arm: Arm) -> str:
+    count = len(arm.failures)
+    return f"{count} seed{'s' * (count > 1)} of {arm.label} failed and {'are' if count > 1 else 'is'} not counted"
 
 
 def _best(arm: Arm) -> np.ndarray:

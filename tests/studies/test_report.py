@@ -104,6 +104,18 @@ def test_shortened_runs_decide_nothing():
     assert decision.why.startswith("of the shortened runs it holds: ")
 
 
+def test_a_verdict_says_which_seeds_failed():
+    """Of seven seeds of each SAC has lost two and CSAC one: enough are left to decide."""
+    study = mujoco(algorithms=["CSAC (paper)", "sac"], seeds=7)
+    lost = {"sac": (1, 3), "csac": (0,)}
+    source = MadeRecords(made, lambda cell: "not finite" * (cell.seed in lost[cell.algorithm]))
+    decisions = [decide(one) for one in comparisons(study, gather(study, source))]
+    assert {one.verdict for one in decisions} >= {"reproduced"}
+    told = "; 1 seed of CSAC (paper) failed and is not counted; 2 seeds of SAC failed and are not counted"
+    assert all(one.why.endswith(told) for one in decisions)
+    assert not any("failed" in decide(one).why for one in comparisons(study, gather(study, MadeRecords(made))))
+
+
 def test_the_claims_of_the_tables():
     """Of each variant of CSAC: four methods on three tasks, and on Hopper, where SD3 has more, three; all hold."""
     claims = claims_of(NAMED["mujoco"][0])
