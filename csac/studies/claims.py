@@ -46,6 +46,8 @@ class Comparison(NamedTuple):
     """Whether the runs of both are as long as the paper's."""
     failed: tuple[str, ...] = ()
     """Which seeds of either are not counted, in words."""
+    lacking: str = ""
+    """What is not there yet that it hangs on, in words."""
 
 
 class Decision(NamedTuple):
@@ -61,10 +63,11 @@ def decide(comparison: Comparison) -> Decision:
 
     It is reproduced where the 95 % interval of the probability that a seed of ours is above one of the others lies
     above one half, not reproduced where it lies below, and else not yet decidable; below five seeds there is none. Runs
-    that are not whole decide nothing, and it is only said what holds of them.
+    that are not whole decide nothing, and it is only said what holds of them; nor is anything decided while runs lack.
     """
     verdict, why = _verdict(comparison)
-    return Decision(comparison.claim, verdict, "; ".join([why, *comparison.failed]))
+    told = "; ".join(filter(None, (why, comparison.lacking, *comparison.failed)))
+    return Decision(comparison.claim, "not yet decidable" if comparison.lacking else verdict, told)
 
 
 def _verdict(comparison: Comparison) -> tuple[Verdict, str]:
@@ -163,11 +166,22 @@ def _weight(arm: Arm) -> float | None:
 def _efficiency(arms: Sequence[Arm]) -> Iterator[Comparison]:
     for task, own in tasks_of(arms).items():
         published, threshold = paper.INTERACTIONS.get(task, {}), lower_boundary(own)
+        lacking = _lacking_boundary(own) if published else ""
         for arm, other in _pairs(own):
             name = other.published or ""
             if name in published and published["CSAC"] < published[name]:
                 claim = f"{task}: fewer interactions than {name} to reach the lower boundary"
-                yield _better(claim, arm, other, partial(_sooner, threshold=threshold))
+                comparison = _better(claim, arm, other, partial(_sooner, threshold=threshold))
+                yield comparison._replace(lacking=lacking)
+
+
+def _lacking_boundary(arms: Sequence[Arm]) -> str:
+    """Say what the lower boundary of a task of the paper's lacks: seeds of its methods, or the one that sets it."""
+    returns = paper.RETURNS[arms[0].task]
+    lowest = min(returns, key=lambda name: returns[name].mean)
+    lacking = [arm.label for arm in arms if arm.published and (arm.missing or not len(arm.rows))]
+    lacking += [lowest] * all(arm.published != lowest for arm in arms)
+    return f"the boundary lacks runs of {', '.join(lacking)}" if lacking else ""
 
 
 def _robustness(arms: Sequence[Arm]) -> Iterator[Comparison]:
