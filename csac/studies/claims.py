@@ -91,7 +91,7 @@ def comparisons(study: Study, arms: Sequence[Arm]) -> list[Comparison]:
 
     Of perturbed tasks the paper claims robustness alone.
     """
-    kinds = () if study.name == "reference" else [kind for kind in study.analyses if kind in _KINDS]
+    kinds = [kind for kind in study.analyses if kind in _KINDS] if study.claims else []
     plain = [arm for arm in arms if not arm.condition]
     return [one for kind in kinds for one in _KINDS[kind](arms if kind == "robustness" else plain)]
 

@@ -82,6 +82,7 @@ REFERENCE = replace(
     name="reference",
     title="CSAC's reference policies against SAC",
     tasks=("Hopper-v4", "Walker2d-v4", "HalfCheetah-v4"),
+    claims=False,
     methods=(
         replace(SAC, label="SAC, 0.2"),
         Method("SAC, automatic", "sac"),

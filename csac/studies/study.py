@@ -74,6 +74,8 @@ class Study:
     """Fresh episodes that each finished policy is tested on."""
     analyses: tuple[str, ...] = ("curves", "returns")
     """What its report shows."""
+    claims: bool = True
+    """Whether the paper's claims are held against it."""
     scale: float = 1.0
 
     def shortened(self, scale: float) -> Study:

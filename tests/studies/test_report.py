@@ -219,6 +219,16 @@ def test_runs_that_are_shorter_than_the_paper_s_say_nothing_of_it(tmp_path):
     assert "reproduced" in claims_of(of_ones_own(tmp_path, "steps = 1_000_000")).values()
 
 
+def test_a_file_may_be_called_as_a_named_study(tmp_path):
+    """Of `reference` nothing is claimed, which hangs on the study and not on its name."""
+    study = of_ones_own(tmp_path, "")
+    (tmp_path / "mine.toml").rename(tmp_path / "reference.toml")
+    assert claims_of(read_study(tmp_path / "reference.toml")) == claims_of(study) != {}
+    for name in ("reference", "smoke"):
+        (reference,) = (one for one in NAMED[name] if one.name == "reference")
+        assert claims_of(reference.narrowed(["Hopper-v4"], seeds=1)) == {}
+
+
 def test_only_the_paper_s_friction_is_claimed(tmp_path):
     analyses = 'analyses = ["robustness"]\nconditions = '
     claims = claims_of(of_ones_own(tmp_path, analyses + '[[], ["friction=1.5@300000"], ["friction=3@300000"]]'))
