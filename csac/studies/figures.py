@@ -40,7 +40,7 @@ FORMATS: tuple[Format, ...] = ("png", "svg")
 NOT_REACHED = "not reached"
 PUBLISHED = "the paper"
 LABEL_CHARACTERS = 56  # that fit side by side below bars, each label in lines of its share
-TO_EITHER_SIDE, RANGE = "± one standard deviation over seeds", "range of the seeds"
+TO_EITHER_SIDE, RANGE = "± one standard deviation over seeds", "range of the seeds that reach it"
 
 
 class Curves(NamedTuple):
@@ -204,7 +204,7 @@ def seeds_note(lines: str, seeds: Sequence[int]) -> str:
 
 
 def reach(values: np.ndarray) -> tuple[float, float]:
-    """Return the lowest and the highest of the seeds, NaN where there are too few to show."""
+    """Return the lowest and the highest of the seeds that are finite, NaN where there are too few to show."""
     finite = values[np.isfinite(values)]
     if len(finite) < max(2, min(len(values), FEWEST_FOR_INTERVAL)):
         return np.nan, np.nan
