@@ -44,6 +44,8 @@ class Arm:
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
     published: str | None = None
     """The paper's column that stands beside it."""
+    preset: str | None = None
+    """What its other hyperparameters come from, where that is a preset."""
     manifests: list[Manifest] = field(default_factory=list)
     times: list[Time] = field(default_factory=list)
     """How long each of its runs took, as far as that is known."""
@@ -83,7 +85,8 @@ def gather(study: Study, source: Source) -> list[Arm]:
     """Return every arm of a study with what its cells have given, task by task."""
     arms: dict[tuple[str, tuple[str, ...], str], Arm] = {}
     for method, condition, cell in study.entries():
-        made = Arm(method.label, cell.task, condition, method.algorithm, method.hyperparameters, method.published)
+        given = (method.algorithm, method.hyperparameters, method.published, method.preset)
+        made = Arm(method.label, cell.task, condition, *given)
         arm = arms.setdefault((cell.task, condition, method.label), made)
         record = source.record(cell)
         if record is None:

@@ -317,7 +317,8 @@ def _trends(arms: Sequence[Arm]) -> Iterator[tuple[str, Trend]]:
     for variant, own in _variants(arms).items():
         names = {name for arm in own for name in arm.hyperparameters}
         differing = [name for name in names if len({plain(arm.hyperparameters.get(name)) for arm in own}) > 1]
-        if len(differing) == 1 and all(_is_positive(arm.hyperparameters.get(differing[0])) for arm in own):
+        is_alike = len({(arm.algorithm, arm.preset) for arm in own}) == 1
+        if is_alike and len(differing) == 1 and all(_is_positive(arm.hyperparameters.get(differing[0])) for arm in own):
             own = sorted(own, key=lambda arm: arm.hyperparameters[differing[0]])
             swept.setdefault(differing[0], []).append(_line(variant, differing[0], own))
             seeds.setdefault(differing[0], []).extend(arm.maximum().seeds for arm in own)

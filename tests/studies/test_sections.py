@@ -12,6 +12,7 @@ from csac.studies.figures import Bars, Curves, Trend
 from csac.studies.named import NAMED
 from csac.studies.parts import Figure
 from csac.studies.sections import Scope, cases, curves, efficiency, report_looks, returns
+from csac.studies.study import Method
 
 
 def pictures(arms):
@@ -147,3 +148,17 @@ def test_a_sweep_has_a_picture_for_each_condition():
     figures = drawn(returns(perturbed("ablation", seeds=1), Scope("it")), Trend)
     assert list(figures) == [f"{where.format('Walker2d-v4')}, over tau" for where in WHERE]
     assert len({figure.name for figure in figures.values()}) == 2
+
+
+# Sweeps.
+
+
+@pytest.mark.parametrize("others", [{}, {"preset": "paper"}, {"algorithm": "sac"}])
+def test_a_sweep_is_of_methods_that_differ_in_that_number_alone(others):
+    (study,) = NAMED["ablation"]
+    first, second = (
+        Method(f"mine, {weight:g}", "csac", hyperparameters={"entropy_weight": weight}) for weight in (0.1, 0.2)
+    )
+    study = replace(study.narrowed(seeds=1), methods=(first, replace(second, **others)))
+    arms = gather(study, MadeRecords(lambda *_: 1.0))
+    assert len(drawn(returns(arms, Scope("it")), Trend)) == (not others)
