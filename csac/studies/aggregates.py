@@ -38,6 +38,7 @@ FEWEST_TASKS = 2
 REFERENCE = "SAC"  # the paper's column that scores are a share of
 _Item = TypeVar("_Item")
 _SHARES = "share of the reference return"
+MOST_SETS = 4_096  # beyond, no more intersections are made: of n sets there may be 2^n
 
 
 class Block(NamedTuple):
@@ -237,8 +238,9 @@ def _improvement(own: np.ndarray, others: np.ndarray) -> Cell:
 
 
 def _with_intersections(sets: Iterable[frozenset[_Item]]) -> list[frozenset[_Item]]:
-    """Return these sets and what any of them have in common, each once."""
+    """Return these sets and what any of them have in common, each once; of very many sets not all that is common."""
     found: dict[frozenset[_Item], None] = {}
     for one in sets:
-        found |= dict.fromkeys([one, *(one & other for other in found)])
+        common = [one & other for other in found] if len(found) < MOST_SETS else []
+        found |= dict.fromkeys([one, *common])
     return list(found)
