@@ -65,7 +65,7 @@ class StudyProgress:
         self._running: dict[str, _Row] = {}
         self._began, self._first_steps = clock(), sum(self._steps.values())
         self._live: Live | None = None
-        if self.console.is_interactive:
+        if cells and self.console.is_interactive:
             self._live = Live(get_renderable=self._display, console=self.console, refresh_per_second=2, transient=True)
             self._live.start()
 

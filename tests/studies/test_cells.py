@@ -1,10 +1,8 @@
 import dataclasses
 
 import pytest
-from studying import cell
+from studying import cell, make_run
 
-from csac.record.manifest import EvaluationPlan, Manifest
-from csac.record.run import RunDirectory
 from csac.studies.cells import Cell, Store, complete, is_final, write_history
 from csac.types import InputError
 
@@ -20,25 +18,6 @@ OTHERS = {
     "environment_arguments": {"healthy_reward": 2.0},
     "events": ("fell",),
 }
-
-
-def make_run(store, one, **manifest):
-    """A run as `train` would leave it."""
-    return RunDirectory.create(
-        store.path(one),
-        Manifest(
-            task=one.task,
-            algorithm=one.algorithm,
-            hyperparameters=one.hyperparameters,
-            seeds=(one.seed,),
-            steps=one.steps,
-            evaluation=EvaluationPlan(one.evaluation_interval, one.evaluation_episodes),
-            perturbations=one.perturbations,
-            environment_arguments=one.environment_arguments,
-            events=one.events,
-            **manifest,
-        ),
-    )
 
 
 def test_every_field_is_part_of_the_name():

@@ -1,9 +1,11 @@
+import io
 import re
 import shlex
 import signal
 
 import pytest
-from studying import TINY, cell, write
+from rich.console import Console
+from studying import TINY, cell, make_run, write
 
 from csac.cli import main
 from csac.studies import commands
@@ -70,6 +72,16 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
     assert csac("study run tiny.toml --engine local --seeds 1 --directory another/machine --results out") == 0
     assert "1 cells: 1 complete" in capsys.readouterr().out
     assert Results("out").status(one, rollouts=100) is None, "its policy was not tested yet"
+
+
+def test_on_a_terminal_where_nothing_is_left_to_run_it_is_said(engine, monkeypatch):
+    for one in cells_of([read_study("tiny.toml")]):
+        make_run(Store(), one, steps_done=300, state="finished")
+    terminal = Console(file=io.StringIO(), width=100, force_terminal=True, _environ={"TERM": "xterm-256color"})
+    monkeypatch.setattr(commands, "make_console", lambda: terminal)
+    assert csac("study run tiny.toml") == 0
+    assert terminal.file.getvalue().splitlines()[-1] == "2 cells: 2 complete"
+    assert not engine
 
 
 def test_what_a_folder_has_not_collected_is_run(engine):

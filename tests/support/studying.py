@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from resuming import SMALL
 
+from csac.record.manifest import EvaluationPlan, Manifest
+from csac.record.run import RunDirectory
 from csac.studies.cells import Cell, Store
 from csac.studies.job import Job
 
@@ -44,3 +47,22 @@ def jobs(directory: Path, *cells: Cell, **options) -> list[Job]:
     store = Store(directory)
     options = {"checkpoint_interval": 120, "tensorboard": False, "keep_checkpoints": True, **options}
     return [Job(one, store.path(one), **options) for one in cells]
+
+
+def make_run(store: Store, one: Cell, **manifest: Any) -> RunDirectory:
+    """A run as `train` would leave it."""
+    return RunDirectory.create(
+        store.path(one),
+        Manifest(
+            task=one.task,
+            algorithm=one.algorithm,
+            hyperparameters=one.hyperparameters,
+            seeds=(one.seed,),
+            steps=one.steps,
+            evaluation=EvaluationPlan(one.evaluation_interval, one.evaluation_episodes),
+            perturbations=one.perturbations,
+            environment_arguments=one.environment_arguments,
+            events=one.events,
+            **manifest,
+        ),
+    )
