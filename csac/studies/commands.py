@@ -295,7 +295,8 @@ def run(options: Run) -> int:
     by_key = {cell.key: cell for cell in cells}
     if options.results:
         for cell in cells:
-            collect(store, cell, options.results)
+            if cell.key not in collected:  # which another machine may have run
+                collect(store, cell, options.results)
     done = {key: status.steps for key, status in statuses.items()}
     progress = StudyProgress([job.cell for job in jobs], labels, done, console)
 

@@ -10,7 +10,7 @@ from studying import TINY, cell, make_run, write
 from csac.cli import main
 from csac.studies import commands
 from csac.studies.calibration import Calibration, Cost, predict
-from csac.studies.cells import Store
+from csac.studies.cells import HOME, Store
 from csac.studies.job import Ended, Started, Stopped
 from csac.studies.results import Results, Runs
 from csac.studies.study import cells_of, read_study
@@ -87,6 +87,18 @@ def test_on_a_terminal_where_nothing_is_left_to_run_it_is_said(engine, monkeypat
 def test_what_a_folder_has_not_collected_is_run(engine):
     assert csac("study run tiny.toml --engine local --results empty") == 0
     assert len(engine) == 2
+
+
+def test_what_another_machine_has_collected_stays_as_it_is(engine):
+    first, second = cells_of([read_study("tiny.toml")])
+    for directory, one, value in (("there", first, 1.0), (HOME, first, 2.0), (HOME, second, 3.0)):
+        run = make_run(Store(directory), one, steps_done=300, state="finished")
+        run.append("evaluations", [{"seed": one.seed, "step": 300, "episode": 0, "return": value, "length": 9}])
+    assert csac("study run tiny.toml --seeds 1 --directory there --results out") == 0
+    assert csac("study run tiny.toml --results out") == 0
+    collected = [Results("out").record(one) for one in (first, second)]
+    assert [record and record.evaluations["return"].tolist() for record in collected] == [[1.0], [3.0]]
+    assert not engine
 
 
 def test_a_manifest_tells_the_command_and_not_where_csac_is(engine, monkeypatch):
