@@ -106,8 +106,10 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a seed that failed is told of below
             run = _train(job, tell)
+        write_history(job.path, spent())  # now: the process may end while the policy is tested
         if run.manifest.state == "finished" and job.rollouts:
             _roll_out(job)
+            write_history(job.path, spent())
     except InputError as error:
         return Ended(key, "elsewhere") if is_in_use(job.path) else _failed(job, spent(), str(error))
     except Interrupted as interruption:
@@ -116,7 +118,6 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
     except Exception as error:
         reason = ": ".join(filter(None, (type(error).__name__, str(error))))
         return _failed(job, spent(), reason, traceback.format_exc())
-    write_history(job.path, spent())
     if run.manifest.state != "finished":
         return Ended(key, "failed", "; ".join(map(str, run.manifest.failures.values())))
     return Ended(key, "complete")
