@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from csac.record.csv_tables import COLUMNS, write_rows
+from csac.record.csv_tables import COLUMNS, read_rows, write_rows
 from csac.record.run import RunDirectory
 from csac.studies.cells import Cell, is_final, is_in_use, read_history, write_history
 from csac.types import InputError
@@ -81,7 +81,7 @@ def is_over(job: Job) -> bool:
     if not is_final(job.path):
         return False
     failed = RunDirectory.open(job.path).manifest.state == "failed"
-    return failed or not job.rollouts or (job.path / ROLLOUTS).exists()
+    return failed or _is_tested(job)
 
 
 def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
@@ -159,11 +159,18 @@ def _roll_out(job: Job) -> None:
     """Test the last policy on episodes that neither training nor its evaluations have seen, and keep a row of each."""
     from csac.evaluation.play import evaluate_run
 
-    if (job.path / ROLLOUTS).exists():
+    if _is_tested(job):
         return
     ((seed, episodes),) = evaluate_run(job.path, episodes=job.rollouts, processes=1)
     rows = [episode.row(seed, job.cell.steps) for episode in episodes]
     write_rows(job.path / ROLLOUTS, COLUMNS["evaluations"], rows)
+
+
+def _is_tested(job: Job) -> bool:
+    """Whether the last policy was tested on as many episodes as are wanted. What cannot be read is made again."""
+    with suppress(InputError):
+        return not job.rollouts or len(read_rows(job.path / ROLLOUTS)) >= job.rollouts
+    return False
 
 
 def _failed(job: Job, history: dict[str, Any], reason: str, trace: str = "") -> Ended:

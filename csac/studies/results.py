@@ -89,7 +89,10 @@ class Results:
     def status(self, cell: Cell, rollouts: int) -> Status | None:
         """Return how a cell ended that was collected, with the rollouts that are wanted, or None."""
         record = self.record(cell)
-        if record is None or (rollouts and record.rollouts is None and not record.failure):
+        if record is None:
+            return None
+        tested = 0 if record.rollouts is None else len(record.rollouts)
+        if tested < rollouts and not record.failure:
             return None
         return Status("failed" if record.failure else "complete", cell.steps, record.failure, record.seconds)
 

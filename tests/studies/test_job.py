@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +14,8 @@ from csac.evaluation.evaluator import EvaluationEpisode
 from csac.record.run import RunDirectory, is_run
 from csac.studies import job as module
 from csac.studies.cells import Store, read_history
-from csac.studies.job import Ended, Job, execute
+from csac.studies.job import ROLLOUTS, Ended, Job, execute, is_over
+from csac.studies.results import Results, collect
 
 
 class Stand:
@@ -29,7 +31,9 @@ class Stand:
         if is_run(job.path):
             return RunDirectory.open(job.path)
         self.clock.now += 100
-        return make_run(Store(job.path.parents[2]), job.cell, state="finished", steps_done=300)
+        run = make_run(Store(job.path.parents[2]), job.cell, state="finished", steps_done=300)
+        run.append("evaluations", [EvaluationEpisode(0, 1.0, 9, None).row(0, 300)])
+        return run
 
     def evaluate(self, _: Any, **options: Any) -> Any:
         self.clock.now += 20
@@ -53,3 +57,30 @@ def test_the_seconds_of_training_outlive_a_stop_while_the_policy_is_tested(tmp_p
     stand.interrupting = False
     assert execute(job, print) == Ended(job.cell.key, "complete")
     assert read_history(job.path) == {"seconds": 120.0}
+
+
+def test_a_policy_is_tested_again_where_more_episodes_are_wanted(tmp_path, stand):
+    (job,) = jobs(tmp_path, cell(), rollouts=3)
+    more, fewer = (replace(job, rollouts=count) for count in (5, 2))
+    execute(job, print)
+    assert [is_over(one) for one in (fewer, job, more)] == [True, True, False]
+    for one in (fewer, more):
+        assert execute(one, print).outcome == "complete"
+    assert [test["episodes"] for test in stand.tests] == [3, 5]
+    assert is_over(more)
+    RunDirectory.open(job.path).append(
+        "evaluations", [{"seed": 0, "step": 300, "episode": 0, "return": 1, "length": 9}]
+    )
+    collect(Store(tmp_path), job.cell, tmp_path / "out")
+    results = Results(tmp_path / "out")
+    assert results.status(job.cell, rollouts=5) == ("complete", 300, "", 140.0)
+    assert results.status(job.cell, rollouts=6) is None
+
+
+def test_a_table_of_tests_that_cannot_be_read_is_made_again(tmp_path, stand):
+    (job,) = jobs(tmp_path, cell(), rollouts=3)
+    execute(job, print)
+    (job.path / ROLLOUTS).write_text("seed,step\n0\n")
+    assert not is_over(job)
+    execute(job, print)
+    assert is_over(job)
