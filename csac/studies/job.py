@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from csac.record.csv_tables import COLUMNS, read_rows, write_rows
 from csac.record.run import RunDirectory
 from csac.studies.cells import Cell, is_final, is_in_use, read_history, write_history
+from csac.tasks.perturbations import Perturbation, perturbations_of, values_at
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class Job:
     tensorboard: bool = True
     wandb: bool = False
     rollouts: int = 0
-    """Fresh episodes that the finished policy is tested on: `rollouts.csv` in its run."""
+    """Fresh episodes that the finished policy is tested on, on the task as it was last: `rollouts.csv` in its run."""
     command: str | None = None
 
 
@@ -156,12 +157,17 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
 
 
 def _roll_out(job: Job) -> None:
-    """Test the last policy on episodes that neither training nor its evaluations have seen, and keep a row of each."""
+    """Test the last policy on episodes that neither training nor its evaluations have seen, and keep a row of each.
+
+    The task is perturbed as it was at the end of training.
+    """
     from csac.evaluation.play import evaluate_run
 
     if _is_tested(job):
         return
-    ((seed, episodes),) = evaluate_run(job.path, episodes=job.rollouts, processes=1)
+    last = values_at(perturbations_of(job.cell.perturbations), job.cell.steps)
+    perturbed = [Perturbation(kind, value) for kind, value in last.items()]
+    ((seed, episodes),) = evaluate_run(job.path, episodes=job.rollouts, perturbations=perturbed, processes=1)
     rows = [episode.row(seed, job.cell.steps) for episode in episodes]
     write_rows(job.path / ROLLOUTS, COLUMNS["evaluations"], rows)
 

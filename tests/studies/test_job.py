@@ -84,3 +84,10 @@ def test_a_table_of_tests_that_cannot_be_read_is_made_again(tmp_path, stand):
     assert not is_over(job)
     execute(job, print)
     assert is_over(job)
+
+
+def test_a_policy_is_tested_on_the_task_as_it_was_last(tmp_path, stand):
+    (job,) = jobs(tmp_path, cell(perturbations=("friction=3@200", "gravity=0.5@50", "friction=2@100")), rollouts=1)
+    execute(job, print)
+    (test,) = stand.tests
+    assert [str(one) for one in test["perturbations"]] == ["gravity=0.5", "friction=3"]
