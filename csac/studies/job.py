@@ -78,11 +78,14 @@ class Stopped(Exception):
 
 
 def is_over(job: Job) -> bool:
-    """Whether there is nothing left to do: the run is final and, where it did not fail, so are its rollouts."""
+    """Whether there is nothing left to do: the run is final and, where it did not fail, so are its rollouts.
+
+    A failure beside a finished run, such as that of a process that died as it drew the curve, is still to be cleared.
+    """
     if not is_final(job.path):
         return False
     failed = RunDirectory.open(job.path).manifest.state == "failed"
-    return failed or _is_tested(job)
+    return failed or (_is_tested(job) and "failure" not in read_history(job.path))
 
 
 def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
@@ -96,6 +99,8 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
     key = job.cell.key
     if is_in_use(job.path):
         return Ended(key, "elsewhere")
+    if is_over(job):  # another process has been here since the jobs were chosen
+        return _ended(key, RunDirectory.open(job.path))
     before = read_history(job.path)
     seconds, began = float(before.get("seconds", 0.0)), time.monotonic()
 
@@ -106,7 +111,7 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
 
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a seed that failed is told of below
-            run = _train(job, tell)
+            run = _trained(job, tell)
         write_history(job.path, spent())  # now: the process may end while the policy is tested
         if run.manifest.state == "finished" and job.rollouts:
             _roll_out(job)
@@ -119,16 +124,23 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
     except Exception as error:
         reason = ": ".join(filter(None, (type(error).__name__, str(error))))
         return _failed(job, spent(), reason, traceback.format_exc())
-    if run.manifest.state != "finished":
-        return Ended(key, "failed", "; ".join(map(str, run.manifest.failures.values())))
-    return Ended(key, "complete")
+    return _ended(key, run)
+
+
+def _trained(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
+    """Return the run of a cell, trained to its end. What is final needs no task, which this machine may not have."""
+    run = RunDirectory.open(job.path) if is_final(job.path) else _train(job, tell)
+    if run.manifest.state == "finished" and not job.keep_checkpoints:
+        # A finished cell needs them no more, and they take most of its room: the replay is in them.
+        shutil.rmtree(run.checkpoints, ignore_errors=True)
+    return run
 
 
 def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
     from csac.training.train import train
 
     cell = job.cell
-    run = train(
+    return train(
         cell.make_algorithm(),
         cell.task,
         steps=cell.steps,
@@ -150,10 +162,6 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
         command=job.command,
         on_evaluation=lambda step, returns: tell(Advanced(cell.key, step, returns.get(cell.seed, float("nan")))),
     )
-    if run.manifest.state == "finished" and not job.keep_checkpoints:
-        # A finished cell needs them no more, and they take most of its room: the replay is in them.
-        shutil.rmtree(run.checkpoints, ignore_errors=True)
-    return run
 
 
 def _roll_out(job: Job) -> None:
@@ -177,6 +185,13 @@ def _is_tested(job: Job) -> bool:
     with suppress(InputError):
         return not job.rollouts or len(read_rows(job.path / ROLLOUTS)) >= job.rollouts
     return False
+
+
+def _ended(key: str, run: RunDirectory) -> Ended:
+    """Say how a cell ended whose run is final."""
+    if run.manifest.state != "finished":
+        return Ended(key, "failed", "; ".join(map(str, run.manifest.failures.values())))
+    return Ended(key, "complete")
 
 
 def _failed(job: Job, history: dict[str, Any], reason: str, trace: str = "") -> Ended:

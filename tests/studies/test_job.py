@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,15 +12,15 @@ from shown import Clock
 from studying import cell, jobs, make_run
 
 from csac.evaluation.evaluator import EvaluationEpisode
-from csac.record.run import RunDirectory, is_run
+from csac.record.run import RunDirectory
 from csac.studies import job as module
-from csac.studies.cells import Store, read_history
+from csac.studies.cells import Store, read_history, write_history
 from csac.studies.job import ROLLOUTS, Ended, Job, execute, is_over
 from csac.studies.results import Results, collect
 
 
 class Stand:
-    """Stands in for training, which takes 100 seconds where there is no finished run yet, and for tests of 20 each."""
+    """Stands in for training, which takes 100 seconds, and for tests of a policy, of 20 each."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.clock, self.tests, self.interrupting = Clock(), list[dict[str, Any]](), False
@@ -28,8 +29,6 @@ class Stand:
         monkeypatch.setattr("csac.evaluation.play.evaluate_run", self.evaluate)
 
     def train(self, job: Job, _: Any) -> RunDirectory:
-        if is_run(job.path):
-            return RunDirectory.open(job.path)
         self.clock.now += 100
         run = make_run(Store(job.path.parents[2]), job.cell, state="finished", steps_done=300)
         run.append("evaluations", [EvaluationEpisode(0, 1.0, 9, None).row(0, 300)])
@@ -91,3 +90,38 @@ def test_a_policy_is_tested_on_the_task_as_it_was_last(tmp_path, stand):
     execute(job, print)
     (test,) = stand.tests
     assert [str(one) for one in test["perturbations"]] == ["gravity=0.5", "friction=3"]
+
+
+def test_what_died_after_its_training_is_looked_at_again(tmp_path, stand):
+    (job,) = jobs(tmp_path, cell(), keep_checkpoints=False)
+    run = make_run(Store(tmp_path), job.cell, state="finished", steps_done=300)
+    run.checkpoints.mkdir()
+    write_history(job.path, {"seconds": 7.0, "failure": "its process was killed by SIGKILL"})
+    assert Store(tmp_path).status(job.cell).state == "failed"
+    assert not is_over(job)
+    assert execute(job, print) == Ended(job.cell.key, "complete")
+    assert Store(tmp_path).status(job.cell) == ("complete", 300, "", 7.0)
+    assert is_over(job)
+    assert not run.checkpoints.exists()
+
+
+def test_what_learning_failed_at_is_not_tried_again_whatever_stands_beside_it(tmp_path):
+    (job,) = jobs(tmp_path, cell())
+    make_run(Store(tmp_path), job.cell, state="failed", failures={0: "step 40: NaN"})
+    write_history(job.path, {"failure": "no task is called Hopper-v4"})
+    assert is_over(job)
+
+
+@pytest.mark.parametrize(
+    ("manifest", "outcome"),
+    [
+        ({"state": "finished"}, ("complete", "")),
+        ({"state": "failed", "failures": {0: "step 40: NaN"}}, ("failed", "step 40: NaN")),
+    ],
+)
+def test_a_cell_that_is_over_by_now_is_left_as_it_is_and_needs_no_training(tmp_path, monkeypatch, manifest, outcome):
+    (job,) = jobs(tmp_path, cell())
+    make_run(Store(tmp_path), job.cell, **manifest)
+    monkeypatch.setitem(sys.modules, "csac.training.train", None)
+    assert execute(job, print) == Ended(job.cell.key, *outcome)
+    assert not read_history(job.path)
