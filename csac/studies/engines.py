@@ -6,7 +6,7 @@ import os
 import pickle
 import signal
 from collections import deque
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -14,9 +14,10 @@ from csac.processes import Child, usable_cores
 from csac.studies.cells import read_history, write_history
 from csac.studies.job import Ended, Job, Message, Started, Stopped, execute
 from csac.studies.worker import work
+from csac.training.interruptions import signals_noted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     Tell = Callable[[Message], Any]
 
@@ -36,14 +37,17 @@ class Engine(Protocol):
 
 def run_here(jobs: Sequence[Job], tell: Tell) -> None:
     """Run the jobs in this process, one after another, each on all cores."""
-    for job in jobs:
-        tell(Started(job.cell.key))
-        try:
-            ended = execute(job, tell)
-        except Stopped:
-            tell(Ended(job.cell.key, "stopped"))
-            raise
-        tell(ended)
+    with signals_noted() as received:
+        for job in jobs:
+            tell(Started(job.cell.key))
+            try:
+                ended = execute(job, tell)
+            except Stopped:
+                tell(Ended(job.cell.key, "stopped"))
+                raise
+            tell(ended)
+            if received:  # too late to stop that one
+                raise Stopped(received[0])
 
 
 def run_in_processes(jobs: Sequence[Job], tell: Tell, workers: int | None = None) -> None:
@@ -112,29 +116,6 @@ class _Worker:
         with suppress(OSError):
             write_history(self.job.path, {**read_history(self.job.path), "failure": reason})
         return Ended(self.job.cell.key, "failed", reason)
-
-
-@contextmanager
-def signals_noted() -> Iterator[list[int]]:
-    """Yield a list that SIGINT and SIGTERM are added to; the second of them raises KeyboardInterrupt.
-
-    SIGHUP is ignored: a study outlives its terminal.
-    """
-    received: list[int] = []
-
-    def note(number: int, _: Any) -> None:
-        if received:
-            raise KeyboardInterrupt
-        received.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    if hasattr(signal, "SIGHUP"):
-        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _told(cores: Sequence[int]) -> str:

@@ -14,10 +14,10 @@ import numpy as np
 from csac.checks import check_whole
 from csac.record.run import RunDirectory, is_run
 from csac.record.statistics import evaluation_matrix, last_evaluations
-from csac.studies.engines import signals_noted
 from csac.studies.job import Stopped
 from csac.studies.shared_study import POINTS
 from csac.tasks.seeds import TUNING_EVALUATION_SEED
+from csac.training.interruptions import signals_noted
 from csac.types import InputError
 
 if TYPE_CHECKING:

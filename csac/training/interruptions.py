@@ -62,21 +62,43 @@ def leaving_at_once() -> Iterator[None]:
         yield
 
 
+class _Received(list[int]):
+    """The signals so far, and the handler that adds to them: the second one raises KeyboardInterrupt."""
+
+    def __call__(self, number: int, _: Any) -> None:
+        if self:
+            raise KeyboardInterrupt
+        self.append(number)
+
+
+@contextmanager
+def signals_noted() -> Iterator[list[int]]:
+    """Yield a list that SIGINT and SIGTERM are added to; the second of them raises KeyboardInterrupt.
+
+    SIGHUP is ignored: a study outlives its terminal. Runs that are trained within share the list: one that completes
+    in spite of a signal leaves it here, and one that begins after it stops at once.
+    """
+    received = _Received()
+    with _handled(received):
+        yield received
+
+
 @contextmanager
 def caught_signals(tell: Callable[[], None] | None = None) -> Iterator[tuple[threading.Event, list[int]]]:
     """Yield (a request to stop, the signals behind it). A second SIGINT or SIGTERM is taken literally.
 
     SIGHUP is ignored: a run outlives its terminal. `tell` is called, in a thread, as soon as the first signal arrives.
     """
-    stop, received = threading.Event(), []
+    outer = signal.getsignal(signal.SIGINT)
+    stop, received = threading.Event(), outer if isinstance(outer, _Received) else _Received()
 
-    def note(number: int, _: Any) -> None:
-        if received:
-            raise KeyboardInterrupt
-        received.append(number)
+    def note(number: int, frame: Any) -> None:
+        received(number, frame)
         stop.set()
 
     with _handled(note), _told_at_once(tell) if tell else nullcontext():
+        if received:
+            stop.set()
         yield stop, received
 
 

@@ -1,15 +1,18 @@
 import os
 import signal
+from contextlib import nullcontext
 
 import pytest
 from resuming import Crash, contents
 from studying import cell, jobs
 
 from csac.record.run import RunDirectory
+from csac.studies import engines
 from csac.studies.cells import Store, is_final
 from csac.studies.engines import run_here, run_in_processes, split_cores
 from csac.studies.job import Advanced, Ended, Started, Stopped
 from csac.tasks.seeds import training_seed
+from csac.training.interruptions import caught_signals
 
 
 def outcomes(messages):
@@ -95,6 +98,21 @@ def test_a_signal_saves_the_cell_and_leaves_the_rest(tmp_path, uninterrupted, ru
     assert 100 <= store.status(two[0].cell).steps < 300
     run_here(two[:1], lambda _: None)
     assert contents(two[0].path) == uninterrupted
+
+
+@pytest.mark.parametrize("around", [caught_signals, nullcontext], ids=["its last step", "its test"])
+def test_a_signal_that_a_cell_outlives_leaves_the_rest(tmp_path, monkeypatch, around):
+    def outlive(job, _):
+        with around():
+            signal.raise_signal(signal.SIGINT)
+        return Ended(job.cell.key, "complete")
+
+    monkeypatch.setattr(engines, "execute", outlive)
+    two, messages = jobs(tmp_path, cell(0), cell(1)), []
+    with pytest.raises(Stopped) as stopped:
+        run_here(two, messages.append)
+    assert stopped.value.signal_number == signal.SIGINT
+    assert outcomes(messages) == {two[0].cell.key: "complete"}
 
 
 def test_processes_run_cells_side_by_side_and_outlive_one_that_dies(tmp_path):

@@ -29,6 +29,7 @@ from csac.studies.tune import tune
 from csac.studies.tune_progress import TuneProgress
 from csac.studies.tune_report import FEWEST_FOR_IMPORTANCES, best_command, caveat, trials_table, write_report
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED, TUNING_EVALUATION_SEED
+from csac.training.interruptions import caught_signals
 from csac.training.train import train
 from csac.types import InputError
 
@@ -225,6 +226,19 @@ def test_a_signal_leaves_a_trial_to_be_gone_on_with(search):
     again = next(trial for trial in study.study.trials if trial.value == 9.0)
     assert sorted(again.intermediate_values) == list(range(100, 1_001, 100))
     assert [result.label for result in study.results()] == [0, 1, 2]
+
+
+def test_a_signal_that_a_trial_outlives_leaves_the_rest(monkeypatch, tmp_path):
+    def outlive(*what, **options):
+        with caught_signals():
+            signal.raise_signal(signal.SIGINT)
+            return FakeTrain(constant)(*what, **options)
+
+    monkeypatch.setattr(training, "train", outlive)
+    study = SharedStudy(tmp_path / "study", question())
+    with pytest.raises(Stopped):
+        tune(study, 3, Told())
+    assert [result.state for result in study.results()] == ["complete"]
 
 
 def test_a_trial_whose_process_died_is_taken_up_and_one_that_is_run_is_not(tmp_path):

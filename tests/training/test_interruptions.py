@@ -11,7 +11,7 @@ import threading
 
 import pytest
 
-from csac.training.interruptions import caught_signals
+from csac.training.interruptions import caught_signals, signals_noted
 
 SWALLOWING = """
 import os, signal
@@ -66,3 +66,23 @@ def test_what_was_there_for_signals_is_there_again():
         assert handlers() != before
     assert (handlers(), received) == (before, [])
     assert signal.set_wakeup_fd(descriptor) == -1
+
+
+def test_a_signal_that_comes_too_late_for_a_run_reaches_who_runs_several():
+    with signals_noted() as noted:
+        with caught_signals() as (stop, received):
+            signal.raise_signal(signal.SIGTERM)
+            assert stop.is_set()
+            assert received == [signal.SIGTERM]
+        assert noted == [signal.SIGTERM]
+        with caught_signals() as (stop, _):
+            assert stop.is_set(), "what begins after it stops at once"
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+
+
+def test_a_signal_that_comes_too_late_for_a_run_alone_is_over_with_it():
+    with caught_signals():
+        signal.raise_signal(signal.SIGINT)
+    with caught_signals() as (stop, received):
+        assert (stop.is_set(), received) == (False, [])
