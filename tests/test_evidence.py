@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import runpy
 import shutil
 from collections.abc import Mapping, Sequence
@@ -12,10 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 from made import MadeRecords
+from studying import make_run
 
 from csac.record.rendering import Row, Table
-from csac.studies.arms import Arm
-from csac.studies.cells import Cell
+from csac.studies.arms import Arm, gather
+from csac.studies.cells import Cell, Store
+from csac.studies.results import Results, collect
 from csac.studies.study import Method, Study, read_study
 from csac.types import InputError
 
@@ -112,6 +115,19 @@ def test_the_tables_say_which_seeds_are_missing_and_left_out():
     assert "- not run: CSAC on Ant-v4: seed 1\n" in told
     assert "- left out of what is over all tasks: Hopper-v4, seed 1, which another task lacks\n" in told
     assert "S: comparisons, seeds 0" in told
+
+
+def test_seeds_that_failed_before_their_first_evaluation_have_reached_nothing(tmp_path):
+    store, failed = Store(tmp_path / "runs"), {"state": "failed", "failures": {0: "step 3: NaN"}}
+    study = dataclasses.replace(STUDY, seeds=1)
+    for _, _, cell in study.entries():
+        run = make_run(store, cell, **(failed if cell.algorithm == "csac" else {"state": "finished"}))
+        if cell.algorithm == "sac":
+            run.append("evaluations", [{"seed": 0, "step": 50, "episode": 0, "return": 4.0, "length": 9}])
+        collect(store, cell, tmp_path / "out")
+    found = EVIDENCE.measured(study, gather(study, Results(tmp_path / "out")))["Hopper-v4"]
+    assert [found[label].final.tolist() for label in ("SAC, 0.2", "CSAC")] == [[4.0], [0.0]]
+    assert "not run" not in EVIDENCE.told(study, Results(tmp_path / "out"))
 
 
 def test_an_interval_on_one_side_of_one_half_is_a_verdict():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from csac.record import manifest as manifests
 from csac.record.atomic import write_atomically
-from csac.record.csv_tables import read_rows
+from csac.record.csv_tables import COLUMNS, read_rows
 from csac.record.run import RunDirectory
 from csac.studies.cells import Cell, Status, Store, is_final, read_history
 from csac.studies.job import ROLLOUTS
@@ -98,13 +98,18 @@ class Results:
 
 
 def collect(store: Store, cell: Cell, directory: str | Path) -> None:
-    """Copy what a cell that is over has given to files that are small enough to be kept with the code."""
+    """Copy what a cell that is over has given to files that are small enough to be kept with the code.
+
+    One that failed before its first evaluation has a table without rows.
+    """
     record, source = Runs(store).record(cell), store.path(cell)
-    if record is None or not (source / "evaluations.csv").exists():
+    table = source / "evaluations.csv"
+    if record is None or not (record.failure or table.exists()):
         return
     path = Path(directory) / "cells" / cell.name.with_suffix(".json")
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path.with_suffix(".csv"), (source / "evaluations.csv").read_bytes())
+    header = (",".join(COLUMNS["evaluations"]) + "\n").encode()
+    write_atomically(path.with_suffix(".csv"), table.read_bytes() if table.exists() else header)
     if (source / ROLLOUTS).exists():
         write_atomically(_rollouts(path), (source / ROLLOUTS).read_bytes())
     manifest = dataclasses.replace(record.manifest, machine=dataclasses.replace(record.manifest.machine, host=""))

@@ -101,6 +101,19 @@ def test_what_another_machine_has_collected_stays_as_it_is(engine):
     assert not engine
 
 
+def test_a_cell_that_failed_before_its_first_evaluation_is_collected_and_over(engine):
+    (one,) = cells_of([read_study("tiny.toml")])[:1]
+    make_run(Store(), one, steps_done=20, state="failed", failures={0: "step 20: the actor is not finite"})
+    assert csac("study run tiny.toml --seeds 1 --results out") == 3
+    record = Results("out").record(one)
+    assert record is not None
+    assert record.failure == "step 20: the actor is not finite"
+    assert len(record.evaluations) == 0
+    assert record.evaluations.dtype.names == ("seed", "step", "episode", "return", "length", "success")
+    assert csac("study run tiny.toml --seeds 1 --directory another/machine --results out") == 3
+    assert not engine
+
+
 def test_a_manifest_tells_the_command_and_not_where_csac_is(engine, monkeypatch):
     monkeypatch.setattr("sys.argv", ["/home/me/.venv/bin/csac", "study", "run", "tiny.toml"])
     assert csac("study run tiny.toml") == 0
