@@ -8,13 +8,14 @@ import os
 import platform
 import socket
 import tempfile
+import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from csac.processes import move_to, usable_cores
-from csac.studies.cells import read_history, write_history
+from csac.studies.cells import is_in_use, read_history, write_history
 from csac.studies.engines import SECONDS_BETWEEN_LOOKS
 from csac.studies.job import Ended, Job, Message, Started, Stopped, execute
 from csac.training.interruptions import signals_noted
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 SECONDS_TO_ANSWER = 10.0
 RETRIES = 5  # of a cell whose node or process was lost
+SECONDS_FOR_LOCK = 300.0  # a node that vanished keeps its locks until the file server's lease ends, a minute or two
+SECONDS_BETWEEN_TRIES = 5.0
 
 
 @dataclass(frozen=True)
@@ -129,19 +132,28 @@ def _work(job: Job, cores: int, messages: Any) -> Ended:
     import ray
 
     with _Cores(cores):
-        node, sent = ray.get_runtime_context().get_node_id(), []
+        context, sent = ray.get_runtime_context(), []
 
         def tell(message: Message) -> None:
             # Nobody waits until it was heard: Ray would lend the core of who waits to another cell.
             sent.append(messages.actor.put.remote(message))
 
-        tell(Started(job.cell.key, f"{platform.node()} {node[:6]}"))
+        tell(Started(job.cell.key, f"{platform.node()} {context.get_node_id()[:6]}"))
         try:
+            if context.worker.core_worker.get_current_task_attempt_number():  # 0 in the first
+                _wait_until_free(job.path)
             return execute(job, tell)
         except Stopped:
             return Ended(job.cell.key, "stopped")
         finally:
             ray.wait(sent, num_returns=len(sent))
+
+
+def _wait_until_free(path: Path) -> None:
+    """Wait for the lock of a run that was lost with its node; but not for ever, as another process may have it."""
+    end = time.monotonic() + SECONDS_FOR_LOCK
+    while is_in_use(path) and time.monotonic() < end:
+        time.sleep(SECONDS_BETWEEN_TRIES)
 
 
 class _Cores:
