@@ -367,12 +367,15 @@ def _engine(options: Run) -> Engine:
     if options.engine == "ray":
         from csac.studies.cluster import Request, run_on_ray  # an optional dependency
 
+        if options.workers:
+            raise InputError("--engine ray runs as many cells as the cluster has room for: leave out --workers")
         if options.cell_cores < 1 or options.cell_gpus < 0 or options.cell_memory < 0:
             raise InputError("--cell-cores is at least 1, --cell-gpus and --cell-memory are not below 0")
         request = Request(options.cell_cores, options.cell_gpus, options.cell_memory)
         return partial(run_on_ray, address=options.address, request=request)
-    if options.address:
-        raise InputError("--address is a Ray cluster's: add --engine ray")
+    for name in ("address", "cell_cores", "cell_gpus", "cell_memory"):
+        if getattr(options, name) != getattr(Run, name):
+            raise InputError(f"--{name.replace('_', '-')} is for Ray: add --engine ray")
     several = len(usable_cores()) > 1 and options.cell is None and options.device == "cpu"
     engine = options.engine or ("processes" if several or options.workers else "local")
     if engine == "local" and options.workers:
