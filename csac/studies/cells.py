@@ -177,7 +177,7 @@ class Store:
 
 
 def is_final(path: Path) -> bool:
-    """Whether a run has been trained to its end, or to where what it learns failed.
+    """Whether a run has been trained to its end, or to where its seed failed: it diverged, or its environment raised.
 
     What failed for another reason, such as a package that is missing or a machine that died, is tried again.
     """
