@@ -704,5 +704,6 @@ def test_a_gpu_that_is_not_there_is_one_line(tmp_path):
         check=False,
     )
     assert result.returncode == 2
-    assert result.stderr == "csac: no GPU that JAX can use: install csac[cuda], or choose the cpu\n"
+    hint = "pip install '.[cuda]' in a clone of csac, or choose the cpu"
+    assert result.stderr == f"csac: no GPU that JAX can use: {hint}\n"
     assert not any(tmp_path.iterdir())

@@ -53,7 +53,8 @@ def on_gpu(updates: int) -> Row:
     found = run_one(worker("agreement", updates=updates), device="gpu")
     if not found["device"]:
         raise InputError(
-            "there is no GPU that JAX can use: install csac[cuda], or see that it runs with --device cpu --quick"
+            "there is no GPU that JAX can use: pip install '.[cuda]' in a clone of csac, "
+            "or see that it runs with --device cpu --quick"
         )
     return found
 

@@ -178,7 +178,7 @@ class _ONNX:
         try:
             import onnxruntime
         except ImportError:
-            raise InputError("to run an ONNX artefact, install ONNX Runtime: pip install 'csac[onnx]'") from None
+            raise InputError("an ONNX artefact needs ONNX Runtime: pip install '.[onnx]' in a clone of csac") from None
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3

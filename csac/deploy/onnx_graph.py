@@ -47,7 +47,7 @@ def onnx_model(network: PolicyNetwork, contract: ArtefactContract) -> bytes:
         import onnx
         from onnx import TensorProto, checker, helper
     except ImportError:
-        raise InputError("an ONNX artefact needs the package onnx: pip install 'csac[onnx]'") from None
+        raise InputError("an ONNX artefact needs the package onnx: pip install '.[onnx]' in a clone of csac") from None
     graph, guards = _Graph(), contract.guards
     inputs, outputs = graph_sizes(contract)
     action = _policy(graph, network, contract)

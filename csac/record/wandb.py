@@ -170,7 +170,7 @@ def import_wandb() -> Any:
     except ImportError:
         wandb = None
     if not hasattr(wandb, "init"):  # a folder of that name, which W&B itself makes, can be imported too
-        raise InputError("W&B is not installed: pip install 'csac[wandb]'")
+        raise InputError("W&B is not installed: pip install '.[wandb]' in a clone of csac")
     return wandb
 
 

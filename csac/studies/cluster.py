@@ -64,7 +64,7 @@ def _connected(address: str | None) -> Any:
     try:
         import ray
     except ImportError:
-        raise InputError("Ray is not installed: pip install 'csac[cluster]'") from None
+        raise InputError("Ray is not installed: pip install '.[cluster]' in a clone of csac") from None
     _require_listener(address)
     try:
         options: dict[str, Any] = {"address": address} if address else {"include_dashboard": False}

@@ -302,7 +302,7 @@ def import_optuna() -> Any:
     try:
         import optuna
     except ImportError:
-        raise InputError("Optuna is not installed: pip install 'csac[tune]'") from None
+        raise InputError("Optuna is not installed: pip install '.[tune]' in a clone of csac") from None
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     return optuna
 

@@ -16,7 +16,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-INSTALL = "pip install 'csac[robots]'"
+INSTALL = "pip install '.[robots]' in a clone of csac"
 RESERVED = frozenset({"seed", "step", "episode", "return", "length", "success"})  # columns that there are anyway
 RESERVED_TAGS = frozenset({"mean_reward", "mean_ep_length", "success_rate"})
 

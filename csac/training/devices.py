@@ -30,7 +30,8 @@ def choose_device(device: str) -> None:
         chosen = jax.default_backend()
     except Exception as error:  # which one depends on what is missing, and on JAX's version
         jax.config.update("jax_platforms", before)
-        raise InputError("no GPU that JAX can use: install csac[cuda], or choose the cpu") from error
+        hint = "pip install '.[cuda]' in a clone of csac, or choose the cpu"
+        raise InputError(f"no GPU that JAX can use: {hint}") from error
     if chosen != device:
         jax.config.update("jax_platforms", before)
         raise InputError(f"this process computes on the {chosen} already: train on the {device} in a new one")

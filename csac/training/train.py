@@ -72,7 +72,7 @@ def train(
         resume: go on with the run in `directory`, where there is one, from its newest checkpoint.
         start_from: `DIRECTORY` or `DIRECTORY@STEP` of a run: begin with a copy of its checkpoint of that step.
         tensorboard: whether to write TensorBoard files.
-        wandb: whether to log to Weights & Biases too (`csac[wandb]`), or the project to log to: a W&B run for each
+        wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to: a W&B run for each
             seed, those of a run directory in one group. Training never waits for W&B, nor fails with it.
         reporter: where progress is shown; None is silent, but for a warning about each seed that fails.
         command: the command line, for the manifest.

@@ -167,7 +167,7 @@ def test_a_suite_is_its_parts_and_a_part_itself():
     [
         (["roofline"], "nothing called 'roofline' to measure: choose among peers, limit"),
         (["growth", "--only", "colour"], "nothing in growth can be measured here whose name contains 'colour'"),
-        (["gpu", "--quick"], "no GPU that JAX can use: install csac[cuda]"),
+        (["gpu", "--quick"], "no GPU that JAX can use: pip install '.[cuda]' in a clone of csac"),
     ],
 )
 def test_a_mistake_is_one_clear_line(capsys, arguments, complaint):

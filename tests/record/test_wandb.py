@@ -213,7 +213,7 @@ def test_without_wandb_one_line_says_what_to_install(monkeypatch, capsys, tmp_pa
     monkeypatch.setitem(sys.modules, "wandb", None)
     for line in ("train Hopper-v4 --wandb --directory run", "study run smoke --wandb"):
         assert main(line.split()) == 2
-        assert capsys.readouterr().err == "csac: W&B is not installed: pip install 'csac[wandb]'\n"
+        assert capsys.readouterr().err == "csac: W&B is not installed: pip install '.[wandb]' in a clone of csac\n"
     # W&B's own folder can be imported, and is not it.
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace())
     with pytest.raises(InputError, match="not installed"):

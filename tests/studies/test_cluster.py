@@ -99,3 +99,9 @@ def test_what_ray_tries_again_waits_for_the_lock_of_the_node_that_was_lost(
     with lock:
         assert module._work(job, 1, messages).outcome == outcome
     assert clock() - began == waited
+
+
+def test_without_ray_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"^Ray is not installed: pip install '\.\[cluster\]' in a clone of csac$"):
+        run_on_ray(jobs(tmp_path, cell()), print, None, Request())

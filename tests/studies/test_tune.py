@@ -539,7 +539,7 @@ def test_a_damaged_journal_is_told(monkeypatch, capsys):
 def test_without_optuna_one_line_says_what_to_install(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert csac(LINE) == 2
-    assert capsys.readouterr().err == "csac: Optuna is not installed: pip install 'csac[tune]'\n"
+    assert capsys.readouterr().err == "csac: Optuna is not installed: pip install '.[tune]' in a clone of csac\n"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -185,7 +185,7 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, task, blocked
     ended = run_python(code, tmp_path)
     assert ended.returncode == 2
     assert ended.stderr.startswith(f"csac: {task} needs packages that are not installed (")
-    assert ended.stderr.endswith("): pip install 'csac[robots]'\n")
+    assert ended.stderr.endswith("): pip install '.[robots]' in a clone of csac\n")
     assert ended.stderr.count("\n") == 1
     assert ended.stdout == ""
     assert list(tmp_path.iterdir()) == []
@@ -194,7 +194,8 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, task, blocked
 def test_another_release_of_a_package_is_said(monkeypatch):
     known.register(QUAD)
     monkeypatch.delitem(gymnasium.registry, QUAD)
-    with pytest.raises(InputError, match=r"^the PyFlyt that is installed has no .*: pip install 'csac\[robots\]'$"):
+    install = r"pip install '\.\[robots\]' in a clone of csac"
+    with pytest.raises(InputError, match=rf"^the PyFlyt that is installed has no .*: {install}$"):
         Environment(QUAD)
 
 

@@ -57,5 +57,5 @@ def test_without_a_gpu_the_cpu_can_still_be_chosen():
     surroundings = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     command = [sys.executable, "-c", FIRST_THE_GPU]
     said = subprocess.run(command, env=surroundings, capture_output=True, text=True, check=True).stdout.strip()
-    without = "no GPU that JAX can use: install csac[cuda], or choose the cpu\ncpu cpu"
+    without = "no GPU that JAX can use: pip install '.[cuda]' in a clone of csac, or choose the cpu\ncpu cpu"
     assert said in (without, "gpu gpu cuda")
