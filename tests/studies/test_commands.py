@@ -77,10 +77,11 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
 def test_on_a_terminal_where_nothing_is_left_to_run_it_is_said(engine, monkeypatch):
     for one in cells_of([read_study("tiny.toml")]):
         make_run(Store(), one, steps_done=300, state="finished")
-    terminal = Console(file=io.StringIO(), width=100, force_terminal=True, _environ={"TERM": "xterm-256color"})
+    shown = io.StringIO()
+    terminal = Console(file=shown, width=100, force_terminal=True, _environ={"TERM": "xterm-256color"})
     monkeypatch.setattr(commands, "make_console", lambda: terminal)
     assert csac("study run tiny.toml") == 0
-    assert terminal.file.getvalue().splitlines()[-1] == "2 cells: 2 complete"
+    assert shown.getvalue().splitlines()[-1] == "2 cells: 2 complete"
     assert not engine
 
 
