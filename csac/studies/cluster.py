@@ -140,13 +140,20 @@ def _work(job: Job, cores: int, messages: Any) -> Ended:
 
         tell(Started(job.cell.key, f"{platform.node()} {context.get_node_id()[:6]}"))
         try:
-            if context.worker.core_worker.get_current_task_attempt_number():  # 0 in the first
+            if _is_retry(context):
                 _wait_until_free(job.path)
             return execute(job, tell)
         except Stopped:
             return Ended(job.cell.key, "stopped")
         finally:
             ray.wait(sent, num_returns=len(sent))
+
+
+def _is_retry(context: Any) -> bool:
+    """Whether Ray runs this task again, which no documented function of its tells; where none does, it is not."""
+    with suppress(AttributeError):
+        return context.worker.core_worker.get_current_task_attempt_number() > 0
+    return False
 
 
 def _wait_until_free(path: Path) -> None:
