@@ -141,7 +141,9 @@ SPACES: Mapping[str, Mapping[str, Dimension]] = MappingProxyType(
         },
         "td3": {"policy_delay": Range(1, 4, "linear", "2 in the paper"), **_NOISE, **_OFF_POLICY},
         "sd3": {
-            "inverse_temperature": Range(0.001, 0.5, "logarithmic", "its authors' 0.001 to 0.1 on these tasks, and further up"),
+            "inverse_temperature": Range(
+                0.001, 0.5, "logarithmic", "its authors' 0.001 to 0.1 on these tasks, and further up"
+            ),
             **_NOISE,
             **_OFF_POLICY,
         },
