@@ -80,6 +80,7 @@ class SeedEnvironments:
         self._returns = [0.0] * len(seeds)
         self._lengths = [0] * len(seeds)
         self._failures: list[Failure] = []
+        self.refused: dict[int, str] = {}  # why the episode saved of the seed at this place was not taken back
 
     def reset(self) -> np.ndarray:
         """Start the next episode of every seed: observations [seed, observation].
@@ -152,7 +153,8 @@ class SeedEnvironments:
     def take_back(self, index: int, saved: Snapshot) -> bool:
         """Let the seed at this place go on from `save`; return false where its episode had to start anew.
 
-        A seed whose environment fails here is reported by the next `step`. Raises KeyError or ValueError where this is
+        That is so as well where the environment does not take the snapshot, which `refused` then says. A seed whose
+        environment cannot be reset either is reported by the next `step`. Raises KeyError or ValueError where this is
         not what `save` returns.
         """
         arrays, values = dict(saved.arrays), saved.values
@@ -165,17 +167,12 @@ class SeedEnvironments:
         self._observation[index], self._reward[index] = observation, values["reward"]
         if not values["alive"]:
             self.stop(index)
-        elif values["exact"]:
-            self._returns[index], self._lengths[index] = values["episode_return"], values["episode_length"]
-            seed = training_seed(self.seeds[index], self._begun[index] - 1)
-            try:
-                self.environments[index].restore(seed, Snapshot(arrays, values["environment"]))
-            except EnvironmentFailure as error:
-                self._fail(index, error)
-        else:
+        elif not (values["exact"] and self._restore(index, Snapshot(arrays, values["environment"]))):
             self._begun[index] -= 1
             self._reset(index)
             return False
+        else:
+            self._returns[index], self._lengths[index] = values["episode_return"], values["episode_length"]
         return True
 
     @property
@@ -201,6 +198,15 @@ class SeedEnvironments:
             self._observation[index] = self.environments[index].reset(seed)
         except EnvironmentFailure as error:
             self._fail(index, error)
+
+    def _restore(self, index: int, saved: Snapshot) -> bool:
+        """Return whether the environment goes on with its episode; one that was saved by another task may not."""
+        try:
+            self.environments[index].restore(training_seed(self.seeds[index], self._begun[index] - 1), saved)
+        except EnvironmentFailure as error:
+            self.refused[index] = str(error)
+            return False
+        return True
 
     def _rest(self, index: int) -> None:
         self._running = [other for other in self._running if other != index]

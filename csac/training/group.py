@@ -18,6 +18,7 @@ from csac.tasks.seeds import SeedEnvironments
 from csac.training.checkpoint import Checkpoint, taken_back
 from csac.training.learner import Learner
 from csac.training.messages import (
+    BegunAnew,
     Boundary,
     Ended,
     Evaluated,
@@ -117,6 +118,8 @@ class Group:
         """Train to the last step and yield what happens; the caller writes it down."""
         if self._pool:
             self._pool.start()
+        for index, reason in self.environments.refused.items():
+            yield BegunAnew(self.seeds[index], reason)
         for message in self._train(should_stop):
             if self._evaluation and not isinstance(message, Boundary):
                 self._held.append(message)

@@ -86,6 +86,13 @@ class Noted(NamedTuple):
     text: str
 
 
+class BegunAnew(NamedTuple):
+    """A seed began its episode anew, since its environment did not take back what the checkpoint has of it."""
+
+    seed: int
+    reason: str
+
+
 class Saved(NamedTuple):
     """What a checkpoint at this step needs of the group is on disk, in these files.
 
@@ -105,7 +112,7 @@ class Ended(NamedTuple):
     policies: dict[int, Policy]
 
 
-GroupMessage = Rows | Evaluated | Failed | Progress | Boundary | Noted | Saved | Ended
+GroupMessage = Rows | Evaluated | Failed | Progress | Boundary | Noted | BegunAnew | Saved | Ended
 
 Order = Literal["save", "stop"] | list[int]  # to a worker: what to do, or the cores to take its next turn on
 

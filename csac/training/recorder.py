@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -11,6 +12,7 @@ import numpy as np
 from csac.record.run import Table
 from csac.record.statistics import best_returns, mean_returns
 from csac.training.messages import (
+    BegunAnew,
     Boundary,
     Ended,
     Evaluated,
@@ -114,6 +116,8 @@ class Recorder:
                 self._note(f"{_seeds(self.groups[group])}: {reason}; started again from step {step:,}")
             case Noted(text):
                 self._note(text)
+            case BegunAnew():
+                self._begun_anew(message)
             case NotSaved(error):
                 raise error
 
@@ -233,6 +237,14 @@ class Recorder:
         self.run.log(text)
         if self.reporter:
             self.reporter.note(text)
+
+    def _begun_anew(self, message: BegunAnew) -> None:
+        """Note that the run is not the one that was never stopped; the next checkpoint may be exact again."""
+        self._note(f"seed {message.seed}: {message.reason}; its episode begins anew")
+        before = self.run.manifest
+        history = [*before.history[:-1], *(replace(last, exact=False) for last in before.history[-1:])]
+        inexact = {*before.inexact_seeds, message.seed}
+        self.run.update_manifest(history=tuple(history), inexact_seeds=tuple(sorted(inexact)))
 
     def _progress(self, group: int, step: int) -> None:
         self._passed[group] = max(step, self._passed[group])

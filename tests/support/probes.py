@@ -163,9 +163,9 @@ class NonFinite(Endless):
 
 
 class Unsavable(Endless):
-    """Ends after 40 steps, and has a `get_snapshot` that raises, exits or gives what no file can hold."""
+    """Ends after 40 steps, and has a `get_snapshot` that raises, exits or gives what no file or nobody takes."""
 
-    def __init__(self, gives: Literal["error", "exit", "nothing", "objects", "values"] = "error") -> None:
+    def __init__(self, gives: Literal["error", "exit", "nothing", "objects", "values", "one way"] = "error") -> None:
         super().__init__(length=40)
         self.gives = gives
 

@@ -140,6 +140,39 @@ def test_an_episode_that_cannot_be_saved_starts_anew_with_its_own_seed():
     assert second.observations[0, 2] == 0  # the step
 
 
+def test_an_episode_that_is_not_taken_back_starts_anew_with_its_own_seed():
+    """The array of another MuJoCo is missing here; the seed had failed, and with it every other seed of the run."""
+    first, second, third = (SeedEnvironments("Hopper-v4", None, (4,)) for _ in range(3))
+    began = first.reset()[0].copy()
+    steps_of(first, 5)
+    saved = through_json(first.save(0))
+    del saved.arrays["mujoco.qpos"]
+    assert second.take_back(0, saved) is False
+    assert "has other arrays" in second.refused[0]
+    np.testing.assert_array_equal(second.observations[0], began)
+    third.reset()
+    assert steps_of(second, 120) == steps_of(third, 120)  # the next episodes have the seeds that they would have had
+
+
+def test_an_episode_that_has_one_time_limit_more_starts_anew():
+    first = SeedEnvironments(lambda: Counting(20), None, (4,))
+    second = SeedEnvironments(lambda: gymnasium.wrappers.TimeLimit(Counting(20), 7), None, (4,))
+    first.reset()
+    steps_of(first, 5)
+    assert second.take_back(0, through_json(first.save(0))) is False
+    episodes = [episode for _, _, episodes in steps_of(second, 7) for episode in episodes]
+    assert [(length, reward) for _, reward, length in episodes] == [(7, 1 + 2 + 3 + 4 + 5 + 6 + 7)]
+
+
+def test_a_seed_that_neither_takes_its_episode_back_nor_can_be_reset_has_failed():
+    first = SeedEnvironments(probes.Unsavable, {"gives": "one way"}, (4,))
+    second = SeedEnvironments(probes.Failing, {"where": "reset"}, (4,))
+    first.reset()
+    assert second.take_back(0, first.save(0)) is False
+    outcome = second.step(np.zeros((1, 1), np.float32))
+    assert [failure.reason for failure in outcome.failures] == ["reset raised RuntimeError: the simulator broke"]
+
+
 def test_a_seed_that_has_failed_stays_so():
     first, second = (SeedEnvironments("Hopper-v4", None, (4, 9)) for _ in range(2))
     first.reset()

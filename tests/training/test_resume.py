@@ -225,6 +225,23 @@ def test_an_episode_that_cannot_be_saved_is_said(tmp_path):
     assert not finished.manifest.history[0].exact
 
 
+def test_an_episode_that_is_not_taken_back_is_said_and_the_run_goes_on(tmp_path):
+    """It has a `get_snapshot` and no `set_snapshot`: every seed failed at once when the run went on."""
+    task, arguments = "probes:Unsavable-v0", {"gives": "one way"}
+    with pytest.raises(Crash):
+        run(tmp_path / "run", LEARNERS[1], 300, task, environment_arguments=arguments, on_evaluation=crash_at(200))
+    assert RunDirectory.open(tmp_path / "run").manifest.inexact_seeds == ()
+    seen: list[Any] = []
+    finished = resume(
+        tmp_path / "run", on_evaluation=lambda *_: seen.append(RunDirectory.open(tmp_path / "run").manifest)
+    )
+    assert (finished.manifest.state, finished.manifest.failures) == ("finished", {})
+    assert "does not take its snapshot back" in (finished.path / "log.txt").read_text()
+    assert seen[0].inexact_seeds == (0,)  # as long as that checkpoint is the newest
+    assert finished.manifest.inexact_seeds == ()
+    assert [entry.exact for entry in finished.manifest.history] == [False]
+
+
 def test_a_rollout_ends_where_its_episode_was_broken_off(tmp_path):
     """Pendulum's state cannot be saved, so the second seed's next episode follows the checkpoint at once."""
     first = group(tmp_path, ROLLOUT, (0, 1), 400, task="Pendulum-v1")
