@@ -38,6 +38,10 @@ class StorageFailure(RuntimeError):
     """A run directory can no longer be written. The message says why, in one line."""
 
 
+class _Occupied(InputError):
+    """There is something in a directory already."""
+
+
 class RunDirectory:
     """One run on disk."""
 
@@ -62,6 +66,19 @@ class RunDirectory:
             reason = error.strerror or str(error)
             raise InputError(f"cannot write to {path}: {reason}; choose another directory") from None
         return cls(path, manifests.read(content))
+
+    @classmethod
+    def create_by_date(cls, task_name: str, manifest: Manifest) -> RunDirectory:
+        """As `create`, in `runs/<task>/<algorithm>/<date-time>`, or `<date-time>-2` and so on where that is taken."""
+        moment = datetime.now().strftime("%Y%m%d-%H%M%S")
+        first = Path("runs", task_name.replace("/", "-"), manifest.algorithm, moment)
+        path, number = first, 1
+        while True:
+            if not os.path.lexists(path):
+                with suppress(_Occupied):  # by a process that began in the same second
+                    return cls.create(path, manifest)
+            number += 1
+            path = first.with_name(f"{moment}-{number}")
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
@@ -221,17 +238,6 @@ def find_runs(directory: str | Path, on_damaged: Callable[[InputError], None] | 
     return sorted(runs, key=lambda run: run.path)
 
 
-def default_directory(task_name: str, algorithm: str) -> Path:
-    """Name a fresh run directory, `runs/<task>/<algorithm>/<date-time>`; it is not created."""
-    moment = datetime.now().strftime("%Y%m%d-%H%M%S")
-    first = Path("runs", task_name.replace("/", "-"), algorithm, moment)
-    path, number = first, 1
-    while path.exists():
-        number += 1
-        path = first.with_name(f"{moment}-{number}")
-    return path
-
-
 def _claim(path: Path, manifest: bytes) -> None:
     """Make `path` a run, or raise and leave it as it was."""
     _refuse_occupied(path)
@@ -257,7 +263,7 @@ def _is_left_over(path: Path) -> bool:
 
 def _refuse_occupied(path: Path) -> None:
     if (path / MANIFEST).exists():
-        raise InputError(f"{path} already holds a run; resume it, or choose another directory")
+        raise _Occupied(f"{path} already holds a run; resume it, or choose another directory")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path} is a file; choose another directory")
     if path.exists() and not all(_is_left_over(entry) for entry in path.iterdir()):

@@ -13,7 +13,7 @@ from csac.algorithms import ALGORITHMS
 from csac.checks import check_arguments, check_whole
 from csac.presets import matching_preset
 from csac.record.manifest import CheckpointPlan, EvaluationPlan, Manifest
-from csac.record.run import RunDirectory, default_directory, is_run
+from csac.record.run import RunDirectory, is_run
 from csac.tasks.environment import Environment
 from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
@@ -95,9 +95,11 @@ class Before(NamedTuple):
         """The run that is continued, in its own directory or in another."""
         return self.existing or (self.source.run if self.source else None)
 
-    def path(self, plan: Plan) -> Path:
-        """Return the directory of the new run."""
-        return self.directory or default_directory(plan.task_name, plan.algorithm.name)
+    def create(self, plan: Plan, manifest: Manifest) -> RunDirectory:
+        """Start the new run in the directory that was named, or in one of its own. Raises InputError."""
+        if self.directory:
+            return RunDirectory.create(self.directory, manifest)
+        return RunDirectory.create_by_date(plan.task_name, manifest)
 
 
 def make_plan(

@@ -121,9 +121,9 @@ def train(
         fits = functools.partial(misfit, algorithm, spec, plan.steps)
         before.source.refuse_misfit(wanted, has_schedule, fits)
         origin = before.source.described(wanted, defaults)
-        run = RunDirectory.create(before.path(plan), dataclasses.replace(wanted, forked_from=origin))
+        run = before.create(plan, dataclasses.replace(wanted, forked_from=origin))
     else:
-        run = RunDirectory.create(before.path(plan), wanted)
+        run = before.create(plan, wanted)
     with run.locked(), storage_failures_told(run, watchers.failures):
         if before.existing:
             run.read_again()  # another process may have gone on with it, and ended, before we had the lock

@@ -13,7 +13,7 @@ from csac.record import run as record
 from csac.record.atomic import write_atomically
 from csac.record.csv_tables import COLUMNS, check_new, read_rows, write_rows
 from csac.record.manifest import Manifest
-from csac.record.run import RunDirectory, default_directory, find_runs
+from csac.record.run import RunDirectory, find_runs
 from csac.types import InputError
 
 MANIFEST = Manifest(
@@ -228,7 +228,10 @@ def test_looking_for_runs_where_there_is_no_directory(tmp_path):
         find_runs(tmp_path / "nowhere")
 
 
-def test_the_default_directory_is_always_a_fresh_one(tmp_path, monkeypatch):
+@pytest.fixture
+def noon(tmp_path, monkeypatch):
+    """One and the same second, in an empty folder."""
+
     class Noon(record.datetime):
         @classmethod
         def now(cls, tz=None):
@@ -236,12 +239,32 @@ def test_the_default_directory_is_always_a_fresh_one(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(record, "datetime", Noon)
-    taken = []
-    for _ in range(3):
-        taken.append(default_directory("PyFlyt/QuadX-Waypoints-v1", "csac"))
-        taken[-1].mkdir(parents=True)
-    folder = Path("runs/PyFlyt-QuadX-Waypoints-v1/csac")
+
+
+def test_the_default_directory_is_always_a_fresh_one(noon):
+    taken = [RunDirectory.create_by_date("PyFlyt/QuadX-Waypoints-v1", MANIFEST).path for _ in range(3)]
+    folder = Path("runs", "PyFlyt-QuadX-Waypoints-v1", MANIFEST.algorithm)
     assert taken == [folder / f"20240506-123059{end}" for end in ("", "-2", "-3")]
+
+
+def test_of_two_runs_that_begin_in_the_same_second_each_has_a_directory(noon, monkeypatch):
+    """The other one takes the name after we saw that it was free."""
+    look, others = record._refuse_occupied, []
+
+    def look_and_lose_the_race(path):
+        if not others:
+            others.append(path)
+            RunDirectory.create(path, MANIFEST)
+        look(path)
+
+    monkeypatch.setattr(record, "_refuse_occupied", look_and_lose_the_race)
+    assert RunDirectory.create_by_date("Hopper-v4", MANIFEST).path == others[0].with_name(f"{others[0].name}-2")
+
+
+def test_where_no_directory_can_be_made_none_is_looked_for_further(noon):
+    Path("runs").touch()
+    with pytest.raises(InputError, match="cannot write to runs"):
+        RunDirectory.create_by_date("Hopper-v4", MANIFEST)
 
 
 # Tables
