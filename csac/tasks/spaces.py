@@ -34,7 +34,12 @@ class ContractParts(NamedTuple):
 
 def observation_parts(space: spaces.Space) -> Parts:
     """Return the parts of a Box or Dict of Boxes in their flat order. Raises InputError for any other space."""
-    named = sorted(space.spaces.items()) if isinstance(space, spaces.Dict) else [(None, space)]
+    keys = list(space.spaces) if isinstance(space, spaces.Dict) else []
+    if unnamed := [key for key in keys if not isinstance(key, str)]:
+        raise InputError(
+            f"the observation has the key {unnamed[0]!r}, which is no text: give each part of the Dict a name"
+        )
+    named = [(key, space[key]) for key in sorted(keys)] if isinstance(space, spaces.Dict) else [(None, space)]
     for key, part in named:
         name = "the observation" if key is None else f"observation[{key!r}]"
         if not isinstance(part, spaces.Box):
@@ -46,6 +51,8 @@ def observation_parts(space: spaces.Space) -> Parts:
             raise InputError(
                 f"{name} is an image {part.low.shape}, which csac does not learn from: choose a vector of states"
             )
+        if key is not None and not part.low.size:
+            raise InputError(f"{name} is empty, a Box of shape {part.shape}: leave it out")
     parts = tuple((key, tuple(part.shape or ())) for key, part in named)
     if not size(parts):
         raise InputError("the observation is empty: there is nothing to learn from")
@@ -56,7 +63,7 @@ def action_parts(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray, np.n
     """Return shape and flat float32 bounds of a bounded Box of floats. Raises InputError for any other space."""
     if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
         raise InputError(f"the action space is {space} and csac takes continuous actions, a Box of floats")
-    low, high = _inner_float32(space.low, 1), _inner_float32(space.high, -1)
+    low, high = _float32_within(space.low.reshape(-1), space.high.reshape(-1))
     if not low.size:
         raise InputError("the action space is empty: there is nothing to learn")
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -67,13 +74,22 @@ def action_parts(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray, np.n
     return space.low.shape, low, high
 
 
-def _inner_float32(bound: np.ndarray, direction: int) -> np.ndarray:
-    """Round a bound to float32 towards the inside, so that a float64 Box holds what we send."""
-    exact = bound.reshape(-1)
+def _float32_within(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Round bounds to float32 towards the inside, so that a float64 Box holds what we send.
+
+    Where no float32 lies between them, both are the nearest.
+    """
     with np.errstate(over="ignore"):
-        rounded = exact.astype(np.float32)
-    outside = rounded < exact if direction > 0 else rounded > exact
-    return np.where(outside & np.isfinite(rounded), np.nextafter(rounded, np.float32(direction * np.inf)), rounded)
+        nearest_low, nearest_high = low.astype(np.float32), high.astype(np.float32)
+    inner_low = _moved(nearest_low, nearest_low < low, np.inf)
+    inner_high = _moved(nearest_high, nearest_high > high, -np.inf)
+    is_between = inner_low <= inner_high
+    return np.where(is_between, inner_low, nearest_low), np.where(is_between, inner_high, nearest_high)
+
+
+def _moved(rounded: np.ndarray, outside: np.ndarray, direction: float) -> np.ndarray:
+    """Return float32 numbers, those that lie outside as the next one in this direction."""
+    return np.where(outside & np.isfinite(rounded), np.nextafter(rounded, np.float32(direction)), rounded)
 
 
 def size(parts: Parts) -> int:

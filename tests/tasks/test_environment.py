@@ -99,6 +99,9 @@ def test_a_task_that_cannot_be_learnt_is_refused(task, message):
         ("observation_space", spaces.Dict(camera=spaces.Box(0, 255, (8, 8, 3), np.uint8)), "camera.*image"),
         ("observation_space", spaces.Dict(), "empty"),
         ("observation_space", spaces.Box(-1.0, 1.0, (0,)), "empty"),
+        ("observation_space", spaces.Dict(a=UNIT, b=spaces.Box(-1.0, 1.0, (0,))), r"observation\['b'\] is empty"),
+        ("observation_space", spaces.Dict({1: UNIT, 2: UNIT}), "the key 1, which is no text"),
+        ("observation_space", spaces.Dict({"a": UNIT, 1: UNIT}), "the key 1, which is no text"),
     ],
 )
 def test_a_space_that_cannot_be_learnt_is_refused(name, space, message):
@@ -230,6 +233,15 @@ def test_actions_lie_in_a_box_of_doubles_too():
         environment.step(np.array(action, np.float32))
     assert all(space.contains(action) for action in environment.raw.unwrapped.actions)  # pyright: ignore
     np.testing.assert_allclose(environment.contract_parts.action_high, space.high, rtol=1e-6)
+
+
+@pytest.mark.parametrize("width", [0.0, 1e-12])
+def test_bounds_between_which_no_float32_lies_are_the_nearest(width):
+    """Rounded inwards they were the wrong way round, and no contract with them can be opened again."""
+    space = spaces.Box(np.array([0.1, -1.0]), np.array([0.1 + width, 1.0]), dtype=np.float64)
+    parts = scripted(action_space=space).contract_parts
+    np.testing.assert_array_equal(parts.action_low, np.array([0.1, -1.0], np.float32))
+    np.testing.assert_array_equal(parts.action_high, np.array([0.1, 1.0], np.float32))
 
 
 def test_both_scales_are_one_environment():
