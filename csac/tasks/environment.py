@@ -8,8 +8,9 @@ import math
 import multiprocessing
 from collections.abc import Mapping
 from contextlib import nullcontext
-from typing import Any
+from typing import Any, Literal
 
+import gymnasium
 import numpy as np
 
 from csac.deploy.contract import ActionBounds
@@ -63,8 +64,8 @@ class Environment:
         self.has_memory = known.has_memory(task, self.raw)
         try:
             check_render_mode(self.raw, render_mode)
-            parts = observation_parts(self.raw.observation_space)
-            self.contract_parts = ContractParts(parts, *action_parts(self.raw.action_space))
+            parts = observation_parts(_space(self.raw, "observation_space"))
+            self.contract_parts = ContractParts(parts, *action_parts(_space(self.raw, "action_space")))
         except InputError as error:
             self.close()
             raise InputError(f"{self.task_name}: {error}") from None
@@ -195,6 +196,20 @@ class Environment:
         raw = {key: part.reshape(shape) for (key, shape), part in zip(self._parts, np.split(noisy, ends), strict=True)}
         self.raw_observation = raw.get(None, raw)
         return noisy
+
+
+def _space(environment: gymnasium.Env, name: Literal["observation_space", "action_space"]) -> gymnasium.Space:
+    """Return a space of an environment. Raises InputError where there is none, or one of another package."""
+    try:
+        space = getattr(environment, name)
+    except RAISED as error:
+        raise InputError(f"the environment gives no {name}: {one_line(error)}") from None
+    if not isinstance(space, gymnasium.Space):
+        kind = type(space)
+        raise InputError(
+            f"{name} is a {kind.__name__} of the module {kind.__module__}, and csac takes spaces of gymnasium"
+        )
+    return space
 
 
 def _say_once(task_name: str, notes: list[str]) -> None:

@@ -109,6 +109,32 @@ def test_a_space_that_cannot_be_learnt_is_refused(name, space, message):
         scripted(**{name: space})
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "gives no observation_space: AttributeError"),
+        ({"observation_space": UNIT}, "gives no action_space: AttributeError"),
+        ({"observation_space": UNIT, "action_space": None}, "action_space is a NoneType of the module builtins"),
+        (
+            {"observation_space": type("Box", (), {"__module__": "gym.spaces.box"})()},
+            "observation_space is a Box of the module gym.spaces.box, and csac takes spaces of gymnasium",
+        ),
+    ],
+)
+def test_an_environment_without_a_space_of_gymnasium_is_refused_and_closed(given, message):
+    closed = []
+
+    class Bare(gymnasium.Env):
+        def close(self):
+            closed.append(True)
+
+    for name, space in given.items():
+        setattr(Bare, name, space)
+    with pytest.raises(InputError, match=f"Bare: .*{message}"):
+        Environment(Bare)
+    assert closed
+
+
 def test_the_advice_for_actions_without_bounds_works():
     def task() -> gymnasium.Env:
         return Scripted(action_space=spaces.Box(-np.inf, np.inf, (2,)))
