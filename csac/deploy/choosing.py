@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from numbers import Integral
 from pathlib import Path
 from typing import get_args
@@ -34,7 +35,7 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
     if which not in get_args(Which):
         raise InputError(f"which={which!r}: choose 'last' or 'best'")
     folder = Path(directory)
-    if not is_run(folder) and (folder / SAVED).exists():
+    if not is_run(folder) and os.path.exists(folder / SAVED):
         return _saved(folder, seed, which)
     run = RunDirectory.open(directory)
     return Policy.load(run.policy(choose_seed(run, seed), which), Contract.load(run.contract))

@@ -214,7 +214,7 @@ def is_locked(path: str | Path) -> bool:
 
 def is_run(path: str | Path) -> bool:
     """Whether there is a run in this directory, sound or not."""
-    return (Path(path) / MANIFEST).exists()
+    return os.path.exists(Path(path) / MANIFEST)  # unlike Path.exists, it raises for no name
 
 
 def find_runs(directory: str | Path, on_damaged: Callable[[InputError], None] | None = None) -> list[RunDirectory]:
@@ -224,7 +224,7 @@ def find_runs(directory: str | Path, on_damaged: Callable[[InputError], None] | 
         InputError: there is no such directory.
     """
     directory = Path(directory)
-    if not directory.is_dir():
+    if not os.path.isdir(directory):
         raise InputError(f"there is no directory {directory}; give one that holds runs")
     runs = []
     for folder, below, files in os.walk(directory):

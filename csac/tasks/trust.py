@@ -31,7 +31,7 @@ def remember(task: object) -> None:
     """Note that the person at this keyboard has named this task, and so its module, if it can be noted."""
     place = _place(module_of(task))
     note = _note(module_of(task), place) if place else None
-    if note is None or note.exists():
+    if note is None or os.path.exists(note):
         return
     with suppress(OSError):
         note.parent.mkdir(parents=True, exist_ok=True)
@@ -56,7 +56,7 @@ def refuse_untrusted(task: object, run: str | Path, trust_task: bool = False) ->
     if place is None:
         raise InputError(f"{run} needs the module {module}, which is not found here: begin where it is, or install it")
     note = _note(module, place)
-    if note is None or not note.exists():
+    if note is None or not os.path.exists(note):
         raise InputError(
             f"{run} wants to run the code of {place} (its task is {task}), which you have not named before: "
             "look at it, and if you trust it, add --trust-task (in Python: trust_task=True)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from pathlib import Path
@@ -169,7 +170,7 @@ class Source(NamedTuple):
             InputError: no such run or checkpoint, or a damaged one.
         """
         name, at, step = str(where).rpartition("@")
-        if not at or Path(where).exists():
+        if not at or os.path.exists(where):
             name, step = str(where), ""
         run = RunDirectory.open(name)
         if step and not (step.isascii() and re.fullmatch(r"\d+(_\d+)*", step) and len(step) <= 20):

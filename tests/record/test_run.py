@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from csac.deploy.choosing import load
 from csac.record import run as record
 from csac.record.atomic import write_atomically
 from csac.record.csv_tables import COLUMNS, check_new, read_rows, write_rows
@@ -226,6 +227,18 @@ def test_a_damaged_run_is_told_and_what_is_below_it_found(tmp_path):
 def test_looking_for_runs_where_there_is_no_directory(tmp_path):
     with pytest.raises(InputError, match="there is no directory"):
         find_runs(tmp_path / "nowhere")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the limit of names of POSIX")
+def test_a_name_that_no_file_can_have_is_refused_in_a_line():
+    """Asking whether it is there raised, and that was a traceback."""
+    long = "x" * 300
+    assert not record.is_run(long)
+    for use in (find_runs, RunDirectory.open, load):
+        with pytest.raises(InputError, match=long):
+            use(long)
+    with pytest.raises(InputError, match="File name too long"):
+        RunDirectory.create(long, MANIFEST)
 
 
 @pytest.fixture

@@ -145,9 +145,10 @@ def test_what_cannot_be_a_module_is_not_found(task):
     trust.remember(task)
 
 
-def test_where_nothing_can_be_noted_one_is_asked_each_time(stranger, monkeypatch):
+@pytest.mark.parametrize("state", [os.devnull, f"/{'x' * 300}"])
+def test_where_nothing_can_be_noted_one_is_asked_each_time(stranger, monkeypatch, state):
     monkeypatch.syspath_prepend(stranger.folder)
-    monkeypatch.setenv("XDG_STATE_HOME", os.devnull)
+    monkeypatch.setenv("XDG_STATE_HOME", state)
     trust.refuse_untrusted("stranger:Stranger-v0", "run", trust_task=True)
     with pytest.raises(InputError, match="add --trust-task"):
         trust.refuse_untrusted("stranger:Stranger-v0", "run")

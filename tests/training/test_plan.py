@@ -13,7 +13,8 @@ import pytest
 from csac import PPO, SAC, train
 from csac.training import provenance
 from csac.training.options import Options, PlanOptions, checked_options
-from csac.training.plan import Plan
+from csac.training.plan import Before, Plan
+from csac.training.resume import Source
 from csac.training.train import _warmup_note
 from csac.types import InputError
 
@@ -101,6 +102,13 @@ def test_a_run_in_which_nothing_is_learnt_says_so(algorithm, steps, why):
 
     assert notes(steps) == [f"note: nothing will be learnt, {why}"]
     assert notes(steps + 1) == []
+
+
+def test_a_source_that_no_folder_can_be_called_is_refused_in_a_line():
+    for where in ("x" * 300, f"{'x' * 300}@10"):
+        with pytest.raises(InputError, match="cannot read"):
+            Source.find(where)
+    assert Before.find("x" * 300, True, None).existing is None
 
 
 def test_numpy_numbers_are_numbers():
