@@ -168,7 +168,7 @@ class RunDirectory:
     def locked(self) -> Iterator[None]:
         """Keep other processes from writing to this run. The system gives the lock back if this process dies.
 
-        Raises InputError where another process holds it.
+        Raises InputError where another process holds it, or the file system has none to give.
         """
         with self._open_lock() as file:
             if fcntl:
@@ -178,6 +178,10 @@ class RunDirectory:
                     file.seek(0)
                     holder = file.read().strip() or "unknown"
                     raise InputError(f"{self.path} is in use by process {holder}: wait for it, or stop it") from None
+                except OSError as error:  # Lustre, or NFS, where nobody serves them
+                    raise InputError(
+                        f"the file system of {self.path} has no locks ({error.strerror}): choose a directory on another"
+                    ) from None
             file.truncate(0)
             file.write(f"{os.getpid()}\n")
             file.flush()

@@ -26,6 +26,8 @@ _CANNOT_WRITE = (
     errno.EFBIG,
     errno.EMFILE,
     errno.ENFILE,
+    errno.ESTALE,
+    errno.ETIMEDOUT,
 )
 
 

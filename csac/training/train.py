@@ -124,7 +124,7 @@ def train(
         run = before.create(plan, dataclasses.replace(wanted, forked_from=origin))
     else:
         run = before.create(plan, wanted)
-    with run.locked(), storage_failures_told(run, watchers.failures):
+    with storage_failures_told(run, watchers.failures), run.locked():
         if before.existing:
             run.read_again()  # another process may have gone on with it, and ended, before we had the lock
             refuse_differences(run, wanted, has_schedule, defaults)

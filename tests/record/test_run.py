@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import tempfile
@@ -239,6 +240,16 @@ def test_a_name_that_no_file_can_have_is_refused_in_a_line():
             use(long)
     with pytest.raises(InputError, match="File name too long"):
         RunDirectory.create(long, MANIFEST)
+
+
+@pytest.mark.skipif(record.fcntl is None, reason="a system with locks")
+def test_a_file_system_without_locks_is_refused_in_a_line(run, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(record.fcntl, "flock", flock)
+    with pytest.raises(InputError, match=r"has no locks \(No locks available\): choose a directory"), run.locked():
+        pass
 
 
 @pytest.fixture

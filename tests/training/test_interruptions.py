@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from csac.training.interruptions import caught_signals, signals_noted
+from csac import SAC, train
+from csac.record.run import RunDirectory, StorageFailure
+from csac.training.interruptions import caught_signals, signals_noted, storage_failures_told
 
 SWALLOWING = """
 import os, signal
@@ -86,3 +93,22 @@ def test_a_signal_that_comes_too_late_for_a_run_alone_is_over_with_it():
         signal.raise_signal(signal.SIGINT)
     with caught_signals() as (stop, received):
         assert (stop.is_set(), received) == (False, [])
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.ESTALE, errno.ETIMEDOUT])
+def test_a_file_system_that_has_gone_is_told_in_a_line(number):
+    run: Any = SimpleNamespace(path="runs/one")
+    told = pytest.raises(StorageFailure, match=f"runs/one cannot be written: {os.strerror(number)}")
+    with told, storage_failures_told(run):
+        raise OSError(number, os.strerror(number))
+
+
+def test_a_disk_that_is_full_when_the_run_is_locked_is_told_in_a_line(tmp_path, monkeypatch):
+    @contextmanager
+    def locked(run: RunDirectory) -> Iterator[None]:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        yield
+
+    monkeypatch.setattr(RunDirectory, "locked", locked)
+    with pytest.raises(StorageFailure, match="cannot be written: No space left on device"):
+        train(SAC(), "Pendulum-v1", directory=tmp_path / "run", steps=10)
