@@ -182,8 +182,17 @@ class Source(NamedTuple):
             raise InputError("; ".join(complaints) or f"{run.path} has no checkpoint yet")
         return cls(run, checkpoint)
 
-    def refuse_misfit(self, wanted: Manifest, has_schedule: bool, misfit: Callable[[Snapshot], str | None]) -> None:
-        """Raise InputError where the new run cannot begin with this checkpoint; `misfit` says why its arrays do not."""
+    def refuse_misfit(
+        self,
+        wanted: Manifest,
+        has_schedule: bool,
+        defaults: Mapping[str, Any],
+        misfit: Callable[[Snapshot], str | None],
+    ) -> None:
+        """Raise InputError where the new run cannot begin with this checkpoint; `misfit` says why its arrays do not.
+
+        `defaults` are as in `refuse_differences`.
+        """
         before = self.run.manifest
         names = ("algorithm", "events")  # of whose tables the new run's are a continuation
         found = differences({name: getattr(before, name) for name in names}, {n: getattr(wanted, n) for n in names})
@@ -193,6 +202,8 @@ class Source(NamedTuple):
             found.append(f"it has no seeds {', '.join(map(str, missing))}")
         elif not living:
             found.append(f"every seed asked for had failed by step {self.checkpoint.step}; begin with an earlier step")
+        if not found and _normalises(before, defaults) != _normalises(wanted, defaults):
+            found.append("its networks have learnt what they see with the other choice of normalise_observations")
         if not found and has_schedule and wanted.steps != before.steps:
             found.append(
                 f"it was planned for {before.steps:,} steps, and its learning rate with it (a schedule): give as many"
@@ -247,6 +258,11 @@ def _fixed(manifest: Manifest, defaults: Mapping[str, Any]) -> dict[str, Any]:
     fixed["evaluation"] = vars(manifest.evaluation)
     fixed["hyperparameters"] = {**defaults, **manifest.hyperparameters}
     return fixed
+
+
+def _normalises(manifest: Manifest, defaults: Mapping[str, Any]) -> bool:
+    """Whether the networks of a run see observations on a common scale. PPO has the statistics in any case."""
+    return bool({**defaults, **manifest.hyperparameters}.get("normalise_observations"))
 
 
 def _machine_changes(before: Manifest, wanted: Manifest) -> list[str]:

@@ -119,7 +119,7 @@ def train(
         refuse_differences(run, wanted, has_schedule, defaults)
     elif before.source:
         fits = functools.partial(misfit, algorithm, spec, plan.steps)
-        before.source.refuse_misfit(wanted, has_schedule, fits)
+        before.source.refuse_misfit(wanted, has_schedule, defaults, fits)
         origin = before.source.described(wanted, defaults)
         run = before.create(plan, dataclasses.replace(wanted, forked_from=origin))
     else:

@@ -13,11 +13,13 @@ import safetensors.numpy
 import trainer  # noqa: F401  (its cache of compiled programs)
 
 from csac.algorithms import ALGORITHMS, CSAC, TD3
+from csac.algorithms.memory import row_width
 from csac.tasks.seeds import Steps
 from csac.training.checkpoint import SCHEMA_VERSION, Checkpoint, Checkpoints, Damaged
-from csac.training.learner import Learner
+from csac.training.learner import Learner, misfit
+from csac.training.packing import by_name
 from csac.training.seed_files import SeedFiles
-from csac.types import Spec
+from csac.types import Snapshot, Spec
 
 SPEC = Spec(3, 1)
 TINY: dict[str, Any] = {"actor_hidden_sizes": (4,), "critic_hidden_sizes": (4,), "batch_size": 8, "warmup_steps": 2}
@@ -76,6 +78,28 @@ def test_what_was_saved_of_each_seed_is_taken_back(seeds):
             np.testing.assert_array_equal(ours, theirs)
     assert again.metrics() == learner.metrics()
     np.testing.assert_array_equal(advance(again, len(seeds), 11, 14), advance(learner, len(seeds), 11, 14))
+
+
+def state_of(algorithm: CSAC) -> Snapshot:
+    """What would be saved of it, of zeros."""
+    state = jax.eval_shape(lambda: algorithm.init(jax.random.key(0), SPEC, 100))
+    arrays = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in by_name({"state": state}).items()}
+    return Snapshot({**arrays, "waiting": np.zeros((1, row_width(SPEC)), np.float32)}, {})
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "problem"),
+    [
+        ({"entropy_weight": "auto"}, {}, None),
+        ({"relative_entropy_weight": "auto"}, {}, None),
+        ({}, {"relative_entropy_weight": "auto"}, "state.learnt_weights"),
+        ({"policy_delay": 2}, {}, None),
+        ({}, {"policy_delay": 2}, "state.actor_metrics"),
+    ],
+)
+def test_what_a_checkpoint_has_fits_or_is_refused(before, after, problem):
+    found = misfit(CSAC(**TINY, **after), SPEC, 100, state_of(CSAC(**TINY, **before)))
+    assert found is None if problem is None else problem in found
 
 
 SETTINGS = [(name, {}) for name in ALGORITHMS] + [("csac", {"reference_policy": "algorithm1"})]

@@ -7,8 +7,9 @@ import os
 import shutil
 import signal
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -19,7 +20,8 @@ import trainer  # noqa: F401  (its cache of compiled programs)
 from plans import settings
 from resuming import ADAPTIVE, LEARNERS, ROLLOUT, Crash, contents, crash_at, run
 
-from csac.record.manifest import Origin
+from csac.algorithms import CSAC, PPO
+from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, steps_in
@@ -568,6 +570,21 @@ def test_a_fork_that_does_not_fit_is_refused(tmp_path, short_run, where, change,
     with pytest.raises(InputError, match=message):
         run(tmp_path / "second", **{"steps": 400, "start_from": f"{short_run}{where}", **change})
     assert not (tmp_path / "second").exists()
+
+
+@pytest.mark.parametrize("algorithm", [CSAC(), PPO()], ids=lambda algorithm: algorithm.name)
+@pytest.mark.parametrize("before", [True, False])
+def test_a_fork_that_would_see_observations_on_another_scale_is_refused(algorithm, before):
+    """PPO's checkpoint has the statistics in any case; CSAC's had them, and they were left aside."""
+
+    def of(normalises: bool) -> Manifest:
+        changed = asdict(replace(algorithm, normalise_observations=normalises))
+        return Manifest(task="Hopper-v4", algorithm=algorithm.name, hyperparameters=changed, seeds=(0,), steps=400)
+
+    made: Any = SimpleNamespace(path="runs/one", manifest=of(before))
+    checkpoint: Any = SimpleNamespace(step=100, values={"failures": {}})
+    with pytest.raises(InputError, match="the other choice of normalise_observations"):
+        Source(made, checkpoint).refuse_misfit(of(not before), False, {}, lambda _: None)
 
 
 def test_a_replay_that_has_forgotten_transitions_cannot_become_larger(tmp_path):
