@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
@@ -64,7 +65,7 @@ class Restart(NamedTuple):
             lines.append(f"note: not the same to the last bit from here on, because {' and '.join(changes)}")
         if before.inexact_seeds:
             seeds = ", ".join(map(str, before.inexact_seeds))
-            lines.append(f"note: this task cannot be saved in mid-episode: seeds {seeds} begin their episode anew")
+            lines.append(f"note: the checkpoint has no episode that can go on: seeds {seeds} begin theirs anew")
         return lines
 
     def continuation(self, before: Manifest, wanted: Manifest) -> Continuation:
@@ -197,7 +198,7 @@ class Source(NamedTuple):
         names = ("algorithm", "events")  # of whose tables the new run's are a continuation
         found = differences({name: getattr(before, name) for name in names}, {n: getattr(wanted, n) for n in names})
         missing = sorted(set(wanted.seeds) - set(before.seeds))
-        living = [seed for seed in wanted.seeds if str(seed) not in self.checkpoint.values["failures"]]
+        living = self._living(wanted)
         if missing:
             found.append(f"it has no seeds {', '.join(map(str, missing))}")
         elif not living:
@@ -227,6 +228,16 @@ class Source(NamedTuple):
         """Return what the manifest says of where the new run began, and of what is different in it."""
         changes = differences(_fixed(self.run.manifest, defaults), _fixed(wanted, defaults))
         return Origin(str(self.run.path), self.checkpoint.step, tuple(changes))
+
+    def begun(self, wanted: Manifest, defaults: Mapping[str, Any]) -> Manifest:
+        """Return the manifest with which the new run is made: which seeds begin their episode anew is known by now."""
+        before = self.run.manifest
+        anew = self._living(wanted) if before.task != wanted.task else before.inexact_seeds
+        inexact = tuple(seed for seed in wanted.seeds if seed in anew)
+        return replace(wanted, forked_from=self.described(wanted, defaults), inexact_seeds=inexact)
+
+    def _living(self, wanted: Manifest) -> list[int]:
+        return [seed for seed in wanted.seeds if str(seed) not in self.checkpoint.values["failures"]]
 
     def copy_to(self, run: RunDirectory, keep: int) -> None:
         """Give a new run the tables up to the checkpoint, and the checkpoint."""

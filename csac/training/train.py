@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from csac.console.progress import Reporter
-    from csac.record.manifest import State
+    from csac.record.manifest import Manifest, State
     from csac.record.scalars import Log
     from csac.tasks.making import Task
     from csac.training.options import PlanOptions
@@ -120,8 +120,7 @@ def train(
     elif before.source:
         fits = functools.partial(misfit, algorithm, spec, plan.steps)
         before.source.refuse_misfit(wanted, has_schedule, defaults, fits)
-        origin = before.source.described(wanted, defaults)
-        run = before.create(plan, dataclasses.replace(wanted, forked_from=origin))
+        run = before.create(plan, before.source.begun(wanted, defaults))
     else:
         run = before.create(plan, wanted)
     with storage_failures_told(run, watchers.failures), run.locked():
@@ -130,8 +129,11 @@ def train(
             refuse_differences(run, wanted, has_schedule, defaults)
         if before.source:
             before.source.copy_to(run, plan.keep_checkpoints)
-        if before.existing or before.source:
-            return _go_on(run, plan, wanted, notes, watchers)
+            made = before.source.run.manifest
+            made = dataclasses.replace(made, inexact_seeds=run.manifest.inexact_seeds)
+            return _go_on(run, plan, made, wanted, notes, watchers)
+        if before.existing:
+            return _go_on(run, plan, run.manifest, wanted, notes, watchers)
         return _run(run, plan, notes, watchers, BEGINNING)
 
 
@@ -212,10 +214,11 @@ class Watchers(NamedTuple):
         return enough
 
 
-def _go_on(run: RunDirectory, plan: Plan, wanted: Any, notes: list[str], watchers: Watchers) -> RunDirectory:
-    """Go on with a run from its newest sound checkpoint."""
-    before = run.manifest
-    if before.state in ("finished", "failed") and before.steps_done >= plan.steps:
+def _go_on(
+    run: RunDirectory, plan: Plan, before: Manifest, wanted: Manifest, notes: list[str], watchers: Watchers
+) -> RunDirectory:
+    """Go on with a run from its newest sound checkpoint, which was made as `before` says."""
+    if run.manifest.state in ("finished", "failed") and run.manifest.steps_done >= plan.steps:
         if watchers.reporter:
             watchers.reporter.note(f"{run.path} has made its {plan.steps:,} steps already; more: --steps")
         return run
@@ -224,7 +227,7 @@ def _go_on(run: RunDirectory, plan: Plan, wanted: Any, notes: list[str], watcher
     run.update_manifest(
         **{name: getattr(wanted, name) for name in current},
         state="running",
-        history=(*before.history, restart.continuation(before, wanted)),
+        history=(*run.manifest.history, restart.continuation(before, wanted)),
         failures=restart.failures,
         steps_done=restart.step,
     )

@@ -27,7 +27,7 @@ from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, steps_in
 from csac.training.group import Group
 from csac.training.learner import Learner
-from csac.training.resume import Source
+from csac.training.resume import Restart, Source
 from csac.training.scheduler import run_groups
 from csac.training.train import resume
 from csac.types import InputError
@@ -602,6 +602,40 @@ def test_a_fork_to_another_task_begins_its_episode_anew(tmp_path):
     assert (forked.manifest.state, forked.manifest.steps_done) == ("finished", 200)
     changes = ("task is 'HalfCheetah-v4', not 'Walker2d-v4'",)
     assert forked.manifest.forked_from == Origin(str(tmp_path / "first"), 130, changes)
+    assert [entry.exact for entry in forked.manifest.history] == [False]
+
+
+def test_a_fork_says_where_it_is_not_what_its_source_would_have_gone_on_to_be(tmp_path):
+    """Its own manifest, which is new, was asked what had changed, and which episodes cannot go on."""
+    first = run(tmp_path / "first", LEARNERS[1], 90, probes.Endless, seeds=2)
+    first.update_manifest(versions={**first.manifest.versions, "jax": "0.1"})
+    forked = run(tmp_path / "second", LEARNERS[1], 100, probes.Endless, start_from=first.path, first_seed=1)
+    (entry,) = forked.manifest.history
+    assert (entry.exact, entry.previous["versions"]["jax"], entry.previous["groups"]) == (False, "0.1", [[0, 1]])
+
+
+def fork_of(manifest: Manifest, **changes: Any) -> Manifest:
+    made: Any = SimpleNamespace(path="runs/one", manifest=manifest)
+    checkpoint: Any = SimpleNamespace(step=100, values={"failures": {"2": "step 50: it fell"}})
+    return Source(made, checkpoint).begun(replace(manifest, inexact_seeds=(), **changes), {})
+
+
+def test_a_continuation_is_exact_only_if_every_episode_goes_on():
+    manifest = Manifest(task="Hopper-v4", algorithm="sac", seeds=(0, 1), steps=400)
+    inexact = replace(manifest, inexact_seeds=(1,))
+    restart = Restart(100, {}, [], [])
+    assert restart.continuation(manifest, manifest).exact
+    assert not restart.continuation(inexact, manifest).exact
+    said = "note: the checkpoint has no episode that can go on: seeds 1 begin theirs anew"
+    assert (said in restart.notes(inexact, manifest), said in restart.notes(manifest, manifest)) == (True, False)
+
+
+def test_a_fork_knows_which_of_its_seeds_begin_their_episode_anew():
+    source = Manifest(task="Hopper-v4", algorithm="sac", seeds=(0, 1, 2), steps=400, inexact_seeds=(0, 1))
+    assert fork_of(source).inexact_seeds == (0, 1)
+    assert fork_of(source, seeds=(1, 2)).inexact_seeds == (1,)
+    assert fork_of(replace(source, inexact_seeds=())).inexact_seeds == ()
+    assert fork_of(replace(source, inexact_seeds=()), task="Walker2d-v4").inexact_seeds == (0, 1)
 
 
 def test_where_no_checkpoints_are_wanted_none_is_made_after_one_either(tmp_path, short_run):
