@@ -75,7 +75,7 @@ class Continuation:
     complaints: tuple[str, ...] = ()
     command: str | None = None
     previous: dict[str, Any] = field(default_factory=dict)
-    """What was otherwise before: steps, machine, versions, groups."""
+    """What was otherwise before: steps, machine, versions, commit, groups."""
 
 
 @dataclass(frozen=True, kw_only=True)

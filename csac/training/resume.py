@@ -75,6 +75,7 @@ class Restart(NamedTuple):
             "steps": before.steps,
             "machine": vars(before.machine),
             "versions": before.versions,
+            "commit": before.commit,
             "groups": before.groups,
         }
         return Continuation(now(), self.step, exact, tuple(self.complaints), wanted.command, previous)
@@ -284,6 +285,7 @@ def _machine_changes(before: Manifest, wanted: Manifest) -> list[str]:
         "grouping of the seeds": ([list(group) for group in before.groups], [list(group) for group in wanted.groups]),
         "device": (before.device, wanted.device),
     }
-    for package in ("jaxlib", "jax", "mujoco", "gymnasium", "numpy", "optax"):
-        pairs[package] = (before.versions.get(package), wanted.versions.get(package))
+    for package in sorted(before.versions.keys() | wanted.versions.keys()):
+        pairs[f"version of {package}"] = (before.versions.get(package), wanted.versions.get(package))
+    pairs["commit of csac"] = (before.commit, wanted.commit)
     return [f"the {name} was {old} and is {new}" for name, (old, new) in pairs.items() if old != new]

@@ -223,7 +223,7 @@ def _go_on(
             watchers.reporter.note(f"{run.path} has made its {plan.steps:,} steps already; more: --steps")
         return run
     restart = roll_back(run)
-    current = ("machine", "versions", "groups", "steps", "process", "device", "checkpoints")
+    current = ("machine", "versions", "commit", "groups", "steps", "process", "device", "checkpoints")
     run.update_manifest(
         **{name: getattr(wanted, name) for name in current},
         state="running",

@@ -630,6 +630,33 @@ def test_a_continuation_is_exact_only_if_every_episode_goes_on():
     assert (said in restart.notes(inexact, manifest), said in restart.notes(manifest, manifest)) == (True, False)
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"commit": "b"}, "the commit of csac was a and is b"),
+        ({"versions": {"csac": "2", "python": "3.11.7"}}, "the version of csac was 1 and is 2"),
+        ({"versions": {"csac": "1", "python": "3.12.0"}}, "the version of python was 3.11.7 and is 3.12.0"),
+        ({"versions": {"csac": "1", "python": "3.11.7", "pybullet": "3"}}, "the version of pybullet was None and is 3"),
+    ],
+)
+def test_whatever_else_computes_is_noticed(change, said):
+    versions = {"csac": "1", "python": "3.11.7"}
+    before = Manifest(task="Hopper-v4", algorithm="sac", seeds=(0,), steps=400, versions=versions, commit="a")
+    now, restart = replace(before, **change), Restart(100, {}, [], [])
+    entry = restart.continuation(before, now)
+    assert (entry.exact, entry.previous["commit"]) == (False, "a")
+    assert any(said in note for note in restart.notes(before, now))
+
+
+def test_the_commit_of_a_run_is_the_one_that_it_goes_on_with(finished):
+    run = RunDirectory.open(finished)
+    ours = run.manifest.commit
+    run.update_manifest(commit="0" * 40)
+    (entry,) = resume(finished, steps=140).manifest.history
+    assert (entry.exact, entry.previous["commit"]) == (False, "0" * 40)
+    assert RunDirectory.open(finished).manifest.commit == ours
+
+
 def test_a_fork_knows_which_of_its_seeds_begin_their_episode_anew():
     source = Manifest(task="Hopper-v4", algorithm="sac", seeds=(0, 1, 2), steps=400, inexact_seeds=(0, 1))
     assert fork_of(source).inexact_seeds == (0, 1)
