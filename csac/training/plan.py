@@ -19,6 +19,7 @@ from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.seeds import EVALUATION_SEED, FIRST_TRAINING_SEED
 from csac.tasks.trust import remember
+from csac.training.checkpoint import steps_in
 from csac.training.devices import choose_device
 from csac.training.options import Options, checked_options
 from csac.training.resume import Source, planned_perturbations
@@ -82,13 +83,17 @@ class Before(NamedTuple):
     directory: Path | None
     existing: RunDirectory | None
     source: Source | None
+    unbegun: RunDirectory | None = None
+    """A fork that was made and never had its checkpoint, which is copied once more."""
 
     @classmethod
     def find(cls, directory: str | Path | None, resume: bool, start_from: str | Path | None) -> Before:
         """Look for what is to be continued. Raises InputError where it cannot be."""
         path = None if directory is None else Path(directory)
         existing = RunDirectory.open(path) if path and resume and is_run(path) else None
-        return cls(path, existing, Source.find(start_from) if start_from is not None and not existing else None)
+        if start_from is None or (existing and _has_begun(existing)):
+            return cls(path, existing, None)
+        return cls(path, None, Source.find(start_from), existing)
 
     @property
     def run(self) -> RunDirectory | None:
@@ -97,9 +102,27 @@ class Before(NamedTuple):
 
     def create(self, plan: Plan, manifest: Manifest) -> RunDirectory:
         """Start the new run in the directory that was named, or in one of its own. Raises InputError."""
+        if self.unbegun:
+            return self.unbegun
         if self.directory:
             return RunDirectory.create(self.directory, manifest)
         return RunDirectory.create_by_date(plan.task_name, manifest)
+
+    def copy_source(self, run: RunDirectory, manifest: Manifest) -> None:
+        """Give a new run, which is locked, the checkpoint that it begins with. Raises InputError."""
+        assert self.source
+        if self.unbegun:
+            run.read_again()
+            if _has_begun(run):
+                raise InputError(f"{run.path} has begun meanwhile: resume it")
+            run.update_manifest(**{**vars(manifest), "created": run.manifest.created})
+        self.source.copy_to(run, manifest.checkpoints.keep)
+
+
+def _has_begun(run: RunDirectory) -> bool:
+    """Whether there is anything to go on with: not in a fork that was stopped before it had its checkpoint."""
+    manifest = run.manifest
+    return bool(not manifest.forked_from or manifest.history or steps_in(run.checkpoints))
 
 
 def make_plan(

@@ -141,7 +141,9 @@ def roll_back(run: RunDirectory) -> Restart:
     if checkpoint is None and complaints:
         raise InputError(f"no checkpoint of {run.path} is sound: {'; '.join(complaints)}")
     if checkpoint is None and run.manifest.forked_from:
-        raise InputError(f"{run.path} was stopped before it had its first checkpoint: remove it and train --from again")
+        raise InputError(
+            f"{run.path} was stopped before its first checkpoint: repeat its command, --from included, with --resume"
+        )
     if checkpoint is None and _would_lose_results(run):
         raise InputError(
             f"{run.path} has results and no checkpoint to go on from, and would begin anew: train in another directory"
@@ -246,7 +248,7 @@ class Source(NamedTuple):
         failures = self.checkpoint.values["failures"].items()
         values = {**self.checkpoint.values, "failures": {k: v for k, v in failures if int(k) in run.manifest.seeds}}
         if self.run.contract.exists():
-            run.contract.parent.mkdir()
+            run.contract.parent.mkdir(exist_ok=True)
             shutil.copyfile(self.run.contract, run.contract)
         Checkpoints(run.checkpoints, keep).commit(self.checkpoint.step, files, values)
 

@@ -112,7 +112,7 @@ def train(
     before = Before.find(directory, resume, start_from)
     plan, spec = make_plan(algorithm, task, options, before, may_evaluate_beside=stop_when is None)
     notes = [memory_needed(plan, spec), *_warmup_note(plan)]
-    wanted = as_kept(plan.manifest(**provenance(task, command)))
+    manifest = wanted = as_kept(plan.manifest(**provenance(task, command)))
     has_schedule, defaults = algorithm.cadence.has_schedule, _defaults(algorithm)
     if before.existing:
         run = before.existing
@@ -120,7 +120,8 @@ def train(
     elif before.source:
         fits = functools.partial(misfit, algorithm, spec, plan.steps)
         before.source.refuse_misfit(wanted, has_schedule, defaults, fits)
-        run = before.create(plan, before.source.begun(wanted, defaults))
+        manifest = before.source.begun(wanted, defaults)
+        run = before.create(plan, manifest)
     else:
         run = before.create(plan, wanted)
     with storage_failures_told(run, watchers.failures), run.locked():
@@ -128,7 +129,7 @@ def train(
             run.read_again()  # another process may have gone on with it, and ended, before we had the lock
             refuse_differences(run, wanted, has_schedule, defaults)
         if before.source:
-            before.source.copy_to(run, plan.keep_checkpoints)
+            before.copy_source(run, manifest)
             made = before.source.run.manifest
             made = dataclasses.replace(made, inexact_seeds=run.manifest.inexact_seeds)
             return _go_on(run, plan, made, wanted, notes, watchers)

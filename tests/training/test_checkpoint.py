@@ -27,7 +27,7 @@ from csac import cli
 from csac.algorithms import CSAC
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.record.manifest import Manifest
+from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.record.tensorboard import TensorBoardLog
 from csac.tasks.seeds import SeedEnvironments
@@ -731,24 +731,30 @@ def test_a_manifest_is_never_seen_empty(tmp_path, monkeypatch):
         RunDirectory.create(tmp_path / "run", Manifest(task="t", algorithm="a", seeds=(0,), steps=1))
 
 
-def test_a_fork_killed_before_it_had_its_checkpoint_does_not_begin_from_nothing(tmp_path, monkeypatch):
+def test_a_fork_killed_before_it_had_its_checkpoint_copies_once_more(tmp_path, monkeypatch):
+    """By then its source has made other checkpoints."""
     first = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "first", **SHORT)
 
     def killed(*_: Any) -> None:
         raise KeyboardInterrupt
 
+    def fork(**options: Any) -> RunDirectory:
+        given = {"directory": tmp_path / "fork", "start_from": first.path, **LONGER, **options}
+        return train(CSAC(**SMALL), "Hopper-v4", **given)
+
     with monkeypatch.context() as patched:
         patched.setattr(Checkpoints, "commit", killed)
         with pytest.raises(KeyboardInterrupt):
-            train(
-                CSAC(**SMALL),
-                "Hopper-v4",
-                directory=tmp_path / "fork",
-                start_from=first.path,
-                **LONGER,
-            )
-    with pytest.raises(InputError, match="remove it and train --from again"):
+            fork()
+    with pytest.raises(InputError, match="repeat its command, --from included, with --resume"):
         resume(tmp_path / "fork")
+    resume(first.path, steps=500)
+    with pytest.raises(InputError, match="already holds a run"):
+        fork(steps=600)
+    again = fork(steps=600, resume=True)
+    assert (again.manifest.forked_from, again.manifest.state) == (Origin(str(first.path), 500), "finished")
+    resume(first.path, steps=600)
+    assert tables(again.path) == tables(first.path)
 
 
 def test_a_fork_that_wants_no_checkpoints_begins_with_one_all_the_same(tmp_path):
