@@ -174,13 +174,12 @@ class Source(NamedTuple):
             InputError: no such run or checkpoint, or a damaged one.
         """
         name, at, step = str(where).rpartition("@")
-        if not at or os.path.exists(where):
-            name, step = str(where), ""
-        run = RunDirectory.open(name)
-        if step and not (step.isascii() and re.fullmatch(r"\d+(_\d+)*", step) and len(step) <= 20):
-            raise InputError(f"{where}: {step!r} is not a step; write DIRECTORY@STEP")
-        if step:
+        if at and not os.path.exists(where):
+            run = RunDirectory.open(name)
+            if not (step.isascii() and re.fullmatch(r"\d+(_\d+)*", step) and len(step) <= 20):
+                raise InputError(f"{where}: {step!r} is not a step; write DIRECTORY@STEP")
             return cls(run, sound_at(run.checkpoints, int(step)))
+        run = RunDirectory.open(where)
         checkpoint, complaints = newest_sound(run.checkpoints)
         if checkpoint is None:
             raise InputError("; ".join(complaints) or f"{run.path} has no checkpoint yet")

@@ -556,6 +556,7 @@ def test_a_fork_with_some_of_the_seeds_has_nothing_of_the_others(tmp_path):
     [
         ("@100", {}, "no checkpoint of step 100; it has 120, 130"),
         ("@soon", {}, "'soon' is not a step"),
+        ("@", {}, "'' is not a step; write DIRECTORY@STEP"),
         ("@10_", {}, "'10_' is not a step"),
         ("@1__0", {}, "'1__0' is not a step"),
         ("x", {}, "does not exist"),
