@@ -129,6 +129,7 @@ def _train(arguments: list[str]) -> int:
             reporter=Reporter(),
             command=shlex.join(["csac", "train", *arguments]),
             **options.plan_options(),
+            **chosen.inherited(),
         )
     )
 

@@ -363,6 +363,10 @@ class Chosen(NamedTuple):
             base.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace=documented
         )
 
+    def inherited(self) -> PlanOptions:
+        """Return what a run takes from the one that it begins with and no option tells."""
+        return {"evaluation_seed": self.source.evaluation.first_seed} if self.source else {}
+
     def others(self) -> dict[str, type[Any]]:
         """Return the algorithms that were not chosen, by name."""
         from csac.algorithms import ALGORITHMS

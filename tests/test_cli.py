@@ -273,13 +273,15 @@ def test_train_without_options_uses_the_defaults(train_call):
 )
 def test_a_fork_is_perturbed_as_its_source_unless_told_otherwise(train_call, monkeypatch, options, perturbations):
     source = make_run("source", "Hopper-v4", 11, [-1.0] * 3, [1.0] * 3)
-    source.update_manifest(perturbations=["friction=2@60"], evaluation=EvaluationPlan(10, 1), environment_arguments={})
+    evaluation = EvaluationPlan(10, 1, 3_000_000)
+    source.update_manifest(perturbations=["friction=2@60"], evaluation=evaluation, environment_arguments={})
     monkeypatch.setattr(Source, "find", lambda where: Source(source, Checkpoint(Path("none"), 50, {}, {})))
 
     call = train_call(f"Hopper-v4 --from source@50 {options}")
 
     assert call["perturbations"] == perturbations
     assert call["start_from"] == "source@50"
+    assert call["evaluation_seed"] == 3_000_000  # which no option tells
 
 
 @pytest.mark.parametrize("name", sorted(ALGORITHMS))
