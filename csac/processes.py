@@ -36,7 +36,8 @@ def move_to(cores: Sequence[int]) -> None:
     """Let every thread of this process run on these processors alone, where the system knows of such a thing."""
     if hasattr(os, "sched_setaffinity"):
         for thread in os.listdir("/proc/self/task"):
-            os.sched_setaffinity(int(thread), cores)
+            with suppress(ProcessLookupError):  # it has ended meanwhile
+                os.sched_setaffinity(int(thread), cores)
 
 
 def die_with_parent() -> None:

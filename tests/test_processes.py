@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 
 import pytest
 
-from csac.processes import Child, cause_of_death
+from csac.processes import Child, cause_of_death, move_to
 
 
 def end(_: Connection, how: str) -> None:
@@ -59,3 +59,18 @@ def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
     lines = result.stderr.strip().splitlines()
     assert "InputError: this script starts processes that import it" in lines[-1]
     assert sum(line.startswith("Traceback") for line in lines) == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux moves threads")
+def test_a_thread_that_ends_meanwhile_keeps_no_other_where_it_was(monkeypatch):
+    moved = []
+
+    def move(thread: int, _: list[int]) -> None:
+        if thread == 2:
+            raise ProcessLookupError
+        moved.append(thread)
+
+    monkeypatch.setattr(os, "listdir", lambda _: ["1", "2", "3"])
+    monkeypatch.setattr(os, "sched_setaffinity", move)
+    move_to([0])
+    assert moved == [1, 3]
