@@ -7,6 +7,7 @@ import faulthandler
 import io
 import os
 import shlex
+import signal
 import sys
 from contextlib import nullcontext, suppress
 from pathlib import Path
@@ -65,8 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _dispatch(arguments)
     except InputError as error:
         return _complain(error, 2)
-    except KeyboardInterrupt:
-        return 130
+    except KeyboardInterrupt as interruption:
+        return 143 if signal.SIGTERM in interruption.args else 130
     finally:
         _settle_output()
 

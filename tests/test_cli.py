@@ -561,6 +561,15 @@ def test_an_interrupted_run_says_what_to_type(monkeypatch, capsys, number, code)
     assert capsys.readouterr().err.endswith("type: csac resume 'my run'\n")
 
 
+@pytest.mark.parametrize(("given", "code"), [((), 130), ((signal.SIGINT,), 130), ((signal.SIGTERM,), 143)])
+def test_leaving_at_once_has_the_exit_code_of_its_signal(monkeypatch, given, code):
+    def train(*_, **__):
+        raise KeyboardInterrupt(*given)
+
+    monkeypatch.setattr(training, "train", train)
+    assert csac("train Hopper-v4") == code
+
+
 @pytest.mark.parametrize(
     ("number", "groups"), [(signal.SIGTERM, 1), (signal.SIGINT, 2)], ids=["SIGTERM", "SIGINT to every process"]
 )

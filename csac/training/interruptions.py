@@ -65,11 +65,11 @@ def leaving_at_once() -> Iterator[None]:
 
 
 class _Received(list[int]):
-    """The signals so far, and the handler that adds to them: the second one raises KeyboardInterrupt."""
+    """The signals so far, and the handler that adds to them: the second one raises KeyboardInterrupt(its number)."""
 
     def __call__(self, number: int, _: Any) -> None:
         if self:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt(number)
         self.append(number)
 
 
@@ -89,7 +89,8 @@ def signals_noted() -> Iterator[list[int]]:
 def caught_signals(tell: Callable[[], None] | None = None) -> Iterator[tuple[threading.Event, list[int]]]:
     """Yield (a request to stop, the signals behind it). A second SIGINT or SIGTERM is taken literally.
 
-    SIGHUP is ignored: a run outlives its terminal. `tell` is called, in a thread, as soon as the first signal arrives.
+    It is a KeyboardInterrupt with the signal's number. SIGHUP is ignored: a run outlives its terminal. `tell` is
+    called, in a thread, as soon as the first signal arrives.
     """
     outer = signal.getsignal(signal.SIGINT)
     stop, received = threading.Event(), outer if isinstance(outer, _Received) else _Received()

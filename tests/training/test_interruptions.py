@@ -64,6 +64,15 @@ def test_a_signal_is_told_while_the_main_thread_is_busy():
     assert order == ["told", "worked"]
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_second_signal_says_which_it_is(number):
+    with caught_signals():
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt) as interruption:
+            signal.raise_signal(number)
+    assert interruption.value.args == (number,)
+
+
 def test_what_was_there_for_signals_is_there_again():
     def handlers():
         return [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
