@@ -206,9 +206,10 @@ class Checkpoints:
 
     def discard_after(self, step: int) -> None:
         """Remove what was written after a step, cut off or not. Nobody else may be writing."""
-        for path in [*self.folder.glob("**/.*"), *(self.folder / f"step_{n}.json" for n in steps_in(self.folder))]:
-            if path.name.startswith(".") or _step_of(path.name) > step:
-                path.unlink()
+        hidden = [path for path in self.folder.glob("**/.*") if not path.is_dir()]  # a folder is somebody else's
+        later = [self.folder / f"step_{n}.json" for n in steps_in(self.folder) if n > step]
+        for path in [*hidden, *later]:
+            path.unlink()
         self.newest = max(steps_in(self.folder), default=None)
         self._prune(None)
 

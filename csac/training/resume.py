@@ -151,7 +151,8 @@ def roll_back(run: RunDirectory) -> Restart:
     complaints = [f"{complaint}; an earlier checkpoint is used" for complaint in complaints]
     complaints += restore(run.path, checkpoint)
     for unfinished in [*run.path.glob(".*.*"), *run.path.glob("policy/.*.*")]:
-        unfinished.unlink()
+        if not unfinished.is_dir():
+            unfinished.unlink()
     if checkpoint is None:
         return BEGINNING
     step, pinned = checkpoint.step, checkpoint.values["pinned"]

@@ -442,6 +442,17 @@ def test_what_an_interrupted_write_left_is_removed(tmp_path):
     assert {path for path in tmp_path.rglob("*") if path.is_file()} == kept
 
 
+def test_a_hidden_folder_of_somebody_else_s_stays(tmp_path):
+    """Of Jupyter, say. To remove it as a file was an error each time that the run went on."""
+    save(tmp_path, 10)
+    (tmp_path / ".ipynb_checkpoints").mkdir()
+    (tmp_path / ".ipynb_checkpoints" / "notes.txt").touch()
+    (tmp_path / ".step_20.json.4711").touch()
+    Checkpoints(tmp_path, 2).discard_after(10)
+    assert (tmp_path / ".ipynb_checkpoints" / "notes.txt").exists()
+    assert not (tmp_path / ".step_20.json.4711").exists()
+
+
 # Groups that fail, and what the recorder makes of it.
 
 
