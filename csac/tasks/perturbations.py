@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from csac.record.manifest import STEPS_LIMIT
 from csac.tasks.physics import NOISES, PHYSICS
 from csac.types import InputError
 
@@ -48,14 +49,18 @@ class Perturbation:
             hint = f"did you mean {similar[0]}? " if similar else ""
             raise InputError(f"no perturbation is called {self.kind!r}: {hint}there are {', '.join(KINDS)}")
         is_number = isinstance(self.value, int | float | np.number) and not isinstance(self.value, bool)
+        value = _as_float(self.value) if is_number else math.nan
+        shown = str(value) if math.isinf(value) else repr(self.value)
         what = "factor" if self.kind in PHYSICS else "standard deviation"
-        if self.kind == "mass" and not (is_number and 0 < self.value < math.inf):
-            raise InputError(f"mass takes a finite factor above 0, not {self.value!r}")
-        if not (is_number and 0 <= self.value < math.inf):
-            raise InputError(f"{self.kind} takes a finite {what} of 0 or more, not {self.value!r}")
+        if self.kind == "mass" and not 0 < value < math.inf:
+            raise InputError(f"mass takes a finite factor above 0, not {shown}")
+        if not 0 <= value < math.inf:
+            raise InputError(f"{self.kind} takes a finite {what} of 0 or more, not {shown}")
         if isinstance(self.step, bool) or not isinstance(self.step, int | np.integer) or self.step < 0:
-            raise InputError(f"the step of {self.kind} must be a whole number of 0 or more, not {self.step!r}")
-        object.__setattr__(self, "value", float(self.value))
+            raise InputError(f"the step of {self.kind} must be a whole number of 0 or more, not {self.step!r:.40}")
+        if self.step > STEPS_LIMIT:
+            raise InputError(f"the step of {self.kind} must be at most {STEPS_LIMIT:,}")
+        object.__setattr__(self, "value", value)
         object.__setattr__(self, "step", int(self.step))
 
     @classmethod
@@ -157,13 +162,20 @@ def _number(text: str, whole: str) -> float:
         raise InputError(f"{whole}: {text!r} is not a number; write it as {_EXAMPLE}") from None
 
 
+def _as_float(value: float | np.number) -> float:
+    try:
+        return float(value)
+    except OverflowError:  # a whole number beyond every float
+        return math.inf if value > 0 else -math.inf
+
+
 def _step(text: str, whole: str) -> int:
     """Return a step, which may be written 3e5 too."""
     try:
         value = int(text) if text.strip("+-_ 0123456789") == "" else float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or value != int(value):
+    if isinstance(value, float) and not value.is_integer():
         raise InputError(f"{whole}: {text!r} is not a whole number of steps; write it as {_EXAMPLE}")
     return int(value)
 

@@ -89,6 +89,9 @@ def test_what_the_manifest_holds_is_short():
         ("friction=2@soon", "friction=2@soon: 'soon' is not a whole number of steps"),
         ("friction=2@1.5", "'1.5' is not a whole number of steps"),
         ("friction=2@inf", "'inf' is not a whole number of steps"),
+        ("friction=2@1" + 310 * "0", "the step of friction must be at most 2,147,483,647"),
+        ("friction=2@1" + 5000 * "0", "is not a whole number of steps"),
+        ("friction=2@1e300", "the step of friction must be at most 2,147,483,647"),
         ("friction=2@-3", "the step of friction must be a whole number of 0 or more, not -3"),
     ],
 )
@@ -96,6 +99,13 @@ def test_a_mistake_is_one_line(text, complaint):
     with pytest.raises(InputError, match=re.escape(complaint)) as refusal:
         Perturbation.parse(text)
     assert "\n" not in str(refusal.value)
+
+
+def test_a_whole_number_that_no_float_can_hold_is_refused():
+    with pytest.raises(InputError, match=r"friction takes a finite factor of 0 or more, not inf"):
+        Perturbation("friction", 10**5000)
+    with pytest.raises(InputError, match=r"must be at most 2,147,483,647"):
+        Perturbation("friction", 2, 10**5000)
 
 
 def test_one_may_be_given_alone_and_objects_too():
