@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 GROUPS_PER_CORE = 4
 
 
-# Steps that one group may be ahead of another: all can be saved at one step without a long wait.
+# Steps that one group may be ahead of another when its turn begins: all can be saved at one step without a long wait.
 LONGEST_LEAD = 1_000
 
 # A checkpoint is made at least this often, whatever the interval in steps.
