@@ -110,7 +110,7 @@ def _signals_before_training() -> AbstractContextManager[None]:
 
 def _train(arguments: list[str]) -> int:
     chosen = Chosen.among(arguments)
-    options = parse(chosen.command(""), arguments, "csac train", chosen.others())
+    options = parse(chosen.command(_first_word(arguments)), arguments, "csac train", chosen.others())
     if chosen.preset:  # what it gives can depend on the task, which is known by now
         options = parse(chosen.command(options.task), arguments, "csac train", chosen.others())
     if options.resume and options.directory is None:
@@ -133,6 +133,11 @@ def _train(arguments: list[str]) -> int:
             **chosen.inherited(),
         )
     )
+
+
+def _first_word(arguments: list[str]) -> str:
+    """Return the task where it comes first, so that the help shows what a preset gives for it."""
+    return "" if not arguments or arguments[0].startswith("-") else arguments[0]
 
 
 def _resume(arguments: list[str]) -> int:
@@ -359,7 +364,7 @@ def _study(arguments: list[str]) -> int:
 
 def _tune(arguments: list[str]) -> int:
     chosen = Chosen.among(arguments)
-    options = parse(chosen.command("", Tune), arguments, "csac tune", chosen.others())
+    options = parse(chosen.command(_first_word(arguments), Tune), arguments, "csac tune", chosen.others())
     if chosen.preset:  # what it gives can depend on the task, which is known by now
         options = parse(chosen.command(options.task, Tune), arguments, "csac tune", chosen.others())
     algorithm = getattr(options, chosen.algorithm)
