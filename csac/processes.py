@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import multiprocessing
 import os
 import signal
 import sys
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
 # A process whose pipe is closed is about to end: its exit code says why.
 SECONDS_TO_END = 10.0
@@ -30,6 +32,42 @@ def usable_cores() -> list[int]:
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
+
+
+def core_quota(folders: Iterable[Path] | None = None) -> int | None:
+    """Return for how many processors this process has time, whatever it may run on; None where nothing bounds that.
+
+    That is the quota of a container, of whose machine every processor is seen. `folders` are its control groups.
+    """
+    quotas = []
+    for folder in control_groups() if folders is None else folders:
+        with suppress(OSError, ValueError):
+            quota, period = (folder / "cpu.max").read_text().split()
+            quotas.append(max(1, math.ceil(int(quota) / int(period))))  # "max" is no number
+    return min(quotas, default=None)
+
+
+def memory_left(folders: Iterable[Path] | None = None) -> int | None:
+    """Return the bytes that a container leaves to this process, or None where nothing bounds them.
+
+    What was only read from files, and can be read again, counts as free. `folders` are as in `core_quota`.
+    """
+    left = []
+    for folder in control_groups() if folders is None else folders:
+        with suppress(OSError, ValueError):
+            limit, used = (int((folder / f"memory.{name}").read_text()) for name in ("max", "current"))
+            statistics = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+            left.append(max(0, limit - used + int(statistics.get("inactive_file", 0))))
+    return min(left, default=None)
+
+
+def control_groups(listed: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> list[Path]:
+    """Return the folders of this process's control groups (Linux, version 2), from its own to the outermost."""
+    try:
+        own = next(line[3:] for line in listed.read_text().splitlines() if line.startswith("0::"))
+    except (OSError, StopIteration):
+        return []
+    return [root / path.relative_to("/") for path in (Path(own), *Path(own).parents) if ".." not in path.parts]
 
 
 def move_to(cores: Sequence[int]) -> None:

@@ -8,10 +8,11 @@ import signal
 import subprocess
 import sys
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import pytest
 
-from csac.processes import Child, cause_of_death, move_to
+from csac.processes import Child, cause_of_death, control_groups, core_quota, memory_left, move_to
 
 
 def end(_: Connection, how: str) -> None:
@@ -74,3 +75,37 @@ def test_a_thread_that_ends_meanwhile_keeps_no_other_where_it_was(monkeypatch):
     monkeypatch.setattr(os, "sched_setaffinity", move)
     move_to([0])
     assert moved == [1, 3]
+
+
+def limited(folder: Path, **files: str) -> Path:
+    """A control group with these files, `cpu_max` for cpu.max."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        (folder / name.replace("_", ".")).write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("text", "cores"), [("200000 100000\n", 2), ("150000 100000", 2), ("1000 100000", 1), ("max 100000\n", None)]
+)
+def test_a_container_s_share_of_its_processors(tmp_path, text, cores):
+    assert core_quota([limited(tmp_path, cpu_max=text)]) == cores
+
+
+def test_the_tightest_of_the_limits_around_a_process_holds(tmp_path):
+    inner = limited(tmp_path / "job", cpu_max="400000 100000", memory_max="500", memory_current="100", memory_stat="")
+    outer = limited(tmp_path, cpu_max="300000 100000", memory_max="max", memory_current="7", memory_stat="")
+    (tmp_path / "listed").write_text("4:memory:/other\n0::/job\n")
+    groups = control_groups(tmp_path / "listed", tmp_path)
+    assert groups == [inner, outer]
+    assert (core_quota(groups), memory_left(groups)) == (3, 400)
+
+
+def test_what_was_only_read_from_files_counts_as_free(tmp_path):
+    files = {"memory_max": "1000", "memory_current": "900", "memory_stat": "anon 200\ninactive_file 600\n"}
+    assert memory_left([limited(tmp_path, **files)]) == 700
+
+
+def test_where_there_are_no_control_groups_nothing_is_limited(tmp_path):
+    groups = control_groups(tmp_path / "none", tmp_path)
+    assert (groups, core_quota(groups), memory_left([tmp_path])) == ([], None, None)

@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from csac.evaluation.evaluator import EvaluationEpisode, EvaluationFailure, Evaluator
-from csac.processes import Child, die_with_parent, move_to, usable_cores
+from csac.processes import Child, core_quota, die_with_parent, move_to, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _BATCHES_THAT_PAY = 2  # for each process: it takes as long to start as a short 
 
 def choose_processes(evaluator: Evaluator, policies: int) -> int:
     """Return how many processes pay for evaluating so many policies: at most one per core."""
-    return max(1, min(len(usable_cores()), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
+    return max(1, min(len(usable_cores()[: core_quota()]), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
 
 
 class ProcessDied(EvaluationFailure):

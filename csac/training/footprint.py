@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import jax
 import psutil
 
+from csac.processes import memory_left
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -24,7 +25,8 @@ def memory_needed(plan: Plan, spec: Spec) -> str:
     per_seed, seeds, groups = _bytes_per_seed(plan, spec), plan.seeds, len(plan.groups)
     evaluating = groups * plan.evaluation_processes
     needed = seeds * per_seed + groups * BYTES_PER_PROCESS + evaluating * BYTES_PER_EVALUATION_PROCESS
-    available = psutil.virtual_memory().available
+    available, limit = psutil.virtual_memory().available, memory_left()
+    available = available if limit is None else min(available, limit)
     if needed > available:
         raise InputError(
             f"this run needs about {needed / 2**30:,.1f} GiB of memory and {available / 2**30:.1f} GiB are available: "

@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from csac.evaluation.evaluator import EPISODES_AT_ONCE
-from csac.processes import Child, die_with_parent, move_to, usable_cores
+from csac.processes import Child, core_quota, die_with_parent, move_to, usable_cores
 from csac.training.checkpoint import remove_unfinished
 from csac.training.group import Group
 from csac.training.messages import (
@@ -57,7 +57,7 @@ def choose_groups(seeds: int, device: str) -> int:
 
     Two learners on a core each do about a fifth more than one learner of two seeds on both.
     """
-    return 1 if device == "gpu" else min(seeds, GROUPS_PER_CORE * len(usable_cores()))
+    return 1 if device == "gpu" else min(seeds, GROUPS_PER_CORE * len(usable_cores()[: core_quota()]))
 
 
 def choose_evaluation_processes(groups: Sequence[Sequence[int]], episodes: int) -> int:
@@ -65,7 +65,7 @@ def choose_evaluation_processes(groups: Sequence[Sequence[int]], episodes: int) 
 
     Several groups may share the cores that are to spare, since they evaluate for a small part of the time only.
     """
-    spare = len(usable_cores()) - len(groups)
+    spare = len(usable_cores()[: core_quota()]) - len(groups)
     batches = max(map(len, groups)) * -(-episodes // EPISODES_AT_ONCE)
     return min(batches, max(1, spare // len(groups))) if spare > 0 else 0
 

@@ -88,6 +88,12 @@ def test_a_batch_that_does_not_fit_is_refused_with_what_it_needs(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_container_s_memory_is_what_is_available(tmp_path, monkeypatch):
+    monkeypatch.setattr("csac.training.footprint.memory_left", lambda: 3 * 2**29)
+    with pytest.raises(InputError, match=r"and 1\.5 GiB are available"):
+        train(SAC(replay_size=2**26), "Pendulum-v1", steps=2**26, directory=tmp_path / "run")
+
+
 @pytest.mark.parametrize(
     ("algorithm", "steps", "why"),
     [

@@ -17,6 +17,16 @@ from csac.training import scheduler as scheduler_module
 from csac.training.messages import Boundary, Ended, Saved
 
 
+@pytest.mark.parametrize(("quota", "groups", "processes"), [(None, 20, 3), (1, 4, 0), (4, 16, 1)])
+def test_a_container_s_share_of_the_processors_decides_how_many_processes_there_are(
+    monkeypatch, quota, groups, processes
+):
+    monkeypatch.setattr(scheduler_module, "usable_cores", lambda: list(range(8)))
+    monkeypatch.setattr(scheduler_module, "core_quota", lambda: quota)
+    assert scheduler_module.choose_groups(20, "cpu") == groups
+    assert scheduler_module.choose_evaluation_processes([[0], [1]], 1000) == processes
+
+
 @pytest.mark.parametrize("interval", [100, 130])
 def test_a_run_that_has_enough_ends_at_that_very_step(tmp_path, interval):
     """Evaluations between the steps where a group can be saved were told of up to 250 steps later."""
