@@ -21,6 +21,8 @@ from csac.tasks.spaces import EnvironmentFailure
 from csac.types import InputError, Spec
 
 UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)
+NUMBERED: Any = {1: UNIT, 2: UNIT}
+PARTLY_NUMBERED: Any = {"a": UNIT, 1: UNIT}
 DISORDERED = spaces.Dict(OrderedDict(z=UNIT, a=spaces.Box(-9, 9, (1, 2)), m=spaces.Box(-9, 9, ())))
 
 
@@ -100,8 +102,8 @@ def test_a_task_that_cannot_be_learnt_is_refused(task, message):
         ("observation_space", spaces.Dict(), "empty"),
         ("observation_space", spaces.Box(-1.0, 1.0, (0,)), "empty"),
         ("observation_space", spaces.Dict(a=UNIT, b=spaces.Box(-1.0, 1.0, (0,))), r"observation\['b'\] is empty"),
-        ("observation_space", spaces.Dict({1: UNIT, 2: UNIT}), "the key 1, which is no text"),
-        ("observation_space", spaces.Dict({"a": UNIT, 1: UNIT}), "the key 1, which is no text"),
+        ("observation_space", spaces.Dict(NUMBERED), "the key 1, which is no text"),
+        ("observation_space", spaces.Dict(PARTLY_NUMBERED), "the key 1, which is no text"),
     ],
 )
 def test_a_space_that_cannot_be_learnt_is_refused(name, space, message):
