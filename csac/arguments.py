@@ -13,9 +13,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 import tyro
-from tyro.conf import DisallowNone, Positional
+from tyro.conf import DisallowNone, FlagCreatePairsOff, Positional
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from csac.synonyms import called_here
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -34,21 +35,14 @@ _COMPLAINTS = (
     (r"Error parsing \S+: (.*)", r"\1"),
 )
 
-# What papers and other libraries call our options.
-_CALLED_OTHERWISE = MappingProxyType(
-    {
-        "--tau": ("--relative-entropy-weight", "--target-rate"),
-        "--sigma": ("--entropy-weight",),
-        "--alpha": ("--entropy-weight",),
-        "--ent-coef": ("--entropy-weight",),
-        "--gamma": ("--discount",),
-        "--polyak": ("--target-rate",),
-        "--learning-starts": ("--warmup-steps",),
-        "--buffer-size": ("--replay-size",),
-        "--train-freq": ("--update-interval",),
-        "--gradient-steps": ("--updates-per-step",),
-        "--total-timesteps": ("--steps",),
-    }
+# What is written otherwise here, and how, where the command has the options that are named.
+_MISWRITTEN = (
+    (r"(--\S*hidden-sizes)", r"\1 needs at least one number, as 256 256"),
+    (r"(--\S*hidden-sizes) .*[,[(].*", r"write the numbers with blanks between: \1 400 300"),
+    (r"--seeds (\S*,.*|\d+( \d+)+)", r"--seeds is how many: --seeds 3"),
+    (r"--device cuda.*", r"--device takes cpu or gpu (cuda is gpu here)"),
+    (r"--entropy-weight auto.*", r"the entropy weight adapts with --temperature automatic"),
+    (r"--temperature ([\d.]\S*).*", r"write --temperature fixed --entropy-weight \1"),
 )
 
 
@@ -77,6 +71,8 @@ def parse(
         with suppress(BrokenPipeError, SystemExit):
             run()
         raise HelpShown
+    if mistake := _mistake(arguments, command):
+        raise InputError(f"{mistake} ({program} --help)")
     complaint = io.StringIO()
     try:
         # With standard output elsewhere too, tyro takes it for one that cannot show boxes.
@@ -118,7 +114,8 @@ def json_object(option: str, text: str) -> dict[str, Any]:
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return "; did you mean ...?" with what resembles `word` most, or nothing."""
-    matches = difflib.get_close_matches(word, list(known), n=2)
+    names = list(known)
+    matches = [word.lower()] if word.lower() in names else difflib.get_close_matches(word, names, n=2)
     return f"; did you mean {' or '.join(matches)}?" if matches else ""
 
 
@@ -174,30 +171,57 @@ def _with_choices_in_order(text: str) -> str:
     return told + between + ", ".join(sorted({*choices.split(", ")} - {"'None'"})) if between else text
 
 
+def _mistake(arguments: list[str], command: type[Any]) -> str | None:
+    """Return how an option is called or written here that is given as other libraries have it."""
+    known = _options(command)
+    for words in re.split(r"\0(?=--)", "\0".join(arguments)):
+        option, *values = re.split(r"[=\0]", words, maxsplit=1)
+        option, text = option.replace("_", "-"), " ".join(values).replace("\0", " ")
+        if option not in known and (hint := called_here(option, known)):
+            return f"there is no option {option}; {hint}"
+        if known.get(option) and text.split(" ")[0].lower() in ("true", "false"):
+            return f"{option} takes no value; {known[option]}"
+        for pattern, template in _MISWRITTEN:
+            match = re.fullmatch(pattern, f"{option} {text}".strip())
+            if match and {option, *re.findall(r"--[a-z-]+", said := match.expand(template))} <= known.keys():
+                return said
+    return None
+
+
 def _unknown(argument: str, command: type[Any], elsewhere: Mapping[str, type[Any]]) -> str:
+    known = _options(command)
     if not argument.startswith("-"):
-        return f"there is no place for {argument!r}"
+        several = ": one task a run; several: csac study" if "--env-kwargs" in known else ""
+        return f"there is no place for {argument!r}{several}"
     option = argument.partition("=")[0].replace("_", "-")
     for name, kind in elsewhere.items():
         if option in _options(kind):
-            return f"{option} is an option of {name}, which --algorithm {name} chooses"
-    known = _options(command)
-    meant = [name for name in _CALLED_OTHERWISE.get(option, ()) if name in known]
-    return f"there is no option {option}" + (f"; it is {' or '.join(meant)} here" if meant else nearest(option, known))
+            return (
+                f"{option} is an option of {name}, which --algorithm {name} chooses"
+                if "--algorithm" in known
+                else f"a run keeps its hyperparameters: begin another with csac train TASK --from DIR {option} X"
+            )
+    return f"there is no option {option}{nearest(option, known)}"
 
 
-def _options(kind: type[Any]) -> list[str]:
-    """Return the options that tyro makes of a dataclass; those of a dataclass within have no prefix."""
-    names: list[str] = []
+def _options(kind: type[Any]) -> dict[str, str]:
+    """Return the options that tyro makes of a dataclass, each with what turns it off where it is a flag.
+
+    Those of a dataclass within have no prefix.
+    """
+    names: dict[str, str] = {}
     annotations = get_type_hints(kind, include_extras=True)
     for item in dataclasses.fields(kind):
         if dataclasses.is_dataclass(item.default):
-            names += _options(type(item.default))
+            names |= _options(type(item.default))
             continue
-        extras = getattr(annotations[item.name], "__metadata__", ())
+        hint = annotations[item.name]
+        extras = getattr(hint, "__metadata__", ())
         if Positional[Any].__metadata__[0] not in extras:
             own = next((extra.name for extra in extras if isinstance(getattr(extra, "name", None), str)), item.name)
-            names.append("--" + own.replace("_", "-"))
+            option = own.replace("_", "-")
+            off = {bool: f"--no-{option} turns it off", FlagCreatePairsOff[bool]: "without it, it is off"}
+            names[f"--{option}"] = off.get(hint, "")
     return names
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from contextlib import AbstractContextManager
 
+    from csac.record.manifest import Manifest
     from csac.record.run import RunDirectory
 
 HELP = """\
@@ -73,7 +74,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
+    if not arguments or arguments[0] in ("-h", "--help"):
         _say(HELP.rstrip())
         return 0
     if arguments[0] == "--version":
@@ -141,7 +144,9 @@ def _first_word(arguments: list[str]) -> str:
 
 
 def _resume(arguments: list[str]) -> int:
-    options = parse(Resume, arguments, "csac resume")
+    from csac.algorithms import ALGORITHMS
+
+    options = parse(Resume, arguments, "csac resume", ALGORITHMS)
     from csac.console.progress import Reporter
     from csac.training.train import resume
 
@@ -215,8 +220,11 @@ def _evaluate(arguments: list[str]) -> int:
         _say(f"note: no episode's last info holds a number called {name!r}")
     for seed in sorted(results.keys() & manifest.failures.keys()):
         _say(f"note: seed {seed} failed at {manifest.failures[seed]}; it is in no mean, and in no file of rows")
+    _tell_of_warmup(manifest)
     if options.csv:
         rows = [episode.row(seed, manifest.steps_done) for seed, episodes in sound.items() for episode in episodes]
+        if not rows:
+            return _complain(f"{options.csv} is not written: every seed that was tested had failed in training", 1)
         write_rows(options.csv, COLUMNS["evaluations"], rows)
         console.print(str(options.csv), soft_wrap=True)
     return 0
@@ -227,6 +235,7 @@ def _play(arguments: list[str]) -> int:
     from csac.console.tables import make_console
     from csac.console.waiting import progress_shown
     from csac.evaluation.play import perturbation_notes, play
+    from csac.record.rendering import number
     from csac.tasks.spaces import EnvironmentFailure
 
     console = make_console()
@@ -243,7 +252,7 @@ def _play(arguments: list[str]) -> int:
                 on_progress=on_progress,
                 trust_task=options.trust_task,
             ):
-                text = f"return {episode.episode_return:,.2f} in {episode.length:,} steps"
+                text = f"return {number(episode.episode_return)} in {episode.length:,} steps"
                 console.print(f"episode {episode.episode}: {text}")
     except EnvironmentFailure as error:
         return _complain(error, 1)
@@ -259,13 +268,14 @@ def _export(arguments: list[str]) -> int:
     from csac.console.waiting import progress_shown
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.export import export_run
+    from csac.record.run import RunDirectory
 
     console, exported = make_console(), []
     try:
         with progress_shown(console, "verifying", "episodes") as on_progress:
             for one in export_run(
                 options.run,
-                tuple(options.format.split(",")),  # pyright: ignore[reportArgumentType] (others are refused by name)
+                tuple(options.format.replace(" ", "").split(",")),  # pyright: ignore[reportArgumentType] (others are refused by name)
                 options.seed_label(),
                 options.checkpoint,
                 options.out,
@@ -280,7 +290,15 @@ def _export(arguments: list[str]) -> int:
         return _complain(error, 1)
     if (sizes := size_table(exported)) is not None:
         console.print(sizes)
+    _tell_of_warmup(RunDirectory.open(options.run).manifest)
     return 0
+
+
+def _tell_of_warmup(manifest: Manifest) -> None:
+    """Say where a policy is as it began, since its run was stopped in the warm-up."""
+    warmup = manifest.hyperparameters.get("warmup_steps", 0)
+    if manifest.steps_done < warmup and not manifest.forked_from:
+        _say(f"note: this policy has never learnt: {manifest.steps_done:,} of {warmup:,} warm-up steps are done")
 
 
 def _latency(arguments: list[str]) -> int:

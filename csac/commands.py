@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from csac.arguments import json_object, peek
+from csac.arguments import json_object, nearest, peek
 from csac.presets import PRESETS, hyperparameters
 from csac.training.options import Options
 from csac.types import InputError
@@ -248,7 +248,7 @@ class Latency:
     An artefact in C is timed inside of a compiled program, the others around their call in Python.
     """
 
-    artefacts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ARTEFACT")]
+    artefacts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ARTEFACT...", help_behavior_hint="(required)")]
     """Folders that csac export has written."""
     calls: int = 100_000
     """Calls one after the other."""
@@ -264,7 +264,7 @@ class Latency:
 class Runs:
     """List the runs below a directory."""
 
-    directory: Annotated[Positional[Path], arg(metavar="DIR")] = Path("runs")
+    directory: Annotated[Positional[Path], arg(metavar="[DIR]")] = Path("runs")
     """Where to look."""
 
 
@@ -333,7 +333,8 @@ class Chosen(NamedTuple):
             source = before.run.manifest if before.run else None
         name = peek(arguments, "--algorithm", source.algorithm if source else "csac")
         if name not in ALGORITHMS:
-            raise InputError(f"no algorithm is called {name!r}: choose {' or '.join(ALGORITHMS)}")
+            hint = nearest(name, ALGORITHMS) or f": choose {' or '.join(ALGORITHMS)}"
+            raise InputError(f"no algorithm is called {name!r}{hint}")
         return cls(name, peek(arguments, "--preset", None), source)
 
     def command(self, task: str, base: type[Any] = Train) -> type[Any]:

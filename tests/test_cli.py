@@ -149,7 +149,14 @@ def words(text):
         ),
         ("latency nowhere", "nowhere does not exist; give the folder of an artefact (csac export writes one)"),
         ("train X --no_such_thing=3", "there is no option --no-such-thing (csac train --help)"),
-        ("train X Y", "there is no place for 'Y' (csac train --help)"),
+        ("train X Y", "there is no place for 'Y': one task a run; several: csac study (csac train --help)"),
+        ("train X --algorithm SAC", "no algorithm is called 'SAC'; did you mean sac?"),
+        (
+            "resume X --discount 0.9",
+            "a run keeps its hyperparameters: begin another with csac train TASK --from DIR --discount X "
+            "(csac resume --help)",
+        ),
+        ("help nonsense", "no command is called 'nonsense' (csac --help)"),
         ("train X --device tpu", "--device: 'tpu' is not one of 'cpu', 'gpu' (csac train --help)"),
         ("train X --algorithm dqn", "no algorithm is called 'dqn': choose csac or sac or td3 or sd3 or ppo"),
         ("train X --preset papr", "no preset is called 'papr': choose paper"),
@@ -197,6 +204,73 @@ def test_a_mistake_is_one_line_and_leaves_no_trace(capsys, tmp_path, line, compl
     assert output.err == f"csac: {complaint}\n"
     assert output.out == ""
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ("X --lr 1e-3", "there is no option --lr; it is --actor-learning-rate and --critic-learning-rate here"),
+        ("X --algorithm ppo --lr 1e-3", "there is no option --lr; it is --learning-rate here"),
+        (
+            "X --net-arch 64 64",
+            "there is no option --net-arch; it is --actor-hidden-sizes and --critic-hidden-sizes here",
+        ),
+        ("X --eval-freq 5", "there is no option --eval-freq; it is --evaluation-interval here"),
+        ("X --n_eval_episodes=5", "there is no option --n-eval-episodes; it is --evaluation-episodes here"),
+        ("X --track", "there is no option --track; it is --wandb here"),
+        ("X --n-envs 4", "there is no option --n-envs; each seed has one environment, and --seeds says how many"),
+        ("X --verbose 1", "there is no option --verbose; none is needed"),
+        ("--env X", "there is no option --env; the task has no flag: csac train Pendulum-v1"),
+        ("--task X", "there is no option --task; the task has no flag: csac train Pendulum-v1"),
+        (
+            "X --algorithm td3 --learning-rate 1",
+            "there is no option --learning-rate; it is --actor-learning-rate and --critic-learning-rate here",
+        ),
+        (
+            "X --hidden-sizes 8",
+            "there is no option --hidden-sizes; it is --actor-hidden-sizes and --critic-hidden-sizes here",
+        ),
+        (
+            "X --algorithm ppo --critic-learning-rate 1",
+            "there is no option --critic-learning-rate; it is --learning-rate here",
+        ),
+        (
+            "X --algorithm ppo --batch-size 8",
+            "there is no option --batch-size; it is --minibatches (their number) here",
+        ),
+        (
+            "X --algorithm ppo --actor-hidden-sizes 8",
+            "there is no option --actor-hidden-sizes; it is --hidden-sizes here",
+        ),
+        (
+            "X --algorithm sac --ent-coef auto",
+            "there is no option --ent-coef; it is --temperature or --entropy-weight here",
+        ),
+        ("X --algorithm sac --entropy-weight auto", "the entropy weight adapts with --temperature automatic"),
+        ("X --algorithm sac --temperature 0.2", "write --temperature fixed --entropy-weight 0.2"),
+        ("X --actor-hidden-sizes --steps 5", "--actor-hidden-sizes needs at least one number, as 256 256"),
+        ("X --algorithm ppo --hidden_sizes", "--hidden-sizes needs at least one number, as 256 256"),
+        ("X --actor-hidden-sizes 400,300", "write the numbers with blanks between: --actor-hidden-sizes 400 300"),
+        ("X --actor-hidden-sizes=[400,300]", "write the numbers with blanks between: --actor-hidden-sizes 400 300"),
+        ("X --actor-hidden-sizes 400, 300", "write the numbers with blanks between: --actor-hidden-sizes 400 300"),
+        ("X --seeds 0,1,2", "--seeds is how many: --seeds 3"),
+        ("X --seeds 0 1 2", "--seeds is how many: --seeds 3"),
+        ("X --device cuda:0", "--device takes cpu or gpu (cuda is gpu here)"),
+        ("X --wandb True", "--wandb takes no value; without it, it is off"),
+        (
+            "X --normalise-observations=false",
+            "--normalise-observations takes no value; --no-normalise-observations turns it off",
+        ),
+    ],
+)
+def test_what_other_libraries_write_leads_to_what_is_written_here(capsys, options, complaint):
+    assert csac(f"train {options}") == 2
+    assert capsys.readouterr().err == f"csac: {complaint} (csac train --help)\n"
+
+
+def test_a_video_is_not_called_out(capsys):
+    assert csac("play X --out film.mp4") == 2
+    assert capsys.readouterr().err == "csac: there is no option --out; it is --video here (csac play --help)\n"
 
 
 def test_json_that_is_none_is_told_where(capsys):
@@ -351,6 +425,12 @@ def test_help_lists_the_commands(capsys):
         assert output.count(f"csac {command} ") >= 2
 
 
+@pytest.mark.parametrize("words", ["train", "study show", "resume"])
+def test_help_before_a_command_is_the_help_of_it(capsys, words):
+    assert csac(f"help {words}") == 0
+    assert capsys.readouterr().out.startswith(f"usage: csac {words} ")
+
+
 def test_version(capsys):
     assert csac("--version") == 0
     assert capsys.readouterr().out == "csac 0.1.0\n"
@@ -483,6 +563,20 @@ def test_a_test_without_the_perturbations_of_the_training_says_so(capsys):
 
     first = capsys.readouterr().out.splitlines()[0]
     assert first == "not perturbed, unlike its training (action_noise=0.1@50): see --perturb"
+
+
+def test_a_policy_of_the_warm_up_is_told_to_have_never_learnt(capsys):
+    note = "note: this policy has never learnt: 100 of 500 warm-up steps are done"
+    run = make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+    for warmup, told in ((100, False), (500, True)):
+        run.update_manifest(hyperparameters={"warmup_steps": warmup})
+        assert csac("evaluate run --seed 0 --episodes 1") == 0
+        assert (note in capsys.readouterr().out.splitlines()) == told
+
+    assert csac("export run --format 'numpy, c' --no-rollouts") == 0
+
+    assert capsys.readouterr().out.splitlines()[-1] == note
+    assert {path.name for path in Path("run/export").iterdir()} == {"numpy", "c"}
 
 
 def test_a_closed_standard_output_is_no_mistake():
