@@ -65,7 +65,7 @@ class PPO:
     clip_range: Annotated[float, POSITIVE] = 0.2
     """How far the probability ratio may leave 1 before its gradient stops (epsilon)."""
     clip_value_loss: bool = True
-    """Whether a value earns nothing by moving further than `clip_range` from what it was."""
+    """Whether a value earns nothing by moving further than `clip_range` from what it was: little for raw rewards."""
     value_loss_weight: Annotated[float, NOT_NEGATIVE] = 0.5
     """Weight of the value loss beside the policy's."""
     entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.0

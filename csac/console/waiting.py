@@ -19,18 +19,23 @@ SPEED_WINDOW = 20.0  # seconds that the shown speed looks back
 
 
 class Speed:
-    """Steps per second over the last `SPEED_WINDOW` seconds."""
+    """Steps per second over the last `SPEED_WINDOW` seconds, or since the note before where that is longer ago."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._samples: deque[tuple[float, int]] = deque()
+        self._has_begun = False
 
     def add(self, total: int) -> None:
         """Note the number of steps made so far."""
         now = self._clock()
         self._samples.append((now, total))
-        while now - self._samples[1 if len(self._samples) > 2 else 0][0] > SPEED_WINDOW:
+        while len(self._samples) > 2 and now - self._samples[1][0] > SPEED_WINDOW:
             self._samples.popleft()
+        if len(self._samples) == 2 and not self._has_begun:
+            self._has_begun = True
+            if now - self._samples[0][0] > SPEED_WINDOW:  # the first steps came after a compilation
+                self._samples.popleft()
 
     def per_second(self) -> float | None:
         """Return the speed, or None as long as there is too little to tell."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from typing import TYPE_CHECKING, NamedTuple
@@ -26,7 +27,7 @@ _C_TYPES: dict[str, str] = {"float32": "float", "float16": "uint16_t", "int8": "
 _MULTIPLIER = 6364136223846793005  # of PCG32
 _WIDTH = 120
 _ARRAY = re.compile(r"static const \w+ csac_(\w+)\[(\d+)\] = \{")
-_NUMBERS = re.compile(r"(?<=\] = \{)[-+0-9.ef,\s]*(?=\};)")
+_NUMBERS = re.compile(r"(?<=\] = \{)[-+0-9.ef,\s]*(?=\};)|(?<=\bCSAC_POLICY_)[0-9a-f]{16}\b")
 
 
 def c_header(network: PolicyNetwork, contract: ArtefactContract) -> str:
@@ -67,6 +68,7 @@ def c_header(network: PolicyNetwork, contract: ArtefactContract) -> str:
         if array is not None:
             arrays.add(name, array)
     return template("policy.h.jinja").render(
+        identity=f"CSAC_POLICY_{hashlib.sha256(''.join(arrays.written).encode()).hexdigest()[:16]}",
         task=_in_comment(policy.task or "a task of its own"),
         algorithm=_in_comment(policy.algorithm),
         weights=contract.weights,
@@ -94,7 +96,7 @@ def _in_comment(text: str) -> str:
 
 
 def is_header(text: str, contract: ArtefactContract) -> bool:
-    """Whether a header is what `c_header` writes for this contract, but for the numbers of its arrays.
+    """Whether a header is what `c_header` writes for this contract, but for the numbers of its arrays and of its guard.
 
     So it can be compiled and run without running anybody else's code, and reads no number beyond an array.
     """

@@ -6,6 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from csac.deploy.templates import template
+from csac.record.rendering import SMALL, number
 
 if TYPE_CHECKING:
     from csac.deploy.artefact_contract import ArtefactContract
@@ -33,15 +34,22 @@ def model_card(contract: ArtefactContract, curve: str | None) -> str:
 
 def _with_deviation(returns: dict[str, Any]) -> str:
     """Return a mean and the standard deviation, as cards on the Hub have them."""
-    return f"{returns['mean_return']:.2f} +/- {returns['standard_deviation'] or 0.0:.2f}"
+    mean, deviation = returns["mean_return"], returns["standard_deviation"] or 0.0
+    return f"{mean:{_form(mean)}} +/- {deviation:{_form(mean)}}"
 
 
 def _with_interval(returns: dict[str, Any]) -> str:
     """Return a mean, and its interval where there is one."""
+    mean = returns["mean_return"]
     if returns["interval_95"] is None:
-        return f"{returns['mean_return']:,.2f} (too few for an interval)"
-    low, high = returns["interval_95"]
-    return f"{returns['mean_return']:,.2f} (95 % t-interval {low:,.2f} to {high:,.2f})"
+        return f"{number(mean)} (too few for an interval)"
+    low, high = (number(end, mean) for end in returns["interval_95"])
+    return f"{number(mean)} (95 % t-interval {low} to {high})"
+
+
+def _form(mean: float) -> str:
+    """Return the format of a mean and its deviation, without commas: other programs read it."""
+    return ".3g" if 0 < abs(mean) < SMALL else ".2f"
 
 
 def _code(value: Any) -> str:

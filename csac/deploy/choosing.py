@@ -67,7 +67,7 @@ def choose_seed(run: RunDirectory, seed: int | None = None) -> int:
         raise InputError(f"seed is the label of one, a whole number, not {seed!r:.40}")
     if seed not in seeds:
         raise InputError(f"{run.path} has no policy of seed {seed}; it has those of {_listed(seeds)}")
-    return seed
+    return int(seed)
 
 
 def _without_failed(run: RunDirectory, seeds: list[int]) -> list[int]:

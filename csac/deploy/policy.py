@@ -115,9 +115,9 @@ class Policy:
         """
         folder = Path(directory)
         strangers = {"manifest.json", "policy.py", "policy.onnx", "policy.h"}
-        if folder.is_dir() and strangers & {path.name for path in folder.iterdir()}:
-            raise InputError(f"{folder} holds a run or an artefact: choose another folder for the policy")
         try:
+            if folder.is_dir() and strangers & {path.name for path in folder.iterdir()}:
+                raise InputError(f"{folder} holds a run or an artefact: choose another folder for the policy")
             folder.mkdir(parents=True, exist_ok=True)
             self.contract.save(folder / CONTRACT)
             self.save_layers(folder / SAVED)

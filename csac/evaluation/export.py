@@ -193,7 +193,8 @@ def control_rate(raw: Any) -> float | None:
 def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
     """Return where a policy comes from and how good it was in training, as JSON holds it.
 
-    The returns are those of the evaluation that belongs to the policy: the seed's last one, or its best; the interval
+    The returns are those of the evaluation that belongs to the policy: the seed's last one, which a run that stopped
+    between two has left behind (`step` and `steps` tell), or its best; the interval
     is over that evaluation's episodes. Those of `all_seeds` are of their last evaluations, and the interval over seeds,
     of which those that failed in training are left out as in every table.
     """

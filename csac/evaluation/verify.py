@@ -10,6 +10,7 @@ import numpy as np
 
 from csac.deploy.guards import GuardState, guarded
 from csac.evaluation.evaluator import Evaluator, evaluate_episodes
+from csac.record.rendering import number
 from csac.record.statistics import FEWEST_FOR_INTERVAL, mean_and_interval
 from csac.tasks.seeds import FRESH_EVALUATION_SEED
 from csac.types import InputError
@@ -158,7 +159,8 @@ def compare_returns(
 
 
 def _told(returns: np.ndarray) -> str:
-    return f"a mean return of {returns.mean():,.2f} ± {returns.std(ddof=1):,.2f}"
+    mean = float(returns.mean())
+    return f"a mean return of {number(mean)} ± {number(float(returns.std(ddof=1)), mean)}"
 
 
 def _observations(

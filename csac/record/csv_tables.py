@@ -78,6 +78,7 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
     """
     aside = _aside(path)
     try:
+        aside.unlink(missing_ok=True)  # of a process of the same number that was killed
         append_rows(aside, columns, rows)
         aside.replace(path)
     except OSError as error:
@@ -143,6 +144,12 @@ def read_evaluations(path: str | Path) -> np.ndarray:
         found[name] = rows[name]
     found["success"] = np.nan
     return found
+
+
+def check_ends(path: Path) -> None:
+    """Raise InputError where the last line of a table has no end, so that nobody knows whether it is whole."""
+    if not path.read_bytes().endswith(b"\n"):
+        raise InputError(f"{path} ends within a line, which may be cut off: end it with a newline, or remove it")
 
 
 def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarray:

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-import matplotlib.style
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
-from csac.record.plots import COLOURS, STYLE, save
+from csac.record.plots import COLOURS, STYLE, Figure, FigureCanvasAgg, FuncFormatter, matplotlib, save
 from csac.record.rendering import short
 
 if TYPE_CHECKING:

@@ -145,7 +145,10 @@ class RunDirectory:
     def rows(self, name: Table) -> np.ndarray:
         """Every row of `<name>.csv` as a structured array; an empty one where nothing was written yet."""
         path = self._table(name)
-        return read_rows(path) if path.exists() else structured(COLUMNS[name], [])
+        rows = read_rows(path) if path.exists() else structured(COLUMNS[name], [])
+        if missing := set(COLUMNS[name]) - set(rows.dtype.names or ()):
+            raise InputError(f"{path} is damaged: it has no column {min(missing)}; restore it")
+        return rows
 
     @property
     def evaluations(self) -> np.ndarray:

@@ -162,8 +162,8 @@ def events_table(last: np.ndarray, names: dict[str, bool]) -> Table | None:
 
 
 def plus_minus(over: OverSeeds) -> Cell:
-    """Return `mean ± std`, of one seed its value alone; whole numbers from 20 on."""
-    form = _form(over.mean)
+    """Return `mean ± std`, of one seed its value alone; whole numbers from 20 on, but for a spread below 1."""
+    form = _form(over.mean, over.std)
     return numeric(over.mean, f"{over.mean:{form}}" + ("" if math.isnan(over.std) else f" ± {over.std:{form}}"))
 
 
@@ -171,7 +171,7 @@ def interval(over: OverSeeds) -> Cell:
     """Return the interval of a mean, or that there are too few seeds for one."""
     if over.seeds < FEWEST_FOR_INTERVAL:
         return Cell(no_interval(over.seeds), math.nan)
-    form = _form(over.mean)
+    form = _form(over.mean, over.high - over.low)
     return Cell(f"{over.low:{form}} to {over.high:{form}}", over.mean)
 
 
@@ -201,8 +201,10 @@ def _whole(value: int) -> Cell:
     return Cell(f"{value:,}", value)
 
 
-def _form(value: float) -> str:
-    return ",.0f" if abs(value) >= 20 else ".3g" if 0 < abs(value) < SMALL else ".2f"
+def _form(value: float, spread: float = math.nan) -> str:
+    if abs(value) >= 20:
+        return ",.2f" if 0 < spread < 1 else ",.0f"
+    return ".3g" if 0 < abs(value) < SMALL else ".2f"
 
 
 def _seeds(run: RunSummary) -> Cell:
@@ -275,7 +277,8 @@ def _rate(is_case: bool, value: float) -> Cell:
 
 def _mean_return(rows: np.ndarray) -> Cell:
     over = over_seeds(rows["return"][rows["seed"] == seed].mean() for seed in set(rows["seed"].tolist()))
-    mean, std = (numeric(value, f"{value:,.1f}").text for value in (over.mean, over.std))
+    form = ".3g" if 0 < abs(over.mean) < SMALL else ",.1f"
+    mean, std = (numeric(value, f"{value:{form}}").text for value in (over.mean, over.std))
     return numeric(over.mean, f"{mean} ± {std}" if std else mean)
 
 

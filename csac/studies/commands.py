@@ -112,8 +112,8 @@ class Show(Chosen):
     A kind of cell that this machine has not run yet is measured first, for some seconds each, and remembered.
     """
 
-    measure: FlagCreatePairsOff[bool] = True
-    """Measure how fast this machine is; without it, only what was measured before is told."""
+    no_measure: FlagCreatePairsOff[bool] = False
+    """Do not measure how fast this machine is: tell only what was measured before."""
     results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
     """Count as over what csac study run --results has collected there."""
 
@@ -215,7 +215,7 @@ def show(options: Show) -> int:
     collected = _collected(studies, cells, options.results)
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     rest = [cell for cell in cells if cell.key not in collected and not is_final(store.path(cell))]
-    predictions = _predictions(rest, statuses, options.measure, console)
+    predictions = _predictions(rest, statuses, not options.no_measure, console)
     table = _table("cell", "what", "steps", "state", "time", "directory")
     table.columns[5].overflow = "fold"
     for index, cell in enumerate(cells):

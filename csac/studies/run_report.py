@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from csac.record.atomic import write_atomically
-from csac.record.csv_tables import read_evaluations, read_rows
+from csac.record.csv_tables import check_ends, read_evaluations, read_rows
 from csac.record.plots import learning_curve
 from csac.record.rendering import Cell, Row, Table, between_markers, markdown
 from csac.record.run import RunDirectory, find_runs, is_run
@@ -219,7 +219,8 @@ def _tables(arms: Sequence[Arm], kind: TableName) -> list[Table]:
         if kind == "returns":
             found = [comparison_table(compare([(arm.label, arm.rows) for arm in own]))]
         elif kind == "cases":
-            found = [case_comparison_table([(arm.label, arm.rollouts) for arm in own])]
+            tested = [(arm.label, arm.rollouts) for arm in own if len(arm.rollouts)]
+            found = [case_comparison_table(tested)] if tested else []
         else:
             found += [
                 sections.recoveries_table(own, marks_of(condition), index) for index in range(len(marks_of(condition)))
@@ -294,7 +295,9 @@ def _read(path: Path, label: str | None, on_damaged: Callable[[InputError], None
     if path.name == "evaluations.csv" and is_run(path.parent):
         path = path.parent
     if path.suffix == ".csv":
-        return [Given(label, path, read_evaluations(path), None)]
+        rows = read_evaluations(path)
+        check_ends(path)
+        return [Given(label, path, rows, None)]
     runs = [] if is_run(path) or not path.is_dir() else find_runs(path, on_damaged)
     found = runs or [RunDirectory.open(path)]
     return [Given(label, run.path, run.evaluations, run.manifest) for run in found]

@@ -127,7 +127,8 @@ class Learner:
     def save(self, index: int) -> Snapshot:
         """Return what the seed at this place needs to go on, but for its memory."""
         arrays = {name: np.array(leaf) for name, leaf in by_name(_lasting(self.carry(index))).items()}
-        return Snapshot({**arrays, "waiting": self._waiting[index].copy()}, {"updates_summed": self._updates_summed})
+        values = {"updates_summed": self._updates_summed, "metrics": list(self._one.metrics)}
+        return Snapshot({**arrays, "waiting": self._waiting[index].copy()}, values)
 
     def memory(self, index: int, step: int) -> Ring:
         """Return the memory of the seed at this place, to read only; `step` environment steps were made."""
@@ -150,9 +151,13 @@ class Learner:
         lasting = _lasting(self._carry._replace(state=self._one.state))
         leaves = [jnp.array(self._axis.stack([seed.arrays[name] for seed in saved])) for name in by_name(lasting)]
         taken = Carry(memory=memory, **jax.tree.unflatten(jax.tree.structure(lasting), leaves))
+        self._updates_summed = int(saved[0].values["updates_summed"])
+        # With other options an algorithm may tell of other metrics: then their means begin anew.
+        tells, sums = list(self._one.metrics), jnp.zeros_like(self._carry.sums)
+        if taken.sums.shape != sums.shape or any(seed.values.get("metrics", tells) != tells for seed in saved):
+            taken, self._updates_summed = taken._replace(sums=sums), 0
         self._carry = taken._replace(state=jax.jit(self._axis.map(self._one.packing.pack))(taken.state))
         self._waiting = np.stack([seed.arrays["waiting"] for seed in saved])
-        self._updates_summed = int(saved[0].values["updates_summed"])
 
     def break_off(self, indices: Sequence[int], step: int) -> None:
         """Mark the last transition of these seeds, after `step` steps, as truncated: what follows is another episode.

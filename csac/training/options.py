@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from csac.checks import check_whole
 from csac.record.manifest import SEED_LIMIT, STEPS_LIMIT
+from csac.synonyms import called_here
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -96,9 +98,16 @@ def checked_options(given: PlanOptions) -> tuple[Options, dict[str, Any]]:
         InputError: there is no option of that name, or a number outside its range.
     """
     if unknown := given.keys() - PlanOptions.__annotations__.keys():
-        similar = difflib.get_close_matches(min(unknown), PlanOptions.__annotations__, n=1)
-        hint = f": did you mean {similar[0]}?" if similar else ""
-        raise InputError(f"train takes no {min(unknown)}{hint}")
+        raise InputError(f"train takes no {min(unknown)}{_hint(min(unknown))}")
     names = {item.name for item in dataclasses.fields(Options)}
     simple: Any = {name: value for name, value in given.items() if name in names}
     return Options(**simple), {name: value for name, value in given.items() if name not in names}
+
+
+def _hint(name: str) -> str:
+    """Return ": ..." with what an option is called here, or what is most like it, or nothing."""
+    flag, *known = ("--" + option.replace("_", "-") for option in (name, *PlanOptions.__annotations__))
+    if words := called_here(flag, known):
+        return ": " + re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), words)
+    similar = difflib.get_close_matches(name, PlanOptions.__annotations__, n=1)
+    return f": did you mean {similar[0]}?" if similar else ""

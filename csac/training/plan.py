@@ -197,7 +197,7 @@ def _choose_parts(
     groups: int | None, options: Options, existing: Manifest | None, can_be_sent: bool
 ) -> tuple[tuple[int, ...], ...]:
     """Return the seeds of each group, for as many groups as were asked for or, without a word, as pay here."""
-    if groups is None and existing and list(existing.seeds) == options.labels:
+    if groups is None and existing and (list(existing.seeds), existing.device) == (options.labels, options.device):
         groups = len(existing.groups) or 1  # so that the numbers stay the same to the last bit
     if groups is None:
         groups = choose_groups(options.seeds, options.device) if can_be_sent else 1

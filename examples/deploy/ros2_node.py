@@ -75,13 +75,22 @@ def run_without_ros(controller: Controller, seconds: float) -> None:
     import gymnasium
 
     contract = controller.policy.contract
-    robot = gymnasium.make(contract["task"])
+    keys = [part["key"] for part in contract["observation_parts"]]
+
+    def flat(observation: Any) -> np.ndarray:
+        parts = [observation] if keys == [None] else [observation[key] for key in keys]
+        return np.concatenate([np.ravel(part) for part in parts])
+
+    try:
+        robot = gymnasium.make(contract["task"], **contract["provenance"].get("environment_arguments", {}))
+    except gymnasium.error.Error as error:
+        raise SystemExit(f"Gymnasium alone does not make {contract['task']}: {error}") from None
     observation, _ = robot.reset(seed=0)
     steps = round(seconds * controller.rate)
     for step in range(steps):
         now = step / controller.rate
         if step < steps / 2:
-            controller.hear(observation, now)
+            controller.hear(flat(observation), now)
         action = controller.tick(now)
         print(f"{now:.2f} s: action {np.array2string(action, precision=3)}")
         observation, _, terminated, truncated, _ = robot.step(action.reshape(contract["action_shape"]))

@@ -13,6 +13,14 @@ def test_speed_looks_back_twenty_seconds(clock):
     assert speed.per_second() == 100.0
 
 
+def test_what_comes_seldom_has_a_speed_too(clock):
+    speed = Speed(clock)
+    for total in (0, 100, 300):
+        speed.add(total)
+        clock.now += 25
+    assert speed.per_second() == 8.0
+
+
 def test_elsewhere_than_on_a_terminal_a_line_comes_now_and_then(plain, clock):
     with progress_shown(plain, "playing", "steps", clock) as show:
         for done in range(71):

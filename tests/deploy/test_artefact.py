@@ -499,6 +499,19 @@ def test_opening_leaves_nothing_in_the_folder(tmp_path, format):
     assert {path.name for path in tmp_path.iterdir()} == {"contract.json", artefact.contract.file} | extra
 
 
+@needs_compiler
+def test_another_policy_in_one_source_file_is_refused_and_the_same_one_twice_is_not(tmp_path):
+    """The second would be left out by its guard, and the first one's actions taken for its own."""
+    for name, seed in (("walk", 1), ("stand", 2)):
+        leave(tmp_path / name, random_policy(contract(), seed), "c")
+    source = tmp_path / "main.c"
+    for second, compiles in (("walk", True), ("stand", False)):
+        source.write_text(f'#include "walk/policy.h"\n#include "{second}/policy.h"\nint main(void) {{ return 0; }}\n')
+        done = subprocess.run(["cc", "-c", source, "-o", tmp_path / "main.o"], capture_output=True, text=True)
+        assert (done.returncode == 0) == compiles, done.stderr
+    assert "another csac policy is in this source file already" in done.stderr
+
+
 # NumPy: the loader alone, in a Python that has nothing else.
 
 
@@ -519,6 +532,14 @@ def test_the_loader_runs_without_csac(tmp_path):
     assert not result.stderr
     expected = policy.predict(np.array([0.1, 0.2, 0.3, 0.4, 0.5]))[0]
     np.testing.assert_allclose(json.loads(result.stdout), expected, atol=1e-5)
+
+
+def test_the_loader_takes_one_observation_at_a_time(tmp_path):
+    """Of several it would give actions and standard deviations in a row."""
+    leave(tmp_path, random_policy(contract(((None, (3,)),)), 1), "numpy")
+    code = "import numpy, policy; policy.Policy().act(numpy.zeros((4, 3)))"
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert "an observation has the shape (3,), one at a time, not (4, 3)" in result.stderr
 
 
 def test_the_loader_refuses_another_policys_file(tmp_path):

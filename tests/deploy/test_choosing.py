@@ -9,7 +9,7 @@ import pytest
 from policies import contract, random_policy
 
 from csac.deploy.artefact_contract import ArtefactContract
-from csac.deploy.choosing import load
+from csac.deploy.choosing import choose_seed, load
 from csac.deploy.guards import NO_GUARDS, make_guards
 from csac.deploy.policy import Policy
 from csac.deploy.writing import write_artefact
@@ -116,6 +116,7 @@ def test_a_failed_seed_is_not_chosen(tmp_path):
 
 def test_a_seed_is_a_whole_number(tmp_path):
     save_run(tmp_path, EVALUATIONS)
+    assert type(choose_seed(RunDirectory.open(tmp_path), np.int64(1))) is int  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="seed is the label of one, a whole number, not '0'"):
         load(tmp_path, seed="0")  # pyright: ignore[reportArgumentType]
 
@@ -158,6 +159,8 @@ def test_a_saved_policy_has_no_seeds_and_replaces_no_run(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
         policies[0].save(tmp_path / "file")
+    with pytest.raises(InputError, match="cannot be written: File name too long"):
+        policies[0].save(tmp_path / ("x" * 300))
 
 
 def test_an_artefact_without_guards_is_loaded_and_one_with_guards_is_not(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
 import subprocess
 import sys
@@ -74,6 +75,33 @@ def test_the_node_without_ros(tmp_path):
     assert len(actions) == 20
     assert actions[14:] == ["[1.5]"] * 6  # heard last at 0.45 s: too old from 0.70 s on
     assert "[1.5]" not in actions[:14]
+
+
+def test_the_node_s_robot_is_the_task_with_its_arguments_and_all_parts_of_its_observation(tmp_path):
+    parts, folder = (("angle", (2,)), ("speed", (1,))), tmp_path / "numpy"
+    agreement = dataclasses.replace(contract(parts, (1,), -2.0, 2.0), task="node_task:Parts-v0")
+    folder.mkdir()
+    guards, policy = make_guards(agreement, fallback="1.5"), random_policy(agreement)
+    told = {"environment_arguments": {"angle": 0.25}}
+    artefact = ArtefactContract(agreement, "numpy", control_rate=20.0, guards=guards, provenance=told)
+    write_artefact(folder, policy.network, artefact)
+    (tmp_path / "node_task.py").write_text(
+        "import gymnasium, numpy as np\n"
+        "class Parts(gymnasium.Env):\n"
+        "    def __init__(self, angle): self.seen = {'speed': np.zeros(1), 'angle': np.full(2, angle)}\n"
+        "    def reset(self, **given): return self.seen, {}\n"
+        "    def step(self, action): return self.seen, 0.0, False, False, {}\n"
+        "gymnasium.register('Parts-v0', Parts, disable_env_checker=True, order_enforce=False)\n"
+    )
+    command = [sys.executable, EXAMPLES / "ros2_node.py", folder, "--seconds", "0.1"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    expected, _ = policy.predict({"angle": np.full(2, 0.25), "speed": np.zeros(1)})
+    assert f"action {np.array2string(expected.reshape(-1), precision=3)}" in done.stdout
+    (tmp_path / "node_task.py").write_text("")
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.stderr.startswith("Gymnasium alone does not make node_task:Parts-v0: ")
 
 
 def test_the_node_wants_a_fallback(tmp_path):

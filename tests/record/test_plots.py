@@ -195,10 +195,11 @@ def test_pictures_need_neither_pyplot_nor_jax():
     assert answer.stdout.strip() == "[]"
 
 
-def test_a_wrong_choice_of_window_stops_no_picture(tmp_path):
+@pytest.mark.parametrize("module", ["plots", "jitter"])
+def test_a_wrong_choice_of_window_stops_no_picture(tmp_path, module):
     path = tmp_path / "curve.png"
     code = (
-        "import os, numpy as np; from csac.record.plots import learning_curve; "
+        f"import csac.record.{module}, os, numpy as np; from csac.record.plots import learning_curve; "
         f"learning_curve([], {str(path)!r}); print(os.environ['MPLBACKEND'])"
     )
     environment = {**os.environ, "MPLBACKEND": "no_such_window"}

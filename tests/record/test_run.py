@@ -13,7 +13,7 @@ import pytest
 from csac.deploy.choosing import load
 from csac.record import run as record
 from csac.record.atomic import write_atomically
-from csac.record.csv_tables import COLUMNS, check_new, read_rows, write_rows
+from csac.record.csv_tables import COLUMNS, append_rows, check_new, read_rows, write_rows
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory, find_runs
 from csac.types import InputError
@@ -438,6 +438,13 @@ def test_a_table_that_cannot_be_is_refused_at_once_and_told_in_one_line(tmp_path
     with pytest.raises(InputError) as caught:
         write_rows(path, COLUMNS["evaluations"], [evaluation()])
     assert str(caught.value) == f"cannot write {path}: {reason}; choose another place"
+
+
+def test_what_a_killed_process_of_the_same_number_left_is_not_taken(tmp_path):
+    path = tmp_path / "rows.csv"
+    append_rows(tmp_path / f".rows.csv.{os.getpid()}", COLUMNS["evaluations"], [evaluation(), evaluation()])
+    write_rows(path, COLUMNS["evaluations"], [evaluation()])
+    assert len(read_rows(path)) == 1
 
 
 def test_log_lines_follow_each_other(run):

@@ -64,6 +64,11 @@ def test_five_seeds_have_one_with_its_interval():
     assert "| 300 (" in outlier  # the mean of 200, 300 and 400; the mean of all is 2200
 
 
+def test_a_spread_below_one_is_told():
+    row = table_of(near=[[20.1], [20.4], [20.2]])[2]
+    assert row.startswith("| near | 3 | 10 | 20.23 ± 0.15 | 19.85 to 20.61 |")  # 0.1528 / sqrt(3) * 4.303 = 0.38
+
+
 def test_two_seeds_and_one_have_no_interval():
     _, _, two, one = table_of(two=[[40.0], [60.0]], one=[[30.0]])
     assert two == "| two | 2 | 10 | 50 ± 14 | 2 seeds: no interval | 1.00 | 50 at 10 |"
@@ -283,6 +288,9 @@ def test_returns_by_seed_and_step_are_enough():
         ("report --label a=run,csac", "a: its runs differ in algorithm, sac and csac; give each a label of its own"),
         ("report --label a=metrics.csv", "metrics.csv has no returns: give an evaluations.csv"),
         ("report --label a=infinite.csv", "infinite.csv has returns beyond ±1e+100"),
+        ("report --label a=cut.csv", "cut.csv ends within a line, which may be cut off: end it with a newline"),
+        ("report strange", "evaluations.csv is damaged: it has no column episode; restore it"),
+        ("report --label a=crash.csv --until 5 --into page.md#it --table cases", "have no table of cases"),
         ("report run other --curve a.png", "these runs are of several tasks"),
     ],
 )
@@ -297,6 +305,11 @@ def test_mistakes_are_told_in_one_line(capsys, line, message):
     make_run_of("csac", [[1.0]], seeds=(1,), algorithm="csac")
     Path("metrics.csv").write_text("seed,step,q_mean\n0,10,1.5\n")
     Path("infinite.csv").write_text(f"{ROWS}\n0,10,0,inf,5,\n")
+    Path("cut.csv").write_text("seed,step,return\n0,10,1.0\n0,20,50.0")
+    Path("crash.csv").write_text(f"{ROWS},crash\n0,10,0,1,5,,1\n")
+    Path("strange").mkdir()
+    make_run_of("strange/run", [[1.0]])
+    Path("strange/run/evaluations.csv").write_text("seed,step\n0,5\n")
     Path("page.md").write_text("<!-- it: begin -->\n<!-- it: end -->\n")
     before = sorted(path.name for path in Path().iterdir())
     assert csac(line) == 2

@@ -102,6 +102,25 @@ def test_what_a_checkpoint_has_fits_or_is_refused(before, after, problem):
     assert found is None if problem is None else problem in found
 
 
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ({"entropy_weight": "auto"}, {}),
+        ({}, {"relative_entropy_form": "implicit"}),
+    ],
+)
+def test_means_begin_anew_where_other_things_are_told(before, after):
+    learner, again = (Learner(CSAC(**TINY, **changes), SPEC, [0], 100) for changes in (before, after))
+    advance(learner, 1, 1, 6)
+    rows = learner.memory(0, 6).rows.copy()
+    again.take_back([learner.save(0)], [lambda given: np.copyto(given, rows)])
+    assert again.metrics() == []
+    advance(again, 1, 7, 7)
+    alone = Learner(CSAC(**TINY, **after), SPEC, [0], 100)
+    advance(alone, 1, 1, 4)
+    assert again.metrics()[0].keys() == alone.metrics()[0].keys()
+
+
 SETTINGS = [(name, {}) for name in ALGORITHMS] + [("csac", {"reference_policy": "algorithm1"})]
 
 

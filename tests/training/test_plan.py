@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from csac import PPO, SAC, train
+from csac.record.manifest import Manifest
 from csac.training import provenance
 from csac.training.options import Options, PlanOptions, checked_options
-from csac.training.plan import Before, Plan
+from csac.training.plan import Before, Plan, _choose_parts
 from csac.training.resume import Source
 from csac.training.train import _warmup_note
 from csac.types import InputError
@@ -46,6 +47,10 @@ def test_what_is_not_given_is_as_declared():
         ({"device": "tpu"}, "device must be cpu or gpu, not 'tpu'"),
         ({"step": 5}, "train takes no step: did you mean steps?"),
         ({"zebra": 5}, "train takes no zebra$"),
+        ({"total_timesteps": 5}, "train takes no total_timesteps: it is steps here$"),
+        ({"env_kwargs": {}}, "train takes no env_kwargs: it is environment_arguments here$"),
+        ({"verbose": 1}, "train takes no verbose: none is needed$"),
+        ({"n_envs": 4}, "train takes no n_envs: each seed has one environment, and seeds says how many$"),
     ],
 )
 def test_a_mistake_is_told_in_one_line(given: Any, message):
@@ -108,6 +113,15 @@ def test_a_run_in_which_nothing_is_learnt_says_so(algorithm, steps, why):
 
     assert notes(steps) == [f"note: nothing will be learnt, {why}"]
     assert notes(steps + 1) == []
+
+
+@pytest.mark.parametrize(("device", "parts"), [("cpu", ((0,), (1,), (2,))), ("gpu", ((0, 1, 2),))])
+def test_the_seeds_of_a_run_stay_as_they_are_divided_on_its_device_alone(device, parts):
+    """A GPU trains all seeds in one program, however many processes a CPU had for them."""
+    existing = Manifest(
+        task="Hopper-v4", algorithm="sac", steps=100, seeds=(0, 1, 2), groups=((0,), (1,), (2,)), device="cpu"
+    )
+    assert _choose_parts(None, Options(seeds=3, device=device), existing, True) == parts
 
 
 def test_a_source_that_no_folder_can_be_called_is_refused_in_a_line():

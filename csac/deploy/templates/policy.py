@@ -46,6 +46,8 @@ class Policy:
             noise = self.generator.standard_normal(len(self.low), dtype=np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
             inputs = observation = np.asarray(observation, np.float32)
+            if observation.shape != (size := (self.contract["observation_size"],)):
+                raise ValueError(f"an observation has the shape {size}, one at a time, not {observation.shape}")
             if "normaliser.mean" in self.tensors:
                 mean, std, limit = (self.tensors["normaliser." + name] for name in ("mean", "std", "limit"))
                 inputs = np.minimum(np.maximum((inputs - mean) / std, -limit), limit)
