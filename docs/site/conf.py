@@ -43,6 +43,7 @@ NAVIGATION = {
         "docs/tuning",
         "docs/going-on",
         "docs/reliability",
+        "docs/glossary",
     ],
     "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")],
     "Measured": [
