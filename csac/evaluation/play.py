@@ -254,12 +254,23 @@ def _recording(
             open_writer.close()
         aside.replace(path)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}; choose another place") from error
+        raise InputError(f"cannot write {path}: {_reason(error, aside)}; choose another place") from error
     finally:
         for open_writer in writer:
             open_writer.close()
         with suppress(OSError):  # what was raised is told
             aside.unlink()
+
+
+def _reason(error: OSError, aside: Path) -> str:
+    """Say in a few words why there is no video: a failure of ffmpeg's comes as a broken pipe with its whole command."""
+    if error.strerror:
+        return error.strerror
+    try:
+        aside.open("ab").close()
+    except OSError as own:
+        return own.strerror or str(own)
+    return "ffmpeg broke off, for the reason that it gave above"
 
 
 def _aside(path: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 from typing import Any
 
@@ -133,14 +134,40 @@ def test_a_video_that_cannot_be_is_refused_before_the_episodes(run_of, tmp_path,
     assert ACTIONS == []
 
 
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # imageio_ffmpeg's, where ffmpeg ended by itself
 def test_a_folder_that_goes_meanwhile_is_told_in_one_line(run_of, tmp_path):
+    """Whether ffmpeg has opened its file by then or not."""
     (tmp_path / "films").mkdir()
     played = play(run_of(3).path, episodes=2, video=tmp_path / "films" / "film.mp4")
     next(played)
     shutil.rmtree(tmp_path / "films")
     (tmp_path / "films").touch()
-    with pytest.raises(InputError, match=r"cannot write .*film\.mp4: Not a directory; choose another place"):
+    with pytest.raises(InputError, match=r"cannot write .*film\.mp4: Not a directory; choose another place$"):
         list(played)
+    gc.collect()
+
+
+@pytest.mark.parametrize(
+    ("folder_goes", "reason"),
+    [(True, "No such file or directory"), (False, "ffmpeg broke off, for the reason that it gave above")],
+)
+def test_an_ffmpeg_that_ends_is_told_in_one_line(run_of, tmp_path, monkeypatch, folder_goes, reason):
+    def broken(path, shape, frames_per_second):
+        def frames():
+            yield
+            if folder_goes:
+                path.parent.rmdir()
+            raise OSError("[Errno 32] Broken pipe\n\nFFMPEG COMMAND:\nffmpeg -y\n\nFFMPEG STDERR OUTPUT:\n")
+
+        writer = frames()
+        next(writer)
+        return writer
+
+    monkeypatch.setattr(playing, "_open_video", broken)
+    film = tmp_path / "films" / "film.mp4"
+    with pytest.raises(InputError) as caught:
+        list(play(run_of(3).path, video=film))
+    assert str(caught.value) == f"cannot write {film}: {reason}; choose another place"
 
 
 def test_evaluating_a_run_tells_how_far_it_is(run_of):
