@@ -115,6 +115,21 @@ def test_the_tables_say_which_seeds_are_missing_and_left_out():
     assert "- not run: CSAC on Ant-v4: seed 1\n" in told
     assert "- left out of what is over all tasks: Hopper-v4, seed 1, which another task lacks\n" in told
     assert "S: comparisons, seeds 0" in told
+    alone = EVIDENCE.told(study, source, only=[1])
+    assert alone.startswith("## S: seeds 1 alone\n\n- not run: SAC, 0.2 on Ant-v4: seed 1\n")
+    assert "left out of what is over all tasks: Hopper-v4, seed 1" in alone
+    assert "comparisons" not in alone
+
+
+def test_some_seeds_alone_are_scaled_by_themselves():
+    sac, csac = STUDY.methods
+    arms = [
+        arm(sac, {seed: [1.0 + seed] * 5 for seed in range(4)}),
+        arm(csac, {seed: [4.0 + 4 * seed] * 5 for seed in range(4)}),
+    ]
+    found = EVIDENCE.measured(STUDY, arms, [2, 3])
+    assert found["Hopper-v4"]["CSAC"].seeds == (2, 3)
+    np.testing.assert_allclose(EVIDENCE.scaled(found, [2, 3])["CSAC"], [[12 / 3.5], [16 / 3.5]])
 
 
 def test_seeds_that_failed_before_their_first_evaluation_have_reached_nothing(tmp_path):

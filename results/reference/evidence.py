@@ -1,6 +1,7 @@
 """The numbers that PROTOCOL.md asks for, from the files in `cells/`, and the arms that it chooses by them.
 
     python results/reference/evidence.py tables results/reference/screen.toml results/reference/confirm.toml
+    python results/reference/evidence.py tables results/reference/tenth.toml --seeds 3 4 --into PAGE.md#NAME
     python results/reference/evidence.py write weights      (then options, then chosen)
     python results/reference/evidence.py null --tasks 3
 
@@ -22,7 +23,7 @@ import numpy as np
 
 from csac.record.atomic import write_atomically
 from csac.record.curve_measures import drawdown, recovery
-from csac.record.rendering import Cell, Row, Table, markdown, number, numeric
+from csac.record.rendering import Cell, Row, Table, between_markers, markdown, number, numeric
 from csac.record.statistics import (
     dispersion_across,
     evaluation_matrix,
@@ -109,13 +110,13 @@ def measure(arm: Arm, steps: int, seeds: Sequence[int]) -> Measured:
     )
 
 
-def measured(study: Study, arms: Sequence[Arm]) -> dict[str, dict[str, Measured]]:
-    """Return, task by task, what each method has reached on the seeds that all of them have there."""
+def measured(study: Study, arms: Sequence[Arm], only: Sequence[int] = ()) -> dict[str, dict[str, Measured]]:
+    """Return, task by task, what each method has reached on the seeds that all of them have there, or `only` these."""
     found: dict[str, dict[str, Measured]] = {}
     for task in study.tasks:
         here = [arm for arm in arms if arm.task == task]
         over = [{manifest.seeds[0] for manifest in arm.manifests} | set(arm.failures) for arm in here]
-        seeds = sorted(set.intersection(*over))
+        seeds = sorted(set.intersection(*over, *([set(only)] if only else [])))
         if seeds:
             found[task] = {arm.label: measure(arm, study.steps_for(task), seeds) for arm in here}
     return found
@@ -258,15 +259,23 @@ def _with_interval(value: float, interval: tuple[float, float] | None) -> Cell:
     return numeric(value, f"{value:.2f}" + (f" ({interval[0]:.2f} to {interval[1]:.2f})" if interval else ""))
 
 
-def told(study: Study, source: Source) -> str:
-    """Return what is known of a study: what did not run, what failed, which seeds are left out, and the tables."""
+def told(study: Study, source: Source, only: Sequence[int] = ()) -> str:
+    """Return what is known of a study: what did not run, what failed, which seeds are left out, and the tables.
+
+    With `only` these seeds count, and all that has a scale is scaled by theirs.
+    """
     arms = gather(study, source)
-    found = measured(study, arms)
+    found = measured(study, arms, only)
     seeds = common_seeds(study, found)
     over = {task: set(next(iter(methods.values())).seeds) for task, methods in found.items()}
     notes = [
-        *(f"not run: {arm.label} on {arm.task}: seed {seed}" for arm in arms for seed in arm.missing),
-        *(f"failed: {arm.label} on {arm.task}: seed {seed}" for arm in arms for seed in arm.failures),
+        *(
+            f"{what}: {arm.label} on {arm.task}: seed {seed}"
+            for what, of in (("not run", lambda arm: arm.missing), ("failed", lambda arm: arm.failures))
+            for arm in arms
+            for seed in of(arm)
+            if not only or seed in only
+        ),
         *(
             f"left out of what is over all tasks: {task}, seed {seed}, which another task lacks"
             for task, own in over.items()
@@ -276,8 +285,19 @@ def told(study: Study, source: Source) -> str:
     tables = [task_table(task, methods) for task, methods in found.items()]
     if seeds:
         tables += [overall_table(study, found), comparison_table(study, found)]
-    parts = [f"## {study.title}", "\n".join(f"- {note}" for note in notes), *map(markdown, tables)]
+    title = f"## {study.title}" + (f": seeds {', '.join(map(str, only))} alone" if only else "")
+    parts = [title, "\n".join(f"- {note}" for note in notes), *map(markdown, tables)]
     return "\n\n".join(part for part in parts if part)
+
+
+def write_into(place: str, text: str) -> None:
+    """Write between the marks of a page, PAGE.md#NAME. Raises InputError where it lacks them or is not there."""
+    page, _, name = place.partition("#")
+    try:
+        new = between_markers(Path(page).read_text(encoding="utf-8"), name, text)
+        write_atomically(Path(page), new.encode())
+    except OSError as error:
+        raise InputError(f"cannot write into {page}: {error.strerror}") from None
 
 
 # Choosing.
@@ -405,6 +425,8 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     tables = commands.add_parser("tables", help="print the tables of studies")
     tables.add_argument("studies", nargs="+", type=Path, metavar="STUDY.toml")
+    tables.add_argument("--seeds", nargs="+", type=int, default=(), help="only these, where the study has them")
+    tables.add_argument("--into", metavar="PAGE.md#NAME", help="write between the marks NAME of a page")
     writing = commands.add_parser("write", help="write the arms of a stage, by the results of those before it")
     writing.add_argument("stage", choices=STAGES)
     for command in (tables, writing):
@@ -415,8 +437,12 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         if arguments.command == "tables":
-            for path in arguments.studies:
-                print(told(read_study(path), Results(arguments.results)) + "\n")
+            source = Results(arguments.results)
+            text = "\n\n".join(told(read_study(path), source, arguments.seeds) for path in arguments.studies) + "\n"
+            if arguments.into:
+                write_into(arguments.into, text)
+            else:
+                print(text)
         elif arguments.command == "write":
             print("\n".join(f"written: {path}" for path in write(arguments.stage, HERE, Results(arguments.results))))
         else:
