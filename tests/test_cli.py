@@ -38,14 +38,14 @@ def csac(line):
 
 
 class Pictures(gymnasium.Env):
-    """Five steps of reward 1, and a picture of each."""
+    """Five steps of the same reward, and a picture of each."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
     observation_space = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
     action_space = gymnasium.spaces.Box(-2, 2, (1,), np.float32)
 
-    def __init__(self, render_mode=None):
-        self.render_mode, self.steps = render_mode, 0
+    def __init__(self, render_mode=None, reward=1.0):
+        self.render_mode, self.reward, self.steps = render_mode, reward, 0
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -54,7 +54,7 @@ class Pictures(gymnasium.Env):
 
     def step(self, action):
         self.steps += 1
-        return np.zeros(3, np.float32), 1.0, self.steps == 5, False, {}
+        return np.zeros(3, np.float32), self.reward, self.steps == 5, False, {}
 
     def render(self):
         return np.full((34, 48, 3), 40 * self.steps, np.uint8)
@@ -752,6 +752,30 @@ def test_play_writes_a_video(capsys):
     pictures = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 34 * 48)
     assert np.rint(pictures.mean(axis=1) / 40).tolist() == [0, 1, 2, 3, 4, 5, 5, 5, 5, 5] * 2
     assert [path.name for path in Path("new").iterdir()] == ["film.mp4"]
+
+
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")
+def test_small_returns_have_digits(capsys):
+    run = make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+    run.update_manifest(environment_arguments={"reward": 0.00246})
+
+    assert csac("play run --video film.mp4") == 0
+    assert capsys.readouterr().out.startswith("episode 0: return 0.0123 in 5 steps\n")
+
+    assert csac("evaluate run --episodes 2") == 0
+    assert words(capsys.readouterr().out)[1] == "0 0.0123 0 0.0123 0.0123 5.0"
+
+
+def test_the_rows_of_failed_seeds_alone_are_no_file(capsys):
+    run = make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+    run.update_manifest(failures={0: "step 120: its reward is nan", 1: "step 130: its reward is nan"})
+
+    assert csac("evaluate run --episodes 1 --csv rows.csv") == 1
+
+    output = capsys.readouterr()
+    assert "seed 0 failed at step 120: its reward is nan; it is in no mean" in output.out + output.err
+    assert output.err.endswith("rows.csv is not written: every seed that was tested had failed in training\n")
+    assert not Path("rows.csv").exists()
 
 
 def test_play_plays_the_perturbed_task(capsys):

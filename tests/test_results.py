@@ -73,6 +73,18 @@ def test_the_table_of_the_relative_entropy_follows_from_its_runs(copied, monkeyp
     assert (script.parent / "mechanism.png").stat().st_size > 10_000
 
 
+def test_the_tables_of_the_evidence_follow_from_its_cells(copied, monkeypatch):
+    page = copied / "results" / "reference" / "README.md"
+    before = page.read_text()
+    page.write_text(re.sub(r"(<!-- (\S+): begin -->\n).*?(<!-- \2: end -->)", r"\1\3", before, flags=re.DOTALL))
+    lines = re.findall(r"^python (results/reference/evidence.py tables .*)$", before, re.MULTILINE)
+    assert len(lines) == before.count(": begin -->")
+    for line in lines:
+        monkeypatch.setattr(sys, "argv", shlex.split(line))
+        runpy.run_path(sys.argv[0], run_name="__main__")
+    assert page.read_text() == before
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
 def test_no_table_of_numbers_is_written_by_hand(page):
     """What stands between markers is written by a command; any other table may only list files and commands."""
