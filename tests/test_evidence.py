@@ -101,9 +101,9 @@ def test_what_is_over_all_tasks_is_over_the_seeds_that_all_tasks_have():
     overall = cells_of_row(EVIDENCE.overall_table(study, found), "CSAC")
     assert overall[1].value == pytest.approx((1.5 + 0.5) / 2)  # without seed 5 and its 99
     compared = cells_of_row(EVIDENCE.comparison_table(study, found), "CSAC", "SAC, 0.2")
-    assert compared[2].text == "0.50 (0.50 to 0.50)"
+    assert compared[2].text == "0.500 (0.500 to 0.500)"
     assert compared[3].text == "not told apart"
-    assert [cell.text for cell in compared[-2:]] == ["1.00 (1.00 to 1.00)", "0.00 (0.00 to 0.00)"]
+    assert [cell.text for cell in compared[-2:]] == ["1.000 (1.000 to 1.000)", "0.000 (0.000 to 0.000)"]
     assert EVIDENCE.common_seeds(study, {"Hopper-v4": found["Hopper-v4"]}) == []  # a task has nothing
 
 
@@ -119,6 +119,8 @@ def test_the_tables_say_which_seeds_are_missing_and_left_out():
     assert alone.startswith("## S: seeds 1 alone\n\n- not run: SAC, 0.2 on Ant-v4: seed 1\n")
     assert "left out of what is over all tasks: Hopper-v4, seed 1" in alone
     assert "comparisons" not in alone
+    with pytest.raises(InputError, match="s has the seeds 0 to 1"):
+        EVIDENCE.told(study, source, only=[7])
 
 
 def test_some_seeds_alone_are_scaled_by_themselves():

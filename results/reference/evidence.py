@@ -50,7 +50,12 @@ MARK = "# From here on written by evidence.py: PROTOCOL.md says when.\n"
 SHARED = sorted((complete("sac", {}).keys() & complete("csac", {}).keys()) - {"entropy_weight", "target_entropy"})
 
 WEIGHTS = (0.05, 5.0)
-PERIODIC = Method("CSAC, periodic 1000", "csac", None, {"reference_policy": "periodic", "reference_period": 1000})
+PERIODIC = Method(
+    "CSAC, periodic 1000",
+    "csac",
+    None,
+    {"reference_policy": "periodic", "reference_period": 1000, "relative_entropy_estimator": "closed_form"},
+)
 OPTIONS: dict[str, dict[str, Any]] = {
     "entropy weight automatic": {"entropy_weight": "auto"},
     "relative-entropy weight automatic": {"relative_entropy_weight": "auto", "target_relative_entropy": 0.01},
@@ -256,14 +261,17 @@ def _compared(values: np.ndarray, others: np.ndarray) -> tuple[Cell, Cell]:
 
 
 def _with_interval(value: float, interval: tuple[float, float] | None) -> Cell:
-    return numeric(value, f"{value:.2f}" + (f" ({interval[0]:.2f} to {interval[1]:.2f})" if interval else ""))
+    return numeric(value, f"{value:.3f}" + (f" ({interval[0]:.3f} to {interval[1]:.3f})" if interval else ""))
 
 
 def told(study: Study, source: Source, only: Sequence[int] = ()) -> str:
     """Return what is known of a study: what did not run, what failed, which seeds are left out, and the tables.
 
-    With `only` these seeds count, and all that has a scale is scaled by theirs.
+    With `only` these seeds count, and all that has a scale is scaled by theirs. Raises InputError for none of its own.
     """
+    of_study = range(study.first_seed, study.first_seed + study.seeds)
+    if only and not set(only) & set(of_study):
+        raise InputError(f"{study.name} has the seeds {of_study.start} to {of_study.stop - 1}")
     arms = gather(study, source)
     found = measured(study, arms, only)
     seeds = common_seeds(study, found)
@@ -285,7 +293,7 @@ def told(study: Study, source: Source, only: Sequence[int] = ()) -> str:
     tables = [task_table(task, methods) for task, methods in found.items()]
     if seeds:
         tables += [overall_table(study, found), comparison_table(study, found)]
-    title = f"## {study.title}" + (f": seeds {', '.join(map(str, only))} alone" if only else "")
+    title = f"## {study.title}" + (f": seeds {', '.join(map(str, sorted(set(only))))} alone" if only else "")
     parts = [title, "\n".join(f"- {note}" for note in notes), *map(markdown, tables)]
     return "\n\n".join(part for part in parts if part)
 
