@@ -381,9 +381,17 @@ def test_a_preset_is_the_algorithms_own(train_call):
 
 
 def test_weights_that_adapt_come_back_from_the_manifest(train_call):
-    line = "Hopper-v4 --entropy-weight auto --relative-entropy-weight auto --target-relative-entropy 0.02"
+    line = (
+        "Hopper-v4 --reference-policy periodic --entropy-weight auto --relative-entropy-weight auto "
+        "--target-relative-entropy 0.02"
+    )
     algorithm = train_call(line)["algorithm"]
-    assert algorithm == CSAC(entropy_weight="auto", relative_entropy_weight="auto", target_relative_entropy=0.02)
+    assert algorithm == CSAC(
+        entropy_weight="auto",
+        relative_entropy_weight="auto",
+        reference_policy="periodic",
+        target_relative_entropy=0.02,
+    )
     assert train_call("Hopper-v4 --entropy-weight 0.3")["algorithm"] == CSAC(entropy_weight=0.3)
 
     told = replace(NOTHING, hyperparameters=asdict(algorithm))
@@ -454,10 +462,10 @@ def test_the_help_of_train_explains_every_hyperparameter(capsys, monkeypatch, na
 def test_the_help_shows_what_a_preset_sets(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
 
-    csac("train --preset paper --help")
+    csac("train --algorithm sac --preset paper --help")
 
     output = " ".join(capsys.readouterr().out.split())
-    assert "(default: algorithm1)" in output
+    assert "(default: fixed)" in output
     assert "(default: paper)" in output
 
 

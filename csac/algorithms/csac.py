@@ -43,7 +43,10 @@ class State(NamedTuple):
 FIRST_WEIGHTS = Weights(1.0, 0.5)  # of those that adapt: SAC's first temperature, and the paper's τ
 
 NOT_TOGETHER = (
-    ({"relative_entropy_weight": ["auto"], "reference_policy": ["algorithm1"]}, "the actor is its own reference"),
+    (
+        {"relative_entropy_weight": ["auto"], "reference_policy": ["algorithm1"]},
+        "the actor is its own reference; reference_policy periodic keeps another",
+    ),
     (
         {"relative_entropy_weight": ["auto"], "reference_policy": ["periodic"], "reference_period": [1]},
         "the actor is its own reference",
@@ -61,8 +64,8 @@ class CSAC:
     entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.2
     """Weight of the entropy (the paper's sigma); `auto` holds the policy's entropy at its target, as SAC does."""
     relative_entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.5
-    """Weight of the relative entropy towards the reference (the paper's tau); 0 is SAC, `auto` holds it at a target."""
-    reference_policy: ReferencePolicy = "periodic"
+    """Weight of the relative entropy towards the reference (the paper's tau); 0 is SAC, `auto` learns it."""
+    reference_policy: ReferencePolicy = "algorithm1"
     """The reference: the actor before the gradients or before the last update, a periodic copy, or an average."""
     reference_period: Annotated[int, COUNT] = 1000
     """Updates between two copies of the actor, with `periodic`."""
@@ -70,8 +73,8 @@ class CSAC:
     """Step of the running average towards the actor, with `average`."""
     critic_reference: Literal["same", "earlier"] = "same"
     """In the critic's target: the actor and its reference, or (CVI) that reference pi_k and the pi_{k-1} before it."""
-    relative_entropy_estimator: Literal["closed_form", "sampled"] = "closed_form"
-    """The exact KL of the two policies, or the paper's log-ratio at the sampled action."""
+    relative_entropy_estimator: Literal["closed_form", "sampled"] = "sampled"
+    """The paper's log-ratio at the sampled action, or the exact KL of the two policies: 0 with `algorithm1`."""
     relative_entropy_form: Literal["explicit", "actor_only", "implicit"] = "explicit"
     """In the critic's target and the actor's loss; in the latter alone; or as tau log pi in the reward (Munchausen)."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0

@@ -103,7 +103,7 @@ class Cell:
 
     @functools.cached_property
     def arm(self) -> str:
-        """What is trained, whatever the seed: `csac-algorithm1-sampled-100k-1a2b3c4d`."""
+        """What is trained, whatever the seed: `csac-periodic-closed_form-100k-1a2b3c4d`."""
         configuration = dataclasses.asdict(self)
         del configuration["seed"]
         words = [self.algorithm, *_told(self.algorithm, self.hyperparameters), *self.perturbations, short(self.steps)]

@@ -16,12 +16,15 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 CSAC_PAPER = Method("CSAC (paper)", "csac", "paper", published="CSAC")
-CSAC_DEFAULT = Method("CSAC (default)", "csac")
+PERIODIC = MappingProxyType(
+    {"reference_policy": "periodic", "reference_period": 1000, "relative_entropy_estimator": "closed_form"}
+)
+CSAC_PERIODIC = Method("CSAC (periodic)", "csac", hyperparameters=PERIODIC)
 SAC = Method("SAC", "sac", "paper", published="SAC")
 PPO = Method("PPO", "ppo", "paper", published="PPO")
 TD3 = Method("TD3", "td3", "paper", published="TD3")
 SD3 = Method("SD3", "sd3", "paper", published="SD3")
-ALL = (CSAC_PAPER, CSAC_DEFAULT, SAC, PPO, TD3, SD3)
+ALL = (CSAC_PAPER, CSAC_PERIODIC, SAC, PPO, TD3, SD3)
 
 MUJOCO = Study(
     "mujoco",
@@ -39,10 +42,10 @@ ABLATION = Study(
         replace(
             method,
             label=f"{method.label}, tau {tau:g}",
-            hyperparameters={"relative_entropy_weight": tau},
+            hyperparameters={**method.hyperparameters, "relative_entropy_weight": tau},
             published=f"tau {tau:g}" if method.published else None,
         )
-        for method in (CSAC_PAPER, CSAC_DEFAULT)
+        for method in (CSAC_PAPER, CSAC_PERIODIC)
         for tau in paper.TAUS
     ),
 )
@@ -55,7 +58,7 @@ ROBUSTNESS = Study(
     "robustness",
     "More friction in mid-training on HalfCheetah",
     tasks=(paper.FRICTION_TASK,),
-    methods=(CSAC_PAPER, CSAC_DEFAULT, SAC),
+    methods=(CSAC_PAPER, CSAC_PERIODIC, SAC),
     conditions=tuple((f"friction={factor:g}@{paper.FRICTION_STEP}",) for factor in paper.FRICTION_FACTORS),
     analyses=("robustness",),
 )
@@ -88,7 +91,15 @@ REFERENCE = replace(
         Method("SAC, automatic", "sac"),
         replace(CSAC_PAPER, label="CSAC, paper"),
         *(
-            Method(f"CSAC, {label}", "csac", hyperparameters={"relative_entropy_weight": 0.5, **hyperparameters})
+            Method(
+                f"CSAC, {label}",
+                "csac",
+                hyperparameters={
+                    "relative_entropy_weight": 0.5,
+                    "relative_entropy_estimator": "closed_form",
+                    **hyperparameters,
+                },
+            )
             for label, hyperparameters in (
                 ("previous", {"reference_policy": "previous"}),
                 ("periodic 100", {"reference_policy": "periodic", "reference_period": 100}),

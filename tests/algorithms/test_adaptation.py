@@ -10,7 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from equations import LINEAR, ONE, POLICY, REFERENCE, batch_of, gaussian, linear, transition, update
+from equations import (
+    CLOSED_FORM,
+    LINEAR,
+    ONE,
+    PERIODIC,
+    POLICY,
+    REFERENCE,
+    batch_of,
+    gaussian,
+    linear,
+    transition,
+    update,
+)
 
 from csac.algorithms import CSAC
 from csac.algorithms.adaptation import (
@@ -72,6 +84,7 @@ def relative_entropies(target, updates, actor_learning_rate=0.03):
         relative_entropy_weight="auto",
         target_relative_entropy=target,
         reference_period=PERIOD,
+        **PERIODIC,
         actor_learning_rate=actor_learning_rate,
         critic_learning_rate=1e-9,  # the critics are given
         weight_learning_rate=0.005,
@@ -117,6 +130,7 @@ def test_both_weights_are_told_as_they_were_used():
         weight_learning_rate=0.1,
         actor_hidden_sizes=(),
         critic_hidden_sizes=(),
+        **PERIODIC,
     )
     state = algorithm.init(jax.random.key(0), ONE, 1000)
     state, metrics = update(algorithm, state, batch_of(transition()))
@@ -141,6 +155,7 @@ def test_the_weight_goes_by_the_relative_entropy_of_the_last_refresh(choice, mea
         relative_entropy_weight="auto",
         reference_policy=choice,
         reference_period=3,
+        **CLOSED_FORM,
         target_relative_entropy=target,
         weight_learning_rate=rate,
         **LINEAR,
@@ -166,7 +181,7 @@ def test_the_weight_goes_by_the_relative_entropy_of_the_last_refresh(choice, mea
 
 
 def test_a_checkpoint_from_before_the_refresh_was_kept_is_refused_in_one_line():
-    learner = Learner(CSAC(relative_entropy_weight="auto", batch_size=8, **LINEAR), ONE, [0], 100)
+    learner = Learner(CSAC(relative_entropy_weight="auto", batch_size=8, **PERIODIC, **LINEAR), ONE, [0], 100)
     saved = learner.save(0)
     del saved.arrays["state.relative_entropy_per_refresh"]
     with pytest.raises(InputError) as raised:
@@ -187,6 +202,7 @@ def test_both_targets_grow_with_the_action_dimensions():
         entropy_weight="auto",
         relative_entropy_weight="auto",
         reference_policy="previous",
+        **CLOSED_FORM,
         target_relative_entropy=0.2,
         weight_learning_rate=0.1,
         **LINEAR,
@@ -205,7 +221,8 @@ def test_both_targets_grow_with_the_action_dimensions():
 
 def test_the_target_charges_the_weight_that_is_learnt():
     # τ = 2, KL = 0.4431472, critics 0 and target critics 3: y = 2 + 0.5 (3 - 2·0.4431472), and the loss is 2 y².
-    algorithm = CSAC(entropy_weight=0.0, relative_entropy_weight="auto", reference_policy="previous", **LINEAR)
+    settings: dict[str, Any] = {"reference_policy": "previous", **CLOSED_FORM, **LINEAR}
+    algorithm = CSAC(entropy_weight=0.0, relative_entropy_weight="auto", **settings)
     nothing, three = linear([[0.0], [0.0]], [0.0]), linear([[0.0], [0.0]], [3.0])
     state = algorithm.init(jax.random.key(0), ONE, 1000)
     weights = state.learnt_weights

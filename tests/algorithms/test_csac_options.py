@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -9,10 +11,12 @@ import numpy as np
 import pytest
 from equations import (
     BOTH_WEIGHTS,
+    CLOSED_FORM,
     CRITICS,
     LINEAR,
     NOISE,
     ONE,
+    PERIODIC,
     POLICY,
     REFERENCE,
     batch_of,
@@ -85,7 +89,12 @@ def test_the_implicit_bonus_belongs_to_the_action_that_was_taken_and_no_terminat
 # CVI charges π_k for its distance from π_(k-1), while the actor, already beyond π_k, is charged for its own from π_k:
 # KL(N(0, 1) ‖ N(1, 2²)) = 0.4431472 and KL(N(1, 2²) ‖ N(0, 2²)) = 1/8.
 EARLIER = gaussian(0.0, 2.0)
-EARLIER_CRITIC = {"relative_entropy_weight": 0.5, "critic_reference": "earlier", "reference_period": 4}
+EARLIER_CRITIC: dict[str, Any] = {
+    "relative_entropy_weight": 0.5,
+    "critic_reference": "earlier",
+    "reference_period": 4,
+    **CLOSED_FORM,
+}
 
 
 @pytest.mark.parametrize(
@@ -114,7 +123,7 @@ def test_the_critic_s_own_reference(choice, step, of_the_actor, of_the_critic):
 
 @pytest.mark.parametrize("normalisation", ["none", "batch"])
 def test_between_renewals_the_critics_of_two_references_do_not_hear_of_the_actor(normalisation):
-    algorithm = CSAC(critic_normalisation=normalisation, **EARLIER_CRITIC, **LINEAR)
+    algorithm = CSAC(reference_policy="periodic", critic_normalisation=normalisation, **EARLIER_CRITIC, **LINEAR)
     state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(reference=REFERENCE, earlier_reference=EARLIER)
     batch = batch_of(transition(), transition(observation=-1.0, next_observation=0.5, action=-0.2))
 
@@ -133,7 +142,7 @@ def test_the_next_action_of_two_references_is_that_of_the_stored_policy():
     # 3 + 2a, and log π is left out: y = 2 + 0.5 (3 + 2·0.5) = 4, where the actor's own action would make it 3.
     stored, actor = gaussian(0.5493061, 1e-6), gaussian(-0.5493061, 1e-6)
     nothing, rising = linear([[0.0], [0.0]], [0.0]), linear([[0.0], [2.0]], [3.0])
-    algorithm = CSAC(entropy_weight=0.0, **EARLIER_CRITIC, **LINEAR)
+    algorithm = CSAC(reference_policy="periodic", entropy_weight=0.0, **EARLIER_CRITIC, **LINEAR)
     state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(
         actor=actor,
         reference=stored,
@@ -152,8 +161,11 @@ def test_the_next_action_of_two_references_is_that_of_the_stored_policy():
             {"relative_entropy_weight": "auto", "reference_policy": "algorithm1"},
             "relative_entropy_weight auto with reference_policy algorithm1 makes no sense: the actor is its own",
         ),
-        ({"relative_entropy_weight": "auto", "reference_period": 1}, "the actor is its own reference"),
-        ({"relative_entropy_weight": "auto", "relative_entropy_form": "implicit"}, "there is no reference"),
+        (
+            {"relative_entropy_weight": "auto", "reference_policy": "periodic", "reference_period": 1},
+            "the actor is its own reference",
+        ),
+        ({"relative_entropy_weight": "auto", "relative_entropy_form": "implicit", **PERIODIC}, "there is no reference"),
         ({"critic_reference": "earlier", "relative_entropy_form": "actor_only"}, "the target has none"),
         ({"critic_reference": "earlier", "relative_entropy_form": "implicit"}, "the target has none"),
         ({"critic_reference": "earlier", "reference_policy": "average"}, "no copy replaces another"),

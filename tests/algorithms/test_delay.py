@@ -101,7 +101,12 @@ def test_periodic_references_are_renewed_while_the_actor_waits():
 
 def test_a_refresh_comes_to_what_the_last_movement_in_its_period_measures():
     algorithm = CSAC(
-        policy_delay=3, reference_policy="periodic", reference_period=8, relative_entropy_weight="auto", **SMALL
+        policy_delay=3,
+        reference_policy="periodic",
+        reference_period=8,
+        relative_entropy_weight="auto",
+        relative_entropy_estimator="closed_form",
+        **SMALL,
     )
     found = [metrics for _, metrics in updates(algorithm, 15)[1:]]
     # Periods end after updates 7 and 15; the actor moves at 2, 5, 8, 11 and 14.
@@ -115,15 +120,15 @@ def test_a_refresh_comes_to_what_the_last_movement_in_its_period_measures():
 def test_references_that_a_waiting_actor_would_take_the_place_of():
     options: list[tuple[dict[str, Any], int]] = [
         ({"critic_reference": "earlier", "reference_policy": "algorithm1"}, 2),
-        ({"critic_reference": "earlier", "reference_period": 2}, 3),
-        ({"relative_entropy_weight": "auto", "reference_period": 5}, 6),
+        ({"critic_reference": "earlier", "reference_policy": "periodic", "reference_period": 2}, 3),
+        ({"relative_entropy_weight": "auto", "reference_policy": "periodic", "reference_period": 5}, 6),
     ]
     for option, least in options:
         kept = option.get("reference_period", 1)
         with pytest.raises(InputError, match=f"kept for at least {least} updates, not {kept}: an actor that waits"):
             CSAC(policy_delay=kept + 1 if least < 6 else 3, **option)
-    CSAC(policy_delay=3, relative_entropy_weight="auto", reference_period=6)
-    CSAC(policy_delay=3, critic_reference="earlier", reference_period=3)
+    CSAC(policy_delay=3, reference_policy="periodic", relative_entropy_weight="auto", reference_period=6)
+    CSAC(policy_delay=3, reference_policy="periodic", critic_reference="earlier", reference_period=3)
 
 
 def test_adam_by_hand():

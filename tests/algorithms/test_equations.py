@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from equations import (
     BOTH_WEIGHTS,
+    CLOSED_FORM,
     CRITICS,
     LINEAR,
     NOISE,
@@ -281,7 +282,12 @@ def test_reference_policy_over_time(choice):
 def test_the_critic_target_of_an_update_uses_the_reference_policy(choice, step, relative_entropy):
     # No entropy weight, critics 0 and target critics 3 everywhere: y = 2 + 0.5 (3 - 0.5 KL), and the loss is 2 y².
     algorithm = CSAC(
-        entropy_weight=0.0, relative_entropy_weight=0.5, reference_policy=choice, reference_period=4, **LINEAR
+        entropy_weight=0.0,
+        relative_entropy_weight=0.5,
+        reference_policy=choice,
+        reference_period=4,
+        **CLOSED_FORM,
+        **LINEAR,
     )
     nothing, three = linear([[0.0], [0.0]], [0.0]), linear([[0.0], [0.0]], [3.0])
     state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(

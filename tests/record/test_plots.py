@@ -106,7 +106,7 @@ def test_every_run_is_in_the_legend_under_its_own_label_and_look(tmp_path, figur
     assert box.x1 <= figures[0].bbox.x1
 
 
-LABELS = [f"CSAC (default), tau {tau:g}" for tau in (0.005, 0.05, 0.5, 5, 50, 500, 5000)]
+LABELS = [f"CSAC (periodic), tau {tau:g}" for tau in (0.005, 0.05, 0.5, 5, 50, 500, 5000)]
 TITLE = "PyFlyt/QuadX-Waypoints-v1: CSAC's reference policies, friction x 2.5 after step 300,000"
 
 

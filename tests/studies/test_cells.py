@@ -57,7 +57,7 @@ def test_the_name_tells_what_is_not_default():
     paper = Cell.make(
         "Walker2d-v4",
         "csac",
-        {"relative_entropy_weight": 5, "reference_policy": "algorithm1"},
+        {"relative_entropy_weight": 5, "reference_policy": "periodic"},
         steps=100_000,
         seed=3,
         evaluation_interval=5_000,
@@ -66,7 +66,7 @@ def test_the_name_tells_what_is_not_default():
     )
     task, arm, seed = paper.name.parts
     assert (task, seed) == ("Walker2d-v4", "seed-3")
-    assert arm.rpartition("-")[0] == "csac-relative_entropy_weight=5-algorithm1-friction=1.5@30000-100k"
+    assert arm.rpartition("-")[0] == "csac-relative_entropy_weight=5-periodic-friction=1.5@30000-100k"
 
 
 def test_what_a_manifest_says_is_the_cell_again(tmp_path):

@@ -92,9 +92,9 @@ def test_a_click_on_a_heading_sorts_the_table(opened):
     assert column(page, table, 1)[-1] == "PPO"
     table.locator("th", has_text="the paper").get_by_role("button").click()
     assert column(page, table, 2)[:2] == ["4,181.89 ± 723.54", "7,158.19 ± 2,821.74"]
-    assert column(page, table, 1)[-1] == "CSAC (default)"  # of which the paper has nothing: last, either way round
+    assert column(page, table, 1)[-1] == "CSAC (periodic)"  # of which the paper has nothing: last, either way round
     table.locator("th", has_text="the paper").get_by_role("button").click()
-    assert column(page, table, 1)[-1] == "CSAC (default)"
+    assert column(page, table, 1)[-1] == "CSAC (periodic)"
 
 
 def test_the_legend_toggles_a_curve_with_its_band(opened):

@@ -45,7 +45,7 @@ def test_too_many_arms_are_in_several_pictures_each_with_csac_beside_sac():
 
 def test_variants_of_csac_that_are_swept_have_a_picture_each():
     shown = pictures(study_of("ablation"))
-    assert list(shown) == ["Walker2d-v4, CSAC (paper)", "Walker2d-v4, CSAC (default)"]
+    assert list(shown) == ["Walker2d-v4, CSAC (paper)", "Walker2d-v4, CSAC (periodic)"]
     assert [len(labels) for labels in shown.values()] == [5, 5]
 
 

@@ -319,7 +319,8 @@ def test_what_means_nothing_or_is_given_is_not_searched():
     def names(algorithm, wanted=None, given=()):
         return list(searched(algorithm.name, vars(algorithm), wanted, given))
 
-    assert "reference_period" in names(CSAC())
+    assert "reference_period" in names(CSAC(reference_policy="periodic"))
+    assert "reference_period" not in names(CSAC())
     assert "reference_rate" not in names(CSAC())
     assert "reference_rate" in names(CSAC(reference_policy="average"))
     assert "entropy_weight" not in names(SAC())

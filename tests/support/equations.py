@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,8 +52,12 @@ POLICY, REFERENCE, NOISE = gaussian(0.0, 1.0), gaussian(1.0, 2.0), jnp.array([0.
 CRITICS = (linear([[1.0], [2.0]], [0.0]), linear([[0.0], [-1.0]], [3.0]))
 
 
+CLOSED_FORM: dict[str, Any] = {"relative_entropy_estimator": "closed_form"}
+PERIODIC: dict[str, Any] = {"reference_policy": "periodic", **CLOSED_FORM}
+
+
 def csac(**settings) -> CSAC:
-    return CSAC(**{"entropy_weight": 0.2, "relative_entropy_weight": 0.5, "discount": 0.9, **settings})
+    return CSAC(**{"entropy_weight": 0.2, "relative_entropy_weight": 0.5, "discount": 0.9, **CLOSED_FORM, **settings})
 
 
 BOTH_WEIGHTS = Weights(0.2, 0.5)

@@ -20,18 +20,20 @@ SMALL: dict[str, Any] = {
 }
 ROLLOUT = PPO(rollout_steps=64, minibatches=4, epochs=2, hidden_sizes=(8, 8), learning_rate_schedule="constant")
 LEARNERS = [
-    CSAC(reference_period=30, **SMALL),
+    CSAC(reference_policy="periodic", reference_period=30, **SMALL),
     SAC(**SMALL),
     TD3(**SMALL),
     SD3(noise_samples=4, **SMALL),
     ROLLOUT,
     SAC(update_interval=7, **SMALL),
+    CSAC(update_interval=3, **SMALL),
 ]
 ADAPTIVE = CSAC(
     entropy_weight="auto",
     relative_entropy_weight="auto",
     weight_learning_rate=0.01,
     critic_reference="earlier",
+    reference_policy="periodic",
     reference_period=30,
     critic_normalisation="batch",
     normalise_observations=True,

@@ -64,7 +64,8 @@ def test_a_checkpoint_of_the_schema_before_is_refused_in_one_line(tmp_path):
 @pytest.mark.parametrize("seeds", [[5], [5, 6]])
 def test_what_was_saved_of_each_seed_is_taken_back(seeds):
     learner, again = (
-        Learner(CSAC(reference_period=3, **TINY), SPEC, labels, 100) for labels in (seeds, [9] * len(seeds))
+        Learner(CSAC(reference_policy="periodic", reference_period=3, **TINY), SPEC, labels, 100)
+        for labels in (seeds, [9] * len(seeds))
     )
     advance(learner, len(seeds), 1, 10)
     saved = [learner.save(index) for index in range(len(seeds))]
@@ -91,8 +92,8 @@ def state_of(algorithm: CSAC) -> Snapshot:
     ("before", "after", "problem"),
     [
         ({"entropy_weight": "auto"}, {}, None),
-        ({"relative_entropy_weight": "auto"}, {}, None),
-        ({}, {"relative_entropy_weight": "auto"}, "state.learnt_weights"),
+        ({"relative_entropy_weight": "auto", "reference_policy": "previous"}, {}, None),
+        ({}, {"relative_entropy_weight": "auto", "reference_policy": "previous"}, "state.learnt_weights"),
         ({"policy_delay": 2}, {}, None),
         ({}, {"policy_delay": 2}, "state.actor_metrics"),
     ],
@@ -121,7 +122,7 @@ def test_means_begin_anew_where_other_things_are_told(before, after):
     assert again.metrics()[0].keys() == alone.metrics()[0].keys()
 
 
-SETTINGS = [(name, {}) for name in ALGORITHMS] + [("csac", {"reference_policy": "algorithm1"})]
+SETTINGS = [(name, {}) for name in ALGORITHMS] + [("csac", {"reference_policy": "periodic"})]
 
 
 @pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=str)

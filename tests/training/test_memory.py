@@ -183,6 +183,7 @@ def test_actions_of_the_warm_up_are_uniform_and_each_seed_draws_its_own():
 def test_a_periodic_reference_counts_updates_whatever_the_steps(often, steps, earlier):
     # Six updates in all: the reference was renewed before the fifth, as a copy of the actor after four.
     algorithm = CSAC(
+        reference_policy="periodic",
         reference_period=4,
         warmup_steps=10,
         batch_size=8,

@@ -31,7 +31,7 @@ SMALL: dict[str, Any] = {
     "warmup_steps": 100,
 }
 LEARNERS = {
-    "csac": CSAC(reference_period=50, **SMALL),
+    "csac": CSAC(reference_policy="periodic", reference_period=50, relative_entropy_estimator="closed_form", **SMALL),
     "csac, paper": CSAC(reference_policy="algorithm1", relative_entropy_estimator="sampled", **SMALL),
     "sac": SAC(**SMALL),
     "td3": TD3(**SMALL),

@@ -33,7 +33,7 @@ SETTINGS: dict[str, Any] = {**COMMON, "entropy_weight": 1e-3}
 NOISY: dict[str, Any] = {**COMMON, "exploration_noise": 0.5}
 
 
-@pytest.fixture(params=["csac", "sac", "csac-periodic", "td3", "sd3"])
+@pytest.fixture(params=["csac", "sac", "csac-periodic", "csac-average", "td3", "sd3"])
 def algorithm(request):
     if request.param == "sac":
         return SAC(temperature="fixed", **SETTINGS)
@@ -42,10 +42,18 @@ def algorithm(request):
     if request.param == "sd3":
         return SD3(noise_samples=4, **NOISY)
     if request.param == "csac":
+        return CSAC(relative_entropy_weight=0.01, **SETTINGS)
+    if request.param == "csac-average":
         return CSAC(
             relative_entropy_weight=0.01, reference_policy="average", relative_entropy_estimator="sampled", **SETTINGS
         )
-    return CSAC(relative_entropy_weight=0.01, reference_period=100, **SETTINGS)
+    return CSAC(
+        relative_entropy_weight=0.01,
+        reference_policy="periodic",
+        reference_period=100,
+        relative_entropy_estimator="closed_form",
+        **SETTINGS,
+    )
 
 
 def values(state, observation: float, actions=(-0.8, 0.0, 0.8)) -> np.ndarray:
@@ -107,7 +115,11 @@ def test_a_truncated_episode_goes_on_in_its_value(algorithm):
 def test_entropy_has_its_weight_in_the_value(algorithm):
     # Every action is as good as another, so the policy spreads out and Q = (r + γ σ H) / (1 - γ) with its entropy H,
     # nearly log 2: with σ = 1 about 10 + 6.2. The relative entropy is zero once nothing moves.
-    fixed: dict[str, Any] = {"temperature": "fixed"} if algorithm is SAC else {"reference_policy": "average"}
+    fixed: dict[str, Any] = (
+        {"temperature": "fixed"}
+        if algorithm is SAC
+        else {"reference_policy": "average", "relative_entropy_estimator": "closed_form"}
+    )
     state = run(algorithm(**{**SETTINGS, **fixed, "entropy_weight": 1.0}), probes.Endless, 2500).states[0]
     policy_entropy = entropy(policy_at(state.actor, jnp.zeros(1)))
     assert np.log(2) - 0.1 < policy_entropy < np.log(2)

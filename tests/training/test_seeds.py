@@ -25,7 +25,7 @@ SMALL: dict[str, Any] = {
 @pytest.mark.parametrize(
     "algorithm",
     [
-        CSAC(reference_period=7, **SMALL),
+        CSAC(reference_policy="periodic", reference_period=7, **SMALL),
         SAC(**SMALL),
         TD3(**SMALL),
         SD3(noise_samples=4, **SMALL),
@@ -50,7 +50,7 @@ TABLES = ("evaluations.csv", "episodes.csv", "metrics.csv")
 
 def tables(directory: Path, **settings: Any) -> dict[str, bytes]:
     """Train on Pendulum and return the bytes of each table."""
-    algorithm = CSAC(**{**SMALL, "reference_period": 50})
+    algorithm = CSAC(**SMALL)
     settings = {"steps": 410, "evaluation_interval": 200, "evaluation_episodes": 2, "tensorboard": False, **settings}
     path = train(algorithm, "Pendulum-v1", directory=directory, **settings).path
     return {name: (path / name).read_bytes() for name in TABLES}
