@@ -75,14 +75,14 @@ def test_scores_are_shares_of_sb3_s_sac(folder):
     lines = told(folder).splitlines()
 
     # The candidate has 400 / 100 five times and 100 / 200 five times; of these ten the middle six are three of each.
-    assert f"| {CANDIDATE} | 2.250 | 2.25 (2.25 to 2.25) | 0.500 |" in lines
-    assert "| SB3 SAC | 1.000 | 1.00 (1.00 to 1.00) | 1.000 |" in lines
+    assert f"| {CANDIDATE} | 2.250 | 2.250 (2.250 to 2.250) | 0.500 |" in lines
+    assert "| SB3 SAC | 1.000 | 1.000 (1.000 to 1.000) | 1.000 |" in lines
 
 
 def test_the_candidate_is_compared_with_every_peer_over_both_tasks_and_on_each(folder):
     lines = told(folder).splitlines()
 
-    always, never, half = "1.00 (1.00 to 1.00)", "0.00 (0.00 to 0.00)", "0.50 (0.50 to 0.50)"
+    always, never, half = "1.000 (1.000 to 1.000)", "0.000 (0.000 to 0.000)", "0.500 (0.500 to 0.500)"
     assert f"| SB3 SAC | {half} | not told apart | {always} | {never} |" in lines
     assert f"| SBX TQC | {always} | better | {always} | {always} |" in lines
     assert f"| SBX CrossQ | {half} | not told apart | {never} | {always} |" in lines
@@ -111,7 +111,7 @@ def test_below_five_common_seeds_there_is_no_verdict(folder):
     assert "**Walker2d-v4: 20 s, seeds 100, 101, 102, 103, 104**" in lines
     assert "**Ant-v4: 30.1 s, seeds 100, 101, 103, 104**" in lines
     assert "**The candidate against each peer, seeds 100, 101, 103, 104**" in lines
-    assert "| SBX TQC | 1.00 | no verdict | 1.00 (1.00 to 1.00) | 1.00 |" in lines
+    assert "| SBX TQC | 1.000 | no verdict | 1.000 (1.000 to 1.000) | 1.000 |" in lines
     assert lines[-1] == "Better than every one of the 5: open: too few seeds."
 
 

@@ -172,7 +172,7 @@ def comparisons(found: dict[str, dict[str, EVIDENCE.Measured]], seeds: Sequence[
 
 def _probability(values: np.ndarray, others: np.ndarray) -> Cell:
     value, interval = probability_of_improvement(values, others), improvement_interval(values, others)
-    return numeric(value, f"{value:.2f}" + (f" ({interval[0]:.2f} to {interval[1]:.2f})" if interval else ""))
+    return numeric(value, f"{value:.3f}" + (f" ({interval[0]:.3f} to {interval[1]:.3f})" if interval else ""))
 
 
 def aim(verdicts: Sequence[str]) -> str:

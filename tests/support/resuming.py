@@ -20,7 +20,7 @@ SMALL: dict[str, Any] = {
 }
 ROLLOUT = PPO(rollout_steps=64, minibatches=4, epochs=2, hidden_sizes=(8, 8), learning_rate_schedule="constant")
 LEARNERS = [
-    CSAC(reference_policy="periodic", reference_period=30, **SMALL),
+    CSAC(reference_policy="periodic", reference_period=30, relative_entropy_estimator="closed_form", **SMALL),
     SAC(**SMALL),
     TD3(**SMALL),
     SD3(noise_samples=4, **SMALL),
@@ -35,6 +35,7 @@ ADAPTIVE = CSAC(
     critic_reference="earlier",
     reference_policy="periodic",
     reference_period=30,
+    relative_entropy_estimator="closed_form",
     critic_normalisation="batch",
     normalise_observations=True,
     policy_delay=3,
