@@ -189,9 +189,17 @@ def write_table(comparison: Comparison, page: Path, name: str, kind: TableName) 
     tables = _tables(comparison.arms(), kind)
     if not tables:
         raise InputError(f"these runs have no table of {kind}")
+    write_between(page, name, "\n\n".join(map(markdown, tables)) + "\n")
+
+
+def write_between(page: Path, name: str, text: str) -> None:
+    """Write `text` between the marks `name` of a page in Markdown.
+
+    Raises:
+        InputError: the page lacks them or cannot be written.
+    """
     try:
-        text = page.read_text(encoding="utf-8")
-        new = between_markers(text, name, "\n\n".join(map(markdown, tables)) + "\n")
+        new = between_markers(page.read_text(encoding="utf-8"), name, text)
         write_atomically(page, new.encode())
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot write into {page}: {error}") from None

@@ -23,7 +23,7 @@ import numpy as np
 
 from csac.record.atomic import write_atomically
 from csac.record.curve_measures import drawdown, recovery
-from csac.record.rendering import Cell, Row, Table, between_markers, markdown, number, numeric
+from csac.record.rendering import Cell, Row, Table, markdown, number, numeric
 from csac.record.statistics import (
     dispersion_across,
     evaluation_matrix,
@@ -35,6 +35,7 @@ from csac.record.statistics import (
 from csac.studies.arms import Arm, gather
 from csac.studies.cells import complete
 from csac.studies.results import Results, Source
+from csac.studies.run_report import write_between
 from csac.studies.study import Method, Study, read_study
 from csac.tasks.perturbations import perturbations_of
 from csac.types import InputError
@@ -270,20 +271,16 @@ def told(study: Study, source: Source, only: Sequence[int] = ()) -> str:
     With `only` these seeds count, and all that has a scale is scaled by theirs. Raises InputError for none of its own.
     """
     of_study = range(study.first_seed, study.first_seed + study.seeds)
-    if only and not set(only) & set(of_study):
+    kept = set(only or of_study) & set(of_study)
+    if not kept:
         raise InputError(f"{study.name} has the seeds {of_study.start} to {of_study.stop - 1}")
     arms = gather(study, source)
     found = measured(study, arms, only)
     seeds = common_seeds(study, found)
     over = {task: set(next(iter(methods.values())).seeds) for task, methods in found.items()}
     notes = [
-        *(
-            f"{what}: {arm.label} on {arm.task}: seed {seed}"
-            for what, of in (("not run", lambda arm: arm.missing), ("failed", lambda arm: arm.failures))
-            for arm in arms
-            for seed in of(arm)
-            if not only or seed in only
-        ),
+        *(f"not run: {arm.label} on {arm.task}: seed {seed}" for arm in arms for seed in arm.missing if seed in kept),
+        *(f"failed: {arm.label} on {arm.task}: seed {seed}" for arm in arms for seed in arm.failures if seed in kept),
         *(
             f"left out of what is over all tasks: {task}, seed {seed}, which another task lacks"
             for task, own in over.items()
@@ -293,19 +290,9 @@ def told(study: Study, source: Source, only: Sequence[int] = ()) -> str:
     tables = [task_table(task, methods) for task, methods in found.items()]
     if seeds:
         tables += [overall_table(study, found), comparison_table(study, found)]
-    title = f"## {study.title}" + (f": seeds {', '.join(map(str, sorted(set(only))))} alone" if only else "")
+    title = f"## {study.title}" + (f": seeds {', '.join(map(str, sorted(kept)))} alone" if only else "")
     parts = [title, "\n".join(f"- {note}" for note in notes), *map(markdown, tables)]
     return "\n\n".join(part for part in parts if part)
-
-
-def write_into(place: str, text: str) -> None:
-    """Write between the marks of a page, PAGE.md#NAME. Raises InputError where it lacks them or is not there."""
-    page, _, name = place.partition("#")
-    try:
-        new = between_markers(Path(page).read_text(encoding="utf-8"), name, text)
-        write_atomically(Path(page), new.encode())
-    except OSError as error:
-        raise InputError(f"cannot write into {page}: {error.strerror}") from None
 
 
 # Choosing.
@@ -448,7 +435,8 @@ def main() -> None:
             source = Results(arguments.results)
             text = "\n\n".join(told(read_study(path), source, arguments.seeds) for path in arguments.studies) + "\n"
             if arguments.into:
-                write_into(arguments.into, text)
+                page, _, name = arguments.into.partition("#")
+                write_between(Path(page), name, text)
             else:
                 print(text)
         elif arguments.command == "write":
