@@ -62,16 +62,22 @@ class Runs:
 
 
 class Results:
-    """Records from files that were collected: `cells/<task>/<arm>/seed-<k>.json` and its tables."""
+    """Records from files that were collected: `cells/<task>/<arm>/seed-<k>.json` and its tables.
+
+    A run does not depend on how long it goes on: one of more steps stands for the cell that was not run itself.
+    """
 
     def __init__(self, directory: str | Path, may_be_empty: bool = False) -> None:
         self.directory = Path(directory)
         self._files: dict[str, Path] = {}
+        self._of_any_length: dict[str, dict[int, Path]] = {}
         for path in sorted(self.directory.glob("cells/*/*/seed-*.json")):
             try:
-                self._files[Cell.of_run(manifests.read(path.read_bytes())).key] = path
+                cell = Cell.of_run(manifests.read(path.read_bytes()))
             except (InputError, OSError) as error:
                 raise InputError(f"{path} is not a cell's: {error}") from None
+            self._files[cell.key] = path
+            self._of_any_length.setdefault(_whatever_its_length(cell), {})[cell.steps] = path
         if not self._files and not may_be_empty:
             raise InputError(
                 f"{self.directory} holds no results of a study; csac study run NAME --results DIR makes them"
@@ -80,11 +86,18 @@ class Results:
     def record(self, cell: Cell) -> Record | None:
         """Return what a cell has given, or None where it was not collected."""
         path = self._files.get(cell.key)
-        if path is None:
-            return None
-        content = path.read_bytes()
-        tables, told = (read_rows(path.with_suffix(".csv")), _rows(_rollouts(path))), json.loads(content)
-        return Record(manifests.read(content), told.get("seconds", 0.0), *tables, told.get("interrupted"))
+        return self._of_longer(cell) if path is None else _read(path)
+
+    def _of_longer(self, cell: Cell) -> Record | None:
+        """Return the beginning of a longer run, which has no policy of that time to test, and not how long it took."""
+        for steps, path in sorted(self._of_any_length.get(_whatever_its_length(cell), {}).items()):
+            if steps > cell.steps and cell.steps % cell.evaluation_interval == 0:
+                whole = _read(path)
+                begun = dataclasses.replace(whole.manifest, steps=cell.steps, steps_done=cell.steps)
+                rows = whole.evaluations[whole.evaluations["step"] <= cell.steps]
+                if not whole.failure:
+                    return Record(begun, 0.0, rows, None, whole.interrupted)
+        return None
 
     def status(self, cell: Cell, rollouts: int) -> Status | None:
         """Return how a cell ended that was collected, with the rollouts that are wanted, or None."""
@@ -116,6 +129,16 @@ def collect(store: Store, cell: Cell, directory: str | Path) -> None:
     fields = json.loads(manifests.written(dataclasses.replace(manifest, process=None, history=())))
     fields |= {"seconds": record.seconds, "interrupted": record.interrupted}
     write_atomically(path, (json.dumps(fields, indent=1) + "\n").encode())
+
+
+def _read(path: Path) -> Record:
+    content = path.read_bytes()
+    tables, told = (read_rows(path.with_suffix(".csv")), _rows(_rollouts(path))), json.loads(content)
+    return Record(manifests.read(content), told.get("seconds", 0.0), *tables, told.get("interrupted"))
+
+
+def _whatever_its_length(cell: Cell) -> str:
+    return dataclasses.replace(cell, steps=0).key
 
 
 def _rollouts(path: Path) -> Path:

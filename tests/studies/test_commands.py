@@ -12,7 +12,7 @@ from csac.studies import commands
 from csac.studies.calibration import Calibration, Cost, predict
 from csac.studies.cells import HOME, Store
 from csac.studies.job import Ended, Started, Stopped
-from csac.studies.results import Results, Runs
+from csac.studies.results import Results, Runs, collect
 from csac.studies.study import cells_of, read_study
 
 
@@ -72,6 +72,38 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
     assert csac("study run tiny.toml --engine local --seeds 1 --directory another/machine --results out") == 0
     assert "1 cells: 1 complete" in capsys.readouterr().out
     assert Results("out").status(one, rollouts=100) is None, "its policy was not tested yet"
+
+
+def test_a_longer_run_that_was_collected_stands_for_a_shorter_one(tmp_path, monkeypatch):
+    shorter = write(tmp_path / "shorter.toml", TINY.replace("steps = 300", "steps = 200"))
+    assert csac("study run tiny.toml --engine local --seeds 1 --results out") == 0
+    assert csac("study run shorter.toml --engine local --seeds 1 --results itself") == 0
+    (one, _) = cells_of([read_study(shorter)])
+    part, itself = Results("out").record(one), Results("itself").record(one)
+    assert part is not None
+    assert itself is not None
+    assert part.evaluations.tobytes() == itself.evaluations.tobytes()
+    assert sorted(set(part.evaluations["step"])) == [100, 200]
+    assert (part.manifest.steps, part.manifest.steps_done, part.seconds, part.rollouts) == (200, 200, 0.0, None)
+    monkeypatch.setattr(commands, "run_here", lambda jobs, tell: pytest.fail("what a longer run has is not run"))
+    assert csac("study run shorter.toml --engine local --seeds 1 --directory another/machine --results out") == 0
+
+
+def test_what_no_longer_run_has_is_not_taken_from_one():
+    for seed, state in enumerate(("finished", "failed")):
+        failures = {seed: "step 290: the actor is not finite"} if state == "failed" else {}
+        one = cell(seed=seed)
+        run = make_run(Store(), one, steps_done=300, state=state, failures=failures)
+        rows = [{"seed": seed, "step": step, "episode": 0, "return": 1.0, "length": 9} for step in (100, 200, 300)]
+        run.append("evaluations", rows)
+        collect(Store(), one, "out")
+    results = Results("out")
+    assert results.status(cell(steps=200), rollouts=0) == ("complete", 200, "", 0.0)
+    assert results.status(cell(steps=200), rollouts=1) is None, "it has no policy of that step to test"
+    assert results.status(cell(steps=250), rollouts=0) is None, "it was not evaluated there"
+    assert results.status(cell(steps=400), rollouts=0) is None, "it is shorter"
+    assert results.status(cell(seed=1, steps=200), rollouts=0) is None, "it failed"
+    assert results.status(cell(steps=200, evaluation_episodes=3), rollouts=0) is None, "it is another"
 
 
 def test_on_a_terminal_where_nothing_is_left_to_run_it_is_said(engine, monkeypatch):
