@@ -2,7 +2,7 @@
 
     python results/reference/evidence.py tables results/reference/screen.toml results/reference/confirm.toml
     python results/reference/evidence.py tables results/reference/tenth.toml --seeds 3 4 --into PAGE.md#NAME
-    python results/reference/evidence.py write weights      (then options, then chosen)
+    python results/reference/evidence.py write chosen       (or options)
     python results/reference/evidence.py null --tasks 3
 
 The first method of a study is the scale of its scores: here SAC 0.2.
@@ -65,11 +65,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "in the actor only": {"relative_entropy_form": "actor_only"},
 }
 
-# Which stages are looked at, how many of their best are taken, and into which files their arms go.
+# Which stage is looked at, how many of its best are taken, and into which files their arms go.
 STAGES = {
-    "weights": (("screen",), 2, ("weights",)),
-    "options": (("screen", "weights"), 1, ("options",)),
-    "chosen": (("screen", "weights", "options"), 2, ("confirm", "recovery", "ant")),
+    "chosen": ("screen", 2, ("confirm", "ant", "recovery")),
+    "options": ("screen", 1, ("options",)),
 }
 
 
@@ -312,12 +311,6 @@ def ranked(values: dict[str, np.ndarray]) -> list[str]:
     return order
 
 
-def joined(studies: Sequence[Study]) -> Study:
-    """Return one study with the methods of all, each label once."""
-    methods = {method.label: method for study in studies for method in study.methods}
-    return dataclasses.replace(studies[0], methods=tuple(methods.values()))
-
-
 def best(study: Study, source: Source) -> list[Method]:
     """Return the forms that can be chosen, the best first. Raises InputError where a cell has not run."""
     arms = gather(study, source)
@@ -329,35 +322,29 @@ def best(study: Study, source: Source) -> list[Method]:
     return [methods[label] for label in ranked({label: values[label] for label in methods})]
 
 
-def weights(forms: Sequence[Method]) -> list[Method]:
-    """Return the forms with less and with more relative entropy."""
-    return [_changed(form, f"tau {tau:g}", {"relative_entropy_weight": tau}) for form in forms for tau in WEIGHTS]
+def options(form: Method) -> list[Method]:
+    """Return a form, with less and more weight, and each option alone that it has not.
 
-
-def options(forms: Sequence[Method]) -> list[Method]:
-    """Return the best form, and each option alone that it has not; two references need `periodic` in the target."""
-    (form,) = forms
+    Two references need `periodic` in the target.
+    """
     told = form.hyperparameters
     is_explicit = told.get("relative_entropy_form", "explicit") == "explicit"
     base = form if told["reference_policy"] == "periodic" and is_explicit else PERIODIC
     two = _changed(base, "two references", {"critic_reference": "earlier"})
+    weights = [_changed(form, f"tau {tau:g}", {"relative_entropy_weight": tau}) for tau in WEIGHTS]
     new = {words: changes for words, changes in OPTIONS.items() if {**told, **changes} != told}
-    return [form, *(_changed(form, words, changes) for words, changes in new.items()), two]
+    return [form, *weights, *(_changed(form, words, changes) for words, changes in new.items()), two]
 
 
 def write(stage: str, folder: Path, source: Source) -> list[Path]:
     """Write the arms of a stage into its files below their mark, and return the files.
 
     Raises:
-        InputError: a stage before it is not complete, or a file has no mark.
+        InputError: the stage before it is not complete, or a file has no mark.
     """
     before, count, names = STAGES[stage]
-    study = joined([read_study(folder / f"{name}.toml") for name in before])
-    forms = best(study, source)[:count]
-    if stage == "chosen":
-        methods = [*forms, *filter(None, (counterpart(study, form) for form in forms))]
-    else:
-        methods = weights(forms) if stage == "weights" else options(forms)
+    forms = best(read_study(folder / f"{before}.toml"), source)[:count]
+    methods = options(*forms) if stage == "options" else forms
     return [_append(folder / f"{name}.toml", methods) for name in names]
 
 
