@@ -1,17 +1,19 @@
 """What csac's candidate and its peers reach in equal time: stage 4 of results/strong/PROTOCOL.md, run by run.
 
-    python -m benchmarks.equal_time seconds     # T of each task: three runs of the candidate
-    python -m benchmarks.equal_time run         # every peer for T seconds: 50 runs of some 13 minutes
+    python -m benchmarks.equal_time speeds            # how fast each is: some 40 minutes with nothing else running
+    python -m benchmarks.equal_time run --part 1/2    # what each peer learns in as many steps as T has room for
+    python -m benchmarks.equal_time run --part 2/2    # the other half, at the same time or on another machine
 
-One run at a time, on two cores; other programs cost more than most differences. Either goes on where it was stopped: a
-run whose file is there is not made again. These runs are no suite: a suite keeps nothing until all of it is measured.
-The tables are printed by results/strong/equal_time.py.
+What is learnt depends on steps and not on time, so only the speeds need a quiet machine: two cores, one run at a time.
+The runs that learn take one core each, on any machine. Each command goes on where it was stopped: a run whose file is
+there is not made again. The tables are printed by results/strong/equal_time.py.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import re
 import shlex
 import statistics
 import subprocess
@@ -22,14 +24,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from benchmarks.contenders import PEERS_PYTHON
-from benchmarks.measuring import ROOT, machine, run_one, surroundings, watch_load
+from benchmarks.measuring import ROOT, Process, machine, run, run_one, surroundings, watch_load
 from benchmarks.tables import Row, read_rows, write_rows
 from csac.processes import usable_cores
 from csac.studies.study import Study, read_study
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
 STUDY = ROOT / "results" / "strong" / "confirm.toml"  # stage 1: the candidate, the tasks and the seeds
 CANDIDATE = "CSAC, candidate"
@@ -37,7 +39,10 @@ FOLDER = ROOT / "results" / "strong" / "equal-time"
 PEERS = ("sb3-sac", "sbx-sac", "sbx-tqc", "sbx-crossq", "sbx-simba")  # peers/models.py has their settings
 CORES = 2
 STEPS = 100_000  # environment steps of the candidate, which take the time T
+SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 1.0)  # of T: when a peer is evaluated
 REPETITIONS = 3
+TIMED_STEPS = (14_000, 20_000)  # of the candidate, beyond its warm-up of 10,000
+TIMED_SECONDS = 60.0  # of a peer: its steps are counted after two thirds, and at the end
 QUIET = 0.2  # processors that other programs may keep busy without a warning
 
 
@@ -50,21 +55,43 @@ class Run(NamedTuple):
     path: Path
 
 
-# The time T.
+class Speed(NamedTuple):
+    """Two moments of a run beyond its warm-up: seconds since the command was started, and steps by then."""
+
+    seconds: tuple[float, float]
+    steps: tuple[float, float]
+
+    @property
+    def rate(self) -> float:
+        """Steps per second."""
+        return (self.steps[1] - self.steps[0]) / (self.seconds[1] - self.seconds[0])
+
+    def steps_at(self, seconds: float) -> float:
+        """Return the steps that are over by then."""
+        return self.steps[1] + self.rate * (seconds - self.seconds[1])
+
+    def seconds_at(self, steps: float) -> float:
+        """Return when so many steps are over."""
+        return self.seconds[1] + (steps - self.steps[1]) / self.rate
 
 
-def training(study: Study, task: str, repetition: int) -> list[str]:
-    """Return the arguments of `csac` for a run of the candidate that takes the time T.
+Speeds = dict[tuple[str, str], list[Speed]]  # of a contender on a task, its repetitions
 
-    csac always evaluates its last policy. One episode is the least that it can be asked for: a second or less, which
-    makes T longer, and so is to the peers' good.
+
+# How fast each is.
+
+
+def training(study: Study, task: str, steps: int) -> list[str]:
+    """Return the arguments of `csac` for a run of the candidate of so many steps.
+
+    csac always evaluates its last policy. One episode is the least that it can be asked for, a second or less.
     """
     method = next(method for method in study.methods if method.label == CANDIDATE)
     words = ["train", task, "--algorithm", method.algorithm]
     for name, value in method.hyperparameters_on(task).items():
         words += _flag(name.replace("_", "-"), value)
-    steps = ["--steps", str(STEPS), "--first-seed", str(study.first_seed + repetition)]
-    return [*words, *steps, "--evaluation-interval", str(STEPS), "--evaluation-episodes", "1"]
+    plan = ["--steps", str(steps), "--first-seed", str(study.first_seed)]
+    return [*words, *plan, "--evaluation-interval", str(steps), "--evaluation-episodes", "1"]
 
 
 def _flag(name: str, value: Any) -> list[str]:
@@ -88,44 +115,101 @@ def time_training(words: Sequence[str]) -> float:
     return seconds
 
 
-def timed(folder: Path, study: Study) -> list[Row]:
-    """Return the rows of seconds.csv. Raises InputError where another candidate was timed."""
-    path = folder / "seconds.csv"
-    rows = read_rows(path) if path.exists() else []
-    for row in rows:
-        if row["command"] != shlex.join(["csac", *training(study, row["task"], row["repetition"])]):
+def measure(contender: str, study: Study, task: str) -> Speed:
+    """Return how fast the candidate or a peer is now. Raises InputError where its command fails."""
+    if contender == CANDIDATE:
+        first, second = (time_training(training(study, task, steps)) for steps in TIMED_STEPS)
+        return Speed((first, second), TIMED_STEPS)
+    what = ["--task", task, "--seed", str(study.first_seed), "--seconds", str(TIMED_SECONDS)]
+    try:
+        answer = run_one(_script(contender, *what, "--launched", repr(time.monotonic())), CORES)
+    except RuntimeError as error:
+        raise InputError(f"{contender} on {task}: {error}") from None
+    (first, before), (second, after) = answer["marks"]
+    return Speed((first, second), (before, after))
+
+
+def measured(folder: Path, study: Study) -> Speeds:
+    """Return the speeds of speeds.csv. Raises InputError where those of another candidate are there."""
+    path = folder / "speeds.csv"
+    found: Speeds = {}
+    for row in read_rows(path) if path.exists() else []:
+        if row["contender"] == CANDIDATE and row["command"] != _command(study, row["task"]):
             raise InputError(f"{path} was measured with another candidate than {STUDY.name} has: remove it")
+        speed = Speed((row["first_seconds"], row["last_seconds"]), (row["first_steps"], row["last_steps"]))
+        found.setdefault((row["contender"], row["task"]), []).append(speed)
+    return found
+
+
+def measure_speeds(folder: Path, study: Study) -> None:
+    """Measure what speeds.csv has not got, all in turns, and write plan.csv.
+
+    The candidate's first run on a task is not counted: it compiles what the others find.
+    """
+    _need_peers()
+    folder.mkdir(parents=True, exist_ok=True)
+    prepared = set()
+    for repetition, task, contender in itertools.product(range(REPETITIONS), study.tasks, (CANDIDATE, *PEERS)):
+        if len(measured(folder, study).get((contender, task), [])) > repetition:
+            continue
+        if contender == CANDIDATE and task not in prepared:
+            time_training(training(study, task, TIMED_STEPS[0]))
+            prepared.add(task)
+        others = watch_load()
+        speed, load = measure(contender, study, task), others()
+        warning = ": TOO MUCH, nothing else may run" if load > QUIET else ""
+        what = f"{contender} on {task}: {speed.rate:.1f} steps/s"
+        print(f"{what}; other programs kept {load:.2f} cores busy{warning}", flush=True)
+        moments = zip(("first", "last"), speed.seconds, speed.steps, strict=True)
+        row = {"contender": contender, "task": task, "repetition": repetition}
+        for name, seconds, steps in moments:
+            row |= {f"{name}_seconds": float(seconds), f"{name}_steps": steps}
+        row |= {"load": load, "command": _command(study, task) if contender == CANDIDATE else ""}
+        add_row(folder / "speeds.csv", row)
+        if not (folder / "machine.txt").exists():
+            (folder / "machine.txt").write_text("".join(f"{line}\n" for line in machine(1.0)))
+    write_rows(folder / "plan.csv", plan(measured(folder, study), study.tasks))
+
+
+def plan(speeds: Speeds, tasks: Iterable[str]) -> list[Row]:
+    """Return T, and the steps of every contender at each share of it by which it has made any.
+
+    Raises InputError for what was not measured often enough.
+    """
+    rows = []
+    for task, contender in itertools.product(tasks, (CANDIDATE, *PEERS)):
+        own = speeds.get((contender, task), [])
+        if len(own) < REPETITIONS:
+            raise InputError(
+                f"{contender} on {task} was measured {len(own)} times, not {REPETITIONS}: go on with speeds"
+            )
+        limit = statistics.median(one.seconds_at(STEPS) for one in speeds[CANDIDATE, task])
+        rate = statistics.median(one.rate for one in own)
+        for share in SHARES:
+            steps = round(statistics.median(one.steps_at(share * limit) for one in own))
+            row = {"task": task, "contender": contender, "limit": limit, "rate": rate, "share": share, "steps": steps}
+            rows += [row] if steps > 0 else []
     return rows
 
 
-def time_candidate(folder: Path, study: Study) -> None:
-    """Make the runs of the candidate that seconds.csv has not got, the tasks in turns."""
-    done = {(row["task"], row["repetition"]) for row in timed(folder, study)}
-    for repetition, task in itertools.product(range(REPETITIONS), study.tasks):
-        if (task, repetition) in done:
-            continue
-        words, others = training(study, task, repetition), watch_load()
-        seconds, load = time_training(words), others()
-        told(f"{task}, repetition {repetition}: {seconds:.1f} s", load)
-        folder.mkdir(parents=True, exist_ok=True)
-        row = {"task": task, "repetition": repetition, "seconds": seconds, "load": load}
-        add_row(folder / "seconds.csv", {**row, "command": shlex.join(["csac", *words])})
-        if not (folder / "machine.txt").exists():
-            (folder / "machine.txt").write_text("".join(f"{line}\n" for line in machine(1.0)))
+def read_plan(folder: Path) -> tuple[dict[str, float], dict[tuple[str, str], list[int]]]:
+    """Return T of each task, and the steps of each contender on it. Raises InputError where there is no plan."""
+    path = folder / "plan.csv"
+    if not path.exists():
+        raise InputError(f"{path} does not exist: python -m benchmarks.equal_time speeds writes it")
+    limits: dict[str, float] = {}
+    steps: dict[tuple[str, str], list[int]] = {}
+    for row in read_rows(path):
+        limits[row["task"]] = row["limit"]
+        steps.setdefault((row["contender"], row["task"]), []).append(row["steps"])
+    return limits, steps
 
 
-def limits(rows: Sequence[Row], tasks: Sequence[str]) -> dict[str, float]:
-    """Return T of each task, to a tenth of a second. Raises InputError where it was not timed often enough."""
-    found = {task: [row["seconds"] for row in rows if row["task"] == task] for task in tasks}
-    for task, seconds in found.items():
-        if len(seconds) < REPETITIONS:
-            raise InputError(
-                f"{task} was timed {len(seconds)} times, not {REPETITIONS}: python -m benchmarks.equal_time seconds"
-            )
-    return {task: round(statistics.median(seconds), 1) for task, seconds in found.items()}
+def _command(study: Study, task: str) -> str:
+    return shlex.join(["csac", *training(study, task, TIMED_STEPS[-1])])
 
 
-# The peers.
+# What the peers learn.
 
 
 def runs(folder: Path, study: Study) -> list[Run]:
@@ -135,43 +219,56 @@ def runs(folder: Path, study: Study) -> list[Run]:
     return [Run(peer, task, seed, folder / task / peer / f"seed-{seed}.csv") for seed, task, peer in parts]
 
 
-def waiting(planned: Sequence[Run], seconds: dict[str, float]) -> list[Run]:
-    """Return the runs that have no file yet. Raises InputError where a file is of another T."""
-    for run in planned:
-        if run.path.exists() and (limit := read_rows(run.path)[0]["limit"]) != seconds[run.task]:
-            raise InputError(f"{run.path} is of {limit} seconds, not of {seconds[run.task]}: remove it")
-    return [run for run in planned if not run.path.exists()]
+def waiting(planned: Sequence[Run], steps: dict[tuple[str, str], list[int]]) -> list[Run]:
+    """Return the runs that have no file yet. Raises InputError where a file is of other steps."""
+    for one in planned:
+        wanted = steps[one.peer, one.task]
+        if one.path.exists() and sorted({row["step"] for row in read_rows(one.path)}) != wanted:
+            raise InputError(
+                f"{one.path} is not of {wanted[0]:,} to {wanted[-1]:,} steps, as plan.csv has it: remove it"
+            )
+    return [one for one in planned if not one.path.exists()]
 
 
-def command(run: Run, seconds: float) -> list[str]:
-    """Return the command of a peer that is started at once: its clock runs from now on."""
-    script, out = str(ROOT / "benchmarks" / "peers" / "equal_time.py"), str(run.path.resolve())
-    what = ["--peer", run.peer, "--task", run.task, "--seed", str(run.seed), "--seconds", str(seconds), "--out", out]
-    return [PEERS_PYTHON, script, *what, "--launched", repr(time.monotonic())]
+def command(one: Run, steps: Sequence[int]) -> list[str]:
+    """Return the command that trains a peer and evaluates it after each of these steps."""
+    what = ["--task", one.task, "--seed", str(one.seed), "--out", str(one.path.resolve())]
+    return _script(one.peer, *what, "--steps", *map(str, steps))
 
 
-def run_peers(folder: Path, study: Study, seconds: dict[str, float]) -> list[Run]:
-    """Make the runs that are missing, one at a time, and return those that failed: they leave no file."""
+def run_peers(folder: Path, study: Study, part: tuple[int, int]) -> list[Run]:
+    """Make the runs of a part that are missing, one at a time, and return those that failed: they leave no file."""
+    _need_peers()
+    limits, steps = read_plan(folder)
+    which, parts = part
+    planned = runs(folder, study)[which - 1 :: parts]
+    left, failed = waiting(planned, steps), []
+    hours = sum(limits[one.task] for one in left) / 3600
+    print(
+        f"{len(planned) - len(left)} of {len(planned)} runs are there; the others take {hours:.1f} hours or more",
+        flush=True,
+    )
+    core = usable_cores()[(which - 1) % len(usable_cores())]
+    for one in left:
+        one.path.parent.mkdir(parents=True, exist_ok=True)
+        name = f"{one.peer} on {one.task}, seed {one.seed}"
+        try:
+            (answer,) = run([Process(command(one, steps[one.peer, one.task]), [core])], surroundings("cpu"))
+        except RuntimeError as error:
+            failed.append(one)
+            print(f"failed: {name}: {error}", file=sys.stderr, flush=True)
+            continue
+        print(f"{name}: {answer['step']:,} steps, {answer['updates']:,} updates", flush=True)
+    return failed
+
+
+def _script(peer: str, *what: str) -> list[str]:
+    return [PEERS_PYTHON, str(ROOT / "benchmarks" / "peers" / "equal_time.py"), "--peer", peer, *what]
+
+
+def _need_peers() -> None:
     if not Path(PEERS_PYTHON).exists():
         raise InputError(f"{PEERS_PYTHON} does not exist: run `make peers` first")
-    planned = runs(folder, study)
-    left, failed = waiting(planned, seconds), []
-    hours = sum(seconds[run.task] for run in left) / 3600
-    print(f"{len(planned) - len(left)} of {len(planned)} runs are there; the others take {hours:.1f} hours", flush=True)
-    for run in left:
-        run.path.parent.mkdir(parents=True, exist_ok=True)
-        others = watch_load()
-        try:
-            answer = run_one(command(run, seconds[run.task]), CORES)
-        except RuntimeError as error:
-            failed.append(run)
-            print(f"failed: {run.peer} on {run.task}, seed {run.seed}: {error}", file=sys.stderr, flush=True)
-            continue
-        reached = f"{answer['step']:,} steps, {answer['updates']:,} updates in {answer['seconds']:.1f} s"
-        load = others()
-        told(f"{run.peer} on {run.task}, seed {run.seed}: {reached}", load)
-        add_row(folder / "load.csv", {"peer": run.peer, "task": run.task, "seed": run.seed, "load": load})
-    return failed
 
 
 def add_row(path: Path, row: Row) -> None:
@@ -181,10 +278,13 @@ def add_row(path: Path, row: Row) -> None:
     aside.replace(path)
 
 
-def told(what: str, load: float) -> None:
-    """Say what came out, and how busy other programs kept the machine meanwhile."""
-    warning = ": TOO MUCH, nothing else may run" if load > QUIET else ""
-    print(f"{what}; other programs kept {load:.2f} cores busy{warning}", flush=True)
+def read_part(text: str) -> tuple[int, int]:
+    """Return (1, 2) of `1/2`. Raises ArgumentTypeError for anything else."""
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    which, parts = map(int, found.groups()) if found else (0, 0)
+    if not 1 <= which <= parts:
+        raise argparse.ArgumentTypeError(f"{text!r} is no part such as 1/2")
+    return which, parts
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -194,18 +294,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("what", choices=("seconds", "run"))
+    parser.add_argument("what", choices=("speeds", "run"))
+    parser.add_argument("--part", type=read_part, default=(1, 1), help="of the runs, such as 1/2; each takes one core")
     parser.add_argument("--folder", type=Path, default=FOLDER, help="where the files go (results/strong/equal-time)")
     given = parser.parse_args(arguments)
     try:
         if not sys.platform.startswith("linux") or len(usable_cores()) < CORES:
             raise InputError("this needs Linux and two processors: run it on such a machine")
         study = read_study(STUDY)
-        if given.what == "seconds":
-            time_candidate(given.folder, study)
+        if given.what == "speeds":
+            measure_speeds(given.folder, study)
             return 0
-        seconds = limits(timed(given.folder, study), study.tasks)
-        return 3 if run_peers(given.folder, study, seconds) else 0
+        return 3 if run_peers(given.folder, study, given.part) else 0
     except InputError as error:
         print(f"equal_time: {error}", file=sys.stderr)
         return 2

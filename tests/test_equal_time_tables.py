@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import runpy
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from made import MadeRecords
 
-from benchmarks.equal_time import CANDIDATE, FOLDER, PEERS, STUDY
+from benchmarks.equal_time import CANDIDATE, FOLDER, PEERS, SHARES, STEPS, STUDY
 from csac.studies.cells import Cell
 from csac.studies.study import read_study
 from csac.types import InputError
@@ -20,55 +21,73 @@ from csac.types import InputError
 SCRIPT = Path(__file__).parents[1] / "results" / "strong" / "equal_time.py"
 TABLES = SimpleNamespace(**runpy.run_path(str(SCRIPT)))
 CONFIRMED = read_study(STUDY)
-LIMITS = {"Walker2d-v4": 20.0, "Ant-v4": 30.1}
+LIMITS = {"Walker2d-v4": 20.0, "Ant-v4": 30.0}
+RATES = {CANDIDATE: 5_000.0, **dict.fromkeys(PEERS, 100.0)}  # steps per second
 # What every seed of a peer reaches on Walker2d and Ant.
 RETURNS = dict(zip(PEERS, [(100.0, 200.0), (50.0, 300.0), (350.0, 90.0), (450.0, 80.0), (10.0, 20.0)], strict=True))
 
 
-def write_peer(path: Path, first: float, second: float, limit: float, steps: int = 1_000, updates: int = 900) -> None:
-    """Two evaluations of ten episodes, whose returns are 1 above and 1 below their mean by turns."""
+def write_peer(path: Path, limit: float, early: float, late: float) -> None:
+    """Evaluations of ten episodes, whose returns are 1 above and 1 below `early`, or `late` in the last fifth."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(("peer", "task", "seed", "limit", "seconds", "step", "updates", "episode", "return", "length"))
-        for share, mean in ((0.9, first), (1.0, second)):
-            reached = (share * limit, round(share * steps), round(share * updates))
+        writer.writerow(("peer", "task", "seed", "step", "updates", "episode", "return", "length"))
+        for share in SHARES:
             for episode in range(10):
-                value = mean + (1 if episode % 2 else -1)
-                writer.writerow(("a peer", "a task", 0, limit, *reached, episode, value, 7))
+                value = (late if share > 0.8 else early) + (1 if episode % 2 else -1)
+                writer.writerow(("a peer", "a task", 0, round(100 * share * limit), 900, episode, value, 7))
 
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    """Every run of every peer, and three timed runs of the candidate on each task."""
-    lines = [f"{task},{i},{seconds + i - 1}" for task, seconds in LIMITS.items() for i in range(3)]
-    (tmp_path / "seconds.csv").write_text("\n".join(["task,repetition,seconds", *lines, ""]))
+    """A plan for every contender, and every run of every peer."""
+    lines = ["task,contender,limit,rate,share,steps"]
+    for task, limit in LIMITS.items():
+        for contender, rate in RATES.items():
+            steps = STEPS if contender == CANDIDATE else rate * limit
+            name = f'"{contender}"' if "," in contender else contender
+            lines += [f"{task},{name},{limit},{rate},{share},{round(share * steps)}" for share in SHARES]
+    (tmp_path / "plan.csv").write_text("\n".join([*lines, ""]))
     for peer, values in RETURNS.items():
         for (task, limit), value in zip(LIMITS.items(), values, strict=True):
             for seed in range(100, 105):
-                write_peer(tmp_path / task / peer / f"seed-{seed}.csv", 0.0, 2 * value, limit)
+                write_peer(tmp_path / task / peer / f"seed-{seed}.csv", limit, value / 2, value)
     return tmp_path
 
 
 def candidate(cell: Cell, step: int) -> float:
-    """On Walker2d 300 at 90,000 steps and 500 at 100,000; on Ant 100 at both; elsewhere what must not count."""
-    if cell.task == "Ant-v4":
-        return {90_000: 100.0, 100_000: 100.0}.get(step, -9_999.0)
-    return {90_000: 300.0, 100_000: 500.0}.get(step, 9_999.0)
+    """On Walker2d 300, 300, 500 and 500 in the last fifth; on Ant 100; before that 7."""
+    if step <= 80_000:
+        return 7.0
+    return 100.0 if cell.task == "Ant-v4" else 300.0 + 200.0 * (step > 90_000)
 
 
 def told(folder: Path, value: Callable[[Cell, int], float | None] = candidate, **made: Callable[[Cell], str]) -> str:
     return TABLES.told(CONFIRMED, MadeRecords(value, **made), folder)
 
 
-def test_the_return_at_equal_time_is_the_mean_of_both_evaluations(folder):
+def test_the_return_at_equal_time_is_the_mean_of_the_last_fifth(folder):
     lines = told(folder).splitlines()
 
-    assert "| Walker2d-v4 | 20 | 19.0, 20.0, 21.0 |" in lines
-    assert "**Ant-v4: 30.1 s, seeds 100, 101, 102, 103, 104**" in lines
-    assert "| SBX CrossQ | 450.0 ± 0.0 | 450.0 | 1,000 | 900 |" in lines
-    assert f"| {CANDIDATE} | 400.0 ± 0.0 | 400.0 | 100,000 |  |" in lines  # Walker2d
-    assert f"| {CANDIDATE} | 100.0 ± 0.0 | 100.0 | 100,000 |  |" in lines  # Ant
+    assert "| Ant-v4 | SBX TQC | 100.0 | 30 | 3,000 |" in lines
+    assert f"| Ant-v4 | {CANDIDATE} | 5000.0 | 30 | 100,000 |" in lines
+    assert "**Ant-v4: seeds 100, 101, 102, 103, 104**" in lines
+    crossq = "| 225.0 | 225.0 | 225.0 | 225.0 | 450.0 |"  # at 0.2, 0.4, 0.6, 0.8 and 1 of the time
+    assert f"| SBX CrossQ | 450.0 ± 0.0 | 450.0 {crossq}" in lines
+    assert f"| {CANDIDATE} | 400.0 ± 0.0 | 400.0 | 7.00 | 7.00 | 7.00 | 7.00 | 500.0 |" in lines  # Walker2d
+    assert f"| {CANDIDATE} | 100.0 ± 0.0 | 100.0 | 7.00 | 7.00 | 7.00 | 7.00 | 100.0 |" in lines  # Ant
+
+
+def test_a_share_by_which_a_peer_has_made_no_step_is_empty(folder):
+    plan, path = folder / "plan.csv", folder / "Ant-v4" / "sbx-tqc"
+    lines = plan.read_text().splitlines()
+    plan.write_text("\n".join(line for line in lines if not re.match(r"Ant-v4,sbx-tqc,.*,0\.[1-4],", line)))
+    for run in path.iterdir():
+        rows = run.read_text().splitlines()
+        run.write_text("\n".join([rows[0], *rows[41:]]))
+
+    assert "| SBX TQC | 90.00 ± 0.00 | 90.00 |  |  | 45.00 | 45.00 | 90.00 |" in told(folder).splitlines()
 
 
 def test_scores_are_shares_of_sb3_s_sac(folder):
@@ -108,52 +127,61 @@ def test_below_five_common_seeds_there_is_no_verdict(folder):
 
     assert "- not run: SBX SimBa on Ant-v4: seeds 102" in lines
     assert "- left out, since not every method has them on every task: seeds 102" in lines
-    assert "**Walker2d-v4: 20 s, seeds 100, 101, 102, 103, 104**" in lines
-    assert "**Ant-v4: 30.1 s, seeds 100, 101, 103, 104**" in lines
+    assert "**Walker2d-v4: seeds 100, 101, 102, 103, 104**" in lines
+    assert "**Ant-v4: seeds 100, 101, 103, 104**" in lines
     assert "**The candidate against each peer, seeds 100, 101, 103, 104**" in lines
     assert "| SBX TQC | 1.000 | no verdict | 1.000 (1.000 to 1.000) | 1.000 |" in lines
     assert lines[-1] == "Better than every one of the 5: open: too few seeds."
 
 
 def test_a_seed_that_failed_counts_as_0_and_is_listed(folder):
-    write_peer(folder / "Walker2d-v4" / "sb3-sac" / "seed-101.csv", np.nan, np.nan, LIMITS["Walker2d-v4"])
+    write_peer(folder / "Walker2d-v4" / "sb3-sac" / "seed-101.csv", LIMITS["Walker2d-v4"], np.nan, np.nan)
     lines = told(folder, failing=lambda cell: "NaN" if (cell.task, cell.seed) == ("Ant-v4", 104) else "").splitlines()
 
     assert "- failed, and counted as 0: SB3 SAC on Walker2d-v4: seeds 101" in lines
     assert f"- failed, and counted as 0: {CANDIDATE} on Ant-v4: seeds 104" in lines
     # Of 100, 0, 100, 100, 100 the mean is 80 and the standard deviation 40 * 5 / sqrt(20) = 44.7.
-    assert "| SB3 SAC | 80.00 ± 44.72 | 0.00 | 1,000 | 900 |" in lines
-    assert f"| {CANDIDATE} | 80.00 ± 44.72 | 0.00 |  |  |" in lines
+    assert "| SB3 SAC | 80.00 ± 44.72 | 0.00 |  |  |  |  |  |" in lines
+    assert f"| {CANDIDATE} | 80.00 ± 44.72 | 0.00 |  |  |  |  |  |" in lines
 
 
 def test_the_machine_and_what_else_ran_there_are_told(folder):
     (folder / "machine.txt").write_text("processor: a fast one\n")
-    (folder / "load.csv").write_text("peer,task,seed,load\nsb3-sac,Ant-v4,100,0.01\nsb3-sac,Ant-v4,101,0.05\n")
+    (folder / "speeds.csv").write_text("contender,load\nsb3-sac,0.01\nsbx-sac,0.05\n")
     page = told(folder)
 
-    assert "- processor: a fast one\n- other programs kept 0.03 cores busy on average, 0.05 at most\n" in page
+    load = "while speeds were measured, other programs kept 0.03 cores busy on average, 0.05 at most"
+    assert f"- processor: a fast one\n- {load}\n" in page
 
 
 def test_without_the_candidate_s_stage_nothing_is_compared(folder):
     lines = told(folder, lambda cell, step: None).splitlines()
 
     assert f"- not run: {CANDIDATE} on Ant-v4: seeds 100, 101, 102, 103, 104" in lines
-    assert lines[-1].startswith("| Ant-v4 | 30.1 |")
+    assert lines[-1].startswith(f"| Ant-v4 | {CANDIDATE} |")
 
 
-def test_rows_of_another_time_or_half_a_file_are_refused(folder):
+def test_rows_of_another_plan_or_half_a_file_are_refused(folder):
     path = folder / "Ant-v4" / "sbx-tqc" / "seed-103.csv"
-    write_peer(path, 0.0, 1.0, 29.0)
-    with pytest.raises(InputError, match=r"seed-103.csv does not hold two evaluations of a run of 30.1 seconds"):
+    write_peer(path, 29.0, 0.0, 1.0)
+    with pytest.raises(InputError, match=r"seed-103.csv does not hold the evaluations of plan.csv: remove it"):
         told(folder)
-    path.write_text("\n".join(path.read_text().splitlines()[:12]))
-    with pytest.raises(InputError, match=r"seed-103.csv does not hold two evaluations"):
+    write_peer(path, 30.0, 0.0, 1.0)
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]))
+    with pytest.raises(InputError, match=r"seed-103.csv does not hold the evaluations of plan.csv"):
         told(folder)
     path.write_text("something else\n1\n")
     with pytest.raises(InputError, match=r"seed-103.csv is missing or damaged: python -m benchmarks.equal_time run"):
         told(folder)
-    (folder / "seconds.csv").unlink()
-    with pytest.raises(InputError, match=r"seconds.csv is missing or damaged: python -m benchmarks.equal_time seconds"):
+
+
+def test_without_a_whole_plan_there_are_no_tables(folder):
+    plan = folder / "plan.csv"
+    plan.write_text("\n".join(line for line in plan.read_text().splitlines() if not line.startswith("Ant-v4,sbx-sac")))
+    with pytest.raises(InputError, match=r"sbx-sac on Ant-v4 was not measured: python -m benchmarks.equal_time speeds"):
+        told(folder)
+    plan.unlink()
+    with pytest.raises(InputError, match=r"plan.csv is missing or damaged: python -m benchmarks.equal_time speeds"):
         told(folder)
 
 

@@ -1,10 +1,13 @@
-"""Train one peer for so many seconds on one task with one seed, and write what it has learnt by then.
+r"""Train one peer with one seed, to learn how fast it is on a task or what it has learnt after so many steps.
 
-    .venv-peers/bin/python benchmarks/peers/equal_time.py --peer sbx-tqc --task Ant-v4 --seed 7 --seconds 60 --out a.csv
+    .venv-peers/bin/python benchmarks/peers/equal_time.py --peer sbx-tqc --task Ant-v4 --seed 7 --seconds 60
+    .venv-peers/bin/python benchmarks/peers/equal_time.py --peer sbx-tqc --task Ant-v4 --seed 7 --out a.csv \
+        --steps 900 1800
 
-Seconds are those since the process was started: imports and compilation count, and an evaluation stops the clock. There
-are two, at 0.9 of the seconds and at their end, each of 10 deterministic episodes; training ends with the second. The
-peers and their settings are in models.py; `python -m benchmarks.equal_time` runs all of them, one after another.
+With `--seconds` nothing is evaluated: a line of JSON has how many steps were over after two thirds of the seconds and
+at their end, which are those since the process was started: imports and compilation count. With `--steps` it is
+evaluated after each of them, in 10 deterministic episodes, and training ends with the last. The peers and their
+settings are in models.py; `python -m benchmarks.equal_time` runs all of them.
 """
 
 import argparse
@@ -14,7 +17,6 @@ import math
 import os
 import time
 import warnings
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -22,48 +24,10 @@ from evaluation import evaluate
 from models import PEERS, make_peer
 
 IMPORTED = time.monotonic()  # what is imported above takes no time that could be seen; what does comes later
-COLUMNS = ("peer", "task", "seed", "limit", "seconds", "step", "updates", "episode", "return", "length")
-SHARES = (0.9, 1.0)  # of the seconds: when the peer is evaluated
+COLUMNS = ("peer", "task", "seed", "step", "updates", "episode", "return", "length")
+SHARES = (2 / 3, 1.0)  # of the seconds: when steps are counted
 EPISODES = 10
-STEPS = 10**9  # what training is asked for, and never reaches: the clock ends it
 LARGEST_SEED = 2**32 - 1  # NumPy's
-
-
-class Clock:
-    """Seconds since `launched`, a reading of `now`, without those for which it was stopped."""
-
-    def __init__(self, launched, now=time.monotonic):
-        self.began, self.now = launched, now
-
-    def seconds(self):
-        """Return what the clock shows."""
-        return self.now() - self.began
-
-    @contextmanager
-    def stopped(self):
-        """Let no time pass on the clock meanwhile."""
-        since = self.now()
-        yield
-        self.began += self.now() - since
-
-
-class Deadline:
-    """Calls `evaluate` with the clock's seconds once the clock has reached each share of the limit.
-
-    Ask `is_over` between an update and the environment's next step, so that the policy has had all of its updates.
-    """
-
-    def __init__(self, clock, limit, evaluate):
-        self.clock, self.evaluate = clock, evaluate
-        self.left = [share * limit for share in SHARES]
-
-    def is_over(self):
-        """Make the evaluations that are due, the clock stopped, and return whether the last of them is made."""
-        while self.left and (seconds := self.clock.seconds()) >= self.left[0]:
-            with self.clock.stopped():
-                self.evaluate(seconds)
-            del self.left[0]
-        return not self.left
 
 
 class Parser(argparse.ArgumentParser):
@@ -80,21 +44,34 @@ def read_arguments(given=None):
     parser.add_argument("--peer", choices=PEERS, required=True)
     parser.add_argument("--task", required=True, help="a Gymnasium id whose actions are numbers within bounds")
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--seconds", type=float, required=True, help="from the start of the process to the end")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--seconds", type=float, help="count the steps of so many, from the start of the process")
+    what.add_argument("--steps", type=int, nargs="+", help="evaluate after each of these environment steps")
     parser.add_argument("--launched", type=float, default=IMPORTED, help="time.monotonic() when it was started")
-    parser.add_argument("--out", type=Path, required=True, help="the CSV file; it appears complete or not at all")
+    parser.add_argument("--out", type=Path, help="the CSV file, with --steps; it appears complete or not at all")
     arguments = parser.parse_args(given)
-    if not (math.isfinite(arguments.seconds) and arguments.seconds > 0):
-        parser.error(f"--seconds must be a number above 0, not {arguments.seconds}")
     if not 0 <= arguments.seed <= LARGEST_SEED:
         parser.error(f"--seed must be from 0 to {LARGEST_SEED}, not {arguments.seed}")
+    if arguments.seconds is None:
+        _check_steps(parser, arguments)
+    elif not (math.isfinite(arguments.seconds) and arguments.seconds > 0):
+        parser.error(f"--seconds must be a number above 0, not {arguments.seconds}")
+    elif arguments.out:
+        parser.error("--out is for --steps: with --seconds nothing is evaluated")
     if not arguments.launched <= time.monotonic():
         parser.error(f"--launched is no reading of time.monotonic() from before this process: {arguments.launched}")
-    if not arguments.out.parent.is_dir() or arguments.out.is_dir():
-        parser.error(f"--out must be a file in a folder that exists, not {arguments.out}")
     if problem := unusable(arguments.peer, arguments.task):
         parser.error(problem)
     return arguments
+
+
+def _check_steps(parser, arguments):
+    if arguments.steps[0] < 1 or sorted(set(arguments.steps)) != arguments.steps:
+        parser.error(f"--steps must be whole numbers from 1 on that rise, not {' '.join(map(str, arguments.steps))}")
+    if not arguments.out:
+        parser.error("--steps needs --out FILE.csv")
+    if not arguments.out.parent.is_dir() or arguments.out.is_dir():
+        parser.error(f"--out must be a file in a folder that exists, not {arguments.out}")
 
 
 def unusable(peer, task):
@@ -116,47 +93,72 @@ def unusable(peer, task):
     return ""
 
 
-def train(arguments, clock):
-    """Train until the clock has reached the seconds; return the rows of both evaluations."""
-    import gymnasium
+def train(model, steps, look):
+    """Train for so many steps, or until `look` returns true: asked before each step, after the updates of the last."""
     from stable_baselines3.common.callbacks import BaseCallback
-
-    model, rows = make_peer(arguments.peer, arguments.task, arguments.seed), []
-    environment = gymnasium.make(arguments.task)
-    run = (arguments.peer, arguments.task, arguments.seed, arguments.seconds)
-
-    def look(seconds):
-        reached = (round(seconds, 3), model.num_timesteps, model._n_updates)
-        for episode, (total, length) in enumerate(evaluate(model, environment, EPISODES)):
-            rows.append((*run, *reached, episode, total, length))
-
-    deadline = Deadline(clock, arguments.seconds, look)
 
     class Callback(BaseCallback):
         is_over = False
 
         def _on_rollout_start(self):
             # A rollout is one step; the updates that belong to the one before are over by now.
-            self.is_over = deadline.is_over()
+            self.is_over = self.is_over or look()
 
         def _on_step(self):
             return not self.is_over
 
-    model.learn(STEPS, callback=Callback())
-    return rows
+    model.learn(steps, callback=Callback())
+
+
+def count_steps(model, seconds, launched, now=time.monotonic):
+    """Return the seconds since `launched` and the steps at two thirds of `seconds` and at their end."""
+    marks, left = [], [share * seconds for share in SHARES]
+
+    def look():
+        passed = now() - launched
+        while left and passed >= left[0]:
+            marks.append((passed, model.num_timesteps))
+            del left[0]
+        return not left
+
+    train(model, 10**9, look)
+    return marks
+
+
+def learn(model, environment, steps):
+    """Return the step, the updates, and the returns and lengths of ten episodes, after each of `steps`."""
+    found, left = [], list(steps)
+
+    def look():
+        if left and model.num_timesteps >= left[0]:
+            found.append((model.num_timesteps, model._n_updates, evaluate(model, environment, EPISODES)))
+            del left[0]
+        return not left
+
+    train(model, steps[-1] + 1, look)  # one more than wanted: what ends training is `look`
+    return found
 
 
 def main(given=None):
-    """Train and write the rows; print how far it came, as one line of JSON."""
+    """Train, and print how far it came as one line of JSON; with `--steps` the rows are written first."""
     arguments = read_arguments(given)
-    rows = train(arguments, Clock(arguments.launched))
+    model = make_peer(arguments.peer, arguments.task, arguments.seed)
+    if arguments.seconds is not None:
+        print(json.dumps({"marks": count_steps(model, arguments.seconds, arguments.launched)}), flush=True)
+        return
+    import gymnasium
+
+    found = learn(model, gymnasium.make(arguments.task), arguments.steps)
     partial = arguments.out.with_suffix(".partial")
     with partial.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
-        writer.writerows(rows)
+        for *reached, episodes in found:
+            for episode, told in enumerate(episodes):
+                writer.writerow((arguments.peer, arguments.task, arguments.seed, *reached, episode, *told))
     os.replace(partial, arguments.out)
-    print(json.dumps(dict(zip(COLUMNS, rows[-1], strict=True))), flush=True)
+    step, updates, _ = found[-1]
+    print(json.dumps({"step": step, "updates": updates}), flush=True)
 
 
 if __name__ == "__main__":

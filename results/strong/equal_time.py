@@ -1,10 +1,10 @@
-"""What csac's candidate and its peers have learnt in equal time: the tables of stage 4 that PROTOCOL.md asks for.
+"""What csac's candidate and its peers have learnt in equal time: what PROTOCOL.md asks for in stage 4.
 
     python results/strong/equal_time.py
 
 The runs are those of `python -m benchmarks.equal_time`, in equal-time/; the candidate's are those of stage 1, in
-results/studies. The return at equal time of a run is the mean of its two evaluations: a peer's at 0.9 of the time T and
-at T, the candidate's at 90,000 and 100,000 steps, of which T is the time.
+results/studies. The return at equal time of a run is the mean of its evaluations in the last fifth: a peer's of the
+time T, the candidate's of the 100,000 steps of which T is the time.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ from csac.types import InputError
 
 HERE = Path(__file__).parent
 EVIDENCE = SimpleNamespace(**runpy.run_path(str(HERE.parent / "reference" / "evidence.py")))
-CANDIDATE = "CSAC, candidate"  # of confirm.toml
-CANDIDATE_STEPS = (90_000, 100_000)
+CANDIDATE = "CSAC, candidate"  # of confirm.toml, and of plan.csv
+STEPS = 100_000  # of the candidate, which take the time T
+LAST_SHARE = 0.2  # of T, or of the candidate's steps: the evaluations there are the return at equal time
 # By the folders of benchmarks/equal_time.py. The first is the SAC automatic of this stage: what scores are shares of.
 PEERS = {
     "sb3-sac": "SB3 SAC",
@@ -46,39 +47,57 @@ PEERS = {
     "sbx-crossq": "SBX CrossQ",
     "sbx-simba": "SBX SimBa",
 }
-ROWS = 20  # of a peer's file: two evaluations of ten episodes
+EPISODES = 10
+TOLD_SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)  # of T, in the table of returns by time
+
+
+class Plan(NamedTuple):
+    """What plan.csv says of one contender on one task."""
+
+    limit: float
+    """T in seconds."""
+    rate: float
+    """Environment steps per second."""
+    steps: dict[float, int]
+    """Those that are over at each share of T."""
 
 
 class Reached(NamedTuple):
-    """What one run has reached at equal time."""
+    """What one run has reached."""
 
     value: float
-    """The mean of its two evaluations; NaN where training failed."""
-    steps: float
-    updates: float = np.nan
+    """The mean of its evaluations in the last fifth; NaN where training failed."""
+    returns: dict[float, float]
+    """The evaluation at each share of T; the candidate's is the last one by then."""
 
 
+Plans = dict[tuple[str, str], Plan]  # by contender and task
 Found = dict[str, dict[str, dict[int, Reached]]]  # by task, method and seed
 
 
 # What runs have reached.
 
 
-def read_times(path: Path) -> dict[str, list[float]]:
-    """Return the seconds of the candidate's runs by task. Raises InputError where there are none."""
-    times: dict[str, list[float]] = {}
-    for row in _table(path, ("task", "seconds"), "python -m benchmarks.equal_time seconds"):
-        times.setdefault(row["task"], []).append(float(row["seconds"]))
-    return times
+def read_plan(path: Path) -> Plans:
+    """Return how far each contender comes in T, by its name in plan.csv. Raises InputError where there is no plan."""
+    plans: Plans = {}
+    for row in _table(path, ("limit", "rate", "share", "steps"), "python -m benchmarks.equal_time speeds"):
+        new = Plan(float(row["limit"]), float(row["rate"]), {})
+        plans.setdefault((row["contender"], row["task"]), new).steps[float(row["share"])] = int(row["steps"])
+    return plans
 
 
-def read_peer(path: Path, limit: float) -> Reached:
-    """Return what the file of one run tells. Raises InputError where it is not one, or of another T."""
-    rows = _table(path, ("limit", "step", "updates", "return"), "python -m benchmarks.equal_time run")
-    if len(rows) != ROWS or {float(row["limit"]) for row in rows} != {limit}:
-        raise InputError(f"{path} does not hold two evaluations of a run of {limit:g} seconds: remove it")
-    value = statistics.fmean(float(row["return"]) for row in rows)
-    return Reached(value, int(rows[-1]["step"]), int(rows[-1]["updates"]))
+def read_peer(path: Path, plan: Plan) -> Reached:
+    """Return what the file of one run tells. Raises InputError where it is not one, or of another plan."""
+    rows = _table(path, ("step", "return"), "python -m benchmarks.equal_time run")
+    if sorted(int(row["step"]) for row in rows) != sorted([*plan.steps.values()] * EPISODES):
+        raise InputError(f"{path} does not hold the evaluations of plan.csv: remove it")
+    returns = {
+        share: statistics.fmean(float(row["return"]) for row in rows if int(row["step"]) == steps)
+        for share, steps in plan.steps.items()
+    }
+    last = [value for share, value in returns.items() if share > 1 - LAST_SHARE]
+    return Reached(statistics.fmean(last), returns)
 
 
 def _table(path: Path, columns: tuple[str, ...], written_by: str) -> list[dict[str, str]]:
@@ -87,24 +106,26 @@ def _table(path: Path, columns: tuple[str, ...], written_by: str) -> list[dict[s
         with path.open(newline="") as file:
             rows = list(csv.DictReader(file))
         for row, column in itertools.product(rows, columns):
-            row[column] if column == "task" else float(row[column])
+            float(row[column])
     except (OSError, KeyError, TypeError, ValueError):
         raise InputError(f"{path} is missing or damaged: {written_by} writes it") from None
     return rows
 
 
-def of_candidate(arm: Arm) -> dict[int, Reached]:
-    """Return what each seed of the candidate has reached after the steps of which T is the time."""
-    reached = {seed: Reached(np.nan, np.nan) for seed in arm.failures}
+def of_candidate(arm: Arm, plan: Plan) -> dict[int, Reached]:
+    """Return what each seed of the candidate has reached."""
+    reached = {seed: Reached(np.nan, dict.fromkeys(plan.steps, np.nan)) for seed in arm.failures}
     if len(arm.rows):
         at, seeds, returns = evaluation_matrix(arm.rows)
-        values = returns[:, np.isin(at, CANDIDATE_STEPS)].mean(axis=1)
-        steps = CANDIDATE_STEPS[-1]
-        reached |= {int(seed): Reached(float(value), steps) for seed, value in zip(seeds, values, strict=True)}
+        values = EVIDENCE.final_returns(arm.rows, STEPS)
+        for seed, line in zip(seeds.tolist(), returns, strict=True):
+            by_then = {share: line[at <= steps] for share, steps in plan.steps.items()}
+            last = {share: float(some[-1]) if len(some) else np.nan for share, some in by_then.items()}
+            reached[seed] = Reached(values[seed], last)
     return reached
 
 
-def gathered(study: Study, results: Source, folder: Path, limits: dict[str, float]) -> Found:
+def gathered(study: Study, results: Source, folder: Path, plans: Plans) -> Found:
     """Return what every peer, and after them the candidate, has reached on each task, as far as it has run."""
     seeds = range(study.first_seed, study.first_seed + study.seeds)
     candidate = {arm.task: arm for arm in gather(study.narrowed(algorithms=[CANDIDATE]), results)}
@@ -112,10 +133,10 @@ def gathered(study: Study, results: Source, folder: Path, limits: dict[str, floa
     for task in study.tasks:
         files = {(peer, seed): folder / task / peer / f"seed-{seed}.csv" for peer in PEERS for seed in seeds}
         found[task] = {
-            label: {s: read_peer(files[peer, s], limits[task]) for s in seeds if files[peer, s].exists()}
+            label: {s: read_peer(files[peer, s], plans[peer, task]) for s in seeds if files[peer, s].exists()}
             for peer, label in PEERS.items()
         }
-        found[task][CANDIDATE] = of_candidate(candidate[task])
+        found[task][CANDIDATE] = of_candidate(candidate[task], plans[CANDIDATE, task])
     return found
 
 
@@ -137,23 +158,40 @@ def measured(found: Found) -> dict[str, dict[str, EVIDENCE.Measured]]:
 # Tables.
 
 
-def task_table(task: str, limit: float, reached: dict[str, dict[int, Reached]], seeds: Sequence[int]) -> Table:
-    """Return what each method has reached on one task."""
+def speed_table(study: Study, plans: Plans) -> Table:
+    """Return how far each contender comes in T."""
+    rows = []
+    for task, (name, label) in itertools.product(study.tasks, {**PEERS, CANDIDATE: CANDIDATE}.items()):
+        plan = plans[name, task]
+        steps = max(plan.steps.values())
+        cells = (
+            Cell(task),
+            Cell(label),
+            numeric(plan.rate, f"{plan.rate:.1f}"),
+            numeric(plan.limit, f"{plan.limit:.0f}"),
+            numeric(steps, f"{steps:,}"),
+        )
+        rows.append(Row(cells))
+    return Table(("task", "method", "steps per second", "T, s", "steps in T"), tuple(rows), "How fast each is")
+
+
+def task_table(task: str, reached: dict[str, dict[int, Reached]], seeds: Sequence[int]) -> Table:
+    """Return what each method has reached on one task, at equal time and on the way."""
     rows = []
     for label, runs in reached.items():
         values = np.nan_to_num([runs[seed].value for seed in seeds])
         std = f" ± {number(values.std(ddof=1), values.mean())}" if len(values) > 1 else ""
-        steps, updates = (np.mean([runs[seed][i] for seed in seeds]) for i in (1, 2))
+        by_then = [[runs[seed].returns.get(share, np.nan) for seed in seeds] for share in TOLD_SHARES]
         cells = (
             Cell(label),
             Cell(f"{number(values.mean())}{std}", values.mean()),
             Cell(number(values.min()), values.min()),
-            numeric(steps, f"{steps:,.0f}"),
-            numeric(updates, f"{updates:,.0f}"),
+            *(numeric(value, number(value)) for value in map(statistics.fmean, by_then)),
         )
         rows.append(Row(cells))
-    headings = ("method", "return at equal time, mean ± std", "worst seed", "steps, mean", "updates, mean")
-    return Table(headings, tuple(rows), f"{task}: {limit:g} s, seeds {_seeds(seeds)}")
+    shares = (f"at {share:g} T" for share in TOLD_SHARES)
+    headings = ("method", "return at equal time, mean ± std", "worst seed", *shares)
+    return Table(headings, tuple(rows), f"{task}: seeds {_seeds(seeds)}")
 
 
 def comparisons(found: dict[str, dict[str, EVIDENCE.Measured]], seeds: Sequence[int]) -> tuple[Table, list[str]]:
@@ -196,36 +234,31 @@ def notes(study: Study, found: Found, seeds: Sequence[int]) -> list[str]:
 
 
 def surroundings(folder: Path) -> list[str]:
-    """Return what the runs depend on: the machine, as far as it was noted, and what else ran on it."""
-    machine, path = folder / "machine.txt", folder / "load.csv"
+    """Return what the speeds depend on: the machine, as far as it was noted, and what else ran on it."""
+    machine, path = folder / "machine.txt", folder / "speeds.csv"
     lines = machine.read_text(encoding="utf-8").splitlines() if machine.exists() else []
     if path.exists():
-        loads = [float(row["load"]) for row in _table(path, ("load",), "python -m benchmarks.equal_time run")]
+        loads = [float(row["load"]) for row in _table(path, ("load",), "python -m benchmarks.equal_time speeds")]
         lines.append(
-            f"other programs kept {statistics.fmean(loads):.2f} cores busy on average, {max(loads):.2f} at most"
+            f"while speeds were measured, other programs kept {statistics.fmean(loads):.2f} cores busy on average, "
+            f"{max(loads):.2f} at most"
         )
     return lines
 
 
 def told(study: Study, results: Source, folder: Path) -> str:
     """Return all that is known of stage 4, in Markdown. Raises InputError where T is not known."""
-    times = read_times(folder / "seconds.csv")
-    if missing := [task for task in study.tasks if task not in times]:
-        raise InputError(f"{missing[0]} was not timed: python -m benchmarks.equal_time seconds")
-    limits = {task: round(statistics.median(times[task]), 1) for task in study.tasks}
+    plans = read_plan(folder / "plan.csv")
+    for task, name in itertools.product(study.tasks, (CANDIDATE, *PEERS)):
+        if (name, task) not in plans:
+            raise InputError(f"{name} on {task} was not measured: python -m benchmarks.equal_time speeds")
     study = dataclasses.replace(study, title="Equal time")
-    found = gathered(study, results, folder, limits)
+    found = gathered(study, results, folder, plans)
     over = measured(found)
     seeds = EVIDENCE.common_seeds(study, over)
     parts = [f"## {study.title}", _list([*notes(study, found, seeds), *surroundings(folder)])]
-    rows = [
-        Row((Cell(task), Cell(f"{limits[task]:g}"), Cell(", ".join(f"{value:.1f}" for value in times[task]))))
-        for task in study.tasks
-    ]
-    tables = [Table(("task", "T, s", "the candidate's runs, s"), tuple(rows))]
-    tables += [
-        task_table(task, limits[task], found[task], next(iter(one.values())).seeds) for task, one in over.items()
-    ]
+    tables = [speed_table(study, plans)]
+    tables += [task_table(task, found[task], next(iter(one.values())).seeds) for task, one in over.items()]
     if seeds:
         comparison, verdicts = comparisons(over, seeds)
         tables += [EVIDENCE.overall_table(study, over), comparison]

@@ -1,11 +1,11 @@
-"""Peers at equal time: the clock, the arguments, the authors' settings in the real libraries, and the list of runs."""
+"""Peers at equal time: steps and seconds, arguments, the settings of authors in the real libraries, and the runs."""
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,13 +13,12 @@ from typing import Any
 import equal_time
 import models
 import pytest
-from equal_time import Clock, Deadline
 from evaluation import evaluate
 
 from benchmarks import equal_time as runner
 from benchmarks.contenders import PEERS_PYTHON
-from benchmarks.measuring import ROOT
-from benchmarks.tables import write_rows
+from benchmarks.measuring import ROOT, Process
+from benchmarks.tables import read_rows, write_rows
 from csac.cli import main as csac
 from csac.studies.study import read_study
 from csac.types import InputError
@@ -28,46 +27,49 @@ STUDY = read_study(runner.STUDY)
 needs_peers = pytest.mark.skipif(not Path(PEERS_PYTHON).exists(), reason="the peers are not installed: make peers")
 
 
-class FakeTime:
-    """A clock on the wall that stands at `at`."""
+class Model:
+    """Learns by a callback as SB3 has it: a rollout of one step, and then an update; each takes `pace` seconds."""
 
-    def __init__(self, at: float) -> None:
-        self.at = at
+    def __init__(self, pace: float = 0.0, warmup: int = 0) -> None:
+        self.pace, self.warmup, self.at = pace, warmup, 100.0
+        self.num_timesteps = self._n_updates = 0
 
-    def __call__(self) -> float:
+    def learn(self, steps: int, callback: Any) -> None:
+        while self.num_timesteps < steps:
+            callback._on_rollout_start()
+            self.num_timesteps += 1
+            self.at += self.pace
+            if not callback._on_step():
+                return
+            self._n_updates += self.num_timesteps > self.warmup
+
+    def now(self) -> float:
         return self.at
 
 
-def at_the_deadline(now: FakeTime, launched: float, step: float, evaluation: float) -> list[float]:
-    """What the clock shows at each evaluation of a limit of 10 s, where a step and an evaluation take so long."""
-    seen: list[float] = []
-
-    def look(seconds: float) -> None:
-        seen.append(seconds)
-        now.at += evaluation
-
-    deadline = Deadline(Clock(launched, now), 10.0, look)
-    while not deadline.is_over():
-        now.at += step
-    return seen
+@pytest.fixture
+def _callbacks(monkeypatch):
+    """What SB3's callbacks are derived from, for the peers' library is not installed here."""
+    name = "stable_baselines3.common.callbacks"
+    monkeypatch.setitem(sys.modules, name, SimpleNamespace(BaseCallback=object))
 
 
-def test_evaluations_come_at_nine_tenths_and_at_the_end_and_stop_the_clock():
-    now = FakeTime(100.0)
-    assert at_the_deadline(now, launched=100.0, step=1.0, evaluation=50.0) == [9.0, 10.0]
-    assert now.at == 100.0 + 10.0 + 2 * 50.0
+@pytest.mark.usefixtures("_callbacks")
+def test_steps_are_counted_after_two_thirds_of_the_seconds_and_at_their_end():
+    model = Model(pace=2.0)
+    # Launched 10 s before, a step each 2 s: 11 steps are over after 32 s, and 19 after 48 s.
+    assert equal_time.count_steps(model, 48.0, launched=90.0, now=model.now) == [(32.0, 11), (48.0, 19)]
 
 
-def test_what_passed_since_the_launch_counts():
-    now = FakeTime(100.0)
-    assert at_the_deadline(now, launched=93.0, step=1.0, evaluation=0.0) == [9.0, 10.0]
-    assert now.at == 103.0
-
-
-def test_a_step_beyond_the_end_is_followed_by_both_evaluations():
-    now = FakeTime(100.0)
-    assert at_the_deadline(now, launched=100.0, step=64.0, evaluation=7.0) == [64.0, 64.0]
-    assert now.at == 100.0 + 64.0 + 2 * 7.0
+@pytest.mark.usefixtures("_callbacks")
+def test_an_evaluation_comes_after_the_updates_of_its_step(monkeypatch):
+    monkeypatch.setattr(equal_time, "evaluate", lambda model, environment, episodes: (environment, episodes))
+    model = Model(warmup=3)
+    assert equal_time.learn(model, "a task", [2, 5, 9]) == [
+        (2, 0, ("a task", 10)),
+        (5, 2, ("a task", 10)),
+        (9, 6, ("a task", 10)),
+    ]
 
 
 class Task:
@@ -100,30 +102,36 @@ def test_the_episodes_have_csac_s_starts_and_the_scale_of_training():
 @pytest.fixture
 def arguments(tmp_path, monkeypatch) -> list[str]:
     monkeypatch.setattr("equal_time.find_spec", lambda library: library)
-    given = ["--peer", "sbx-tqc", "--task", "Walker2d-v4", "--seed", "3", "--seconds", "5", "--out"]
-    return [*given, str(tmp_path / "run.csv")]
+    monkeypatch.chdir(tmp_path)
+    return ["--peer", "sbx-tqc", "--task", "Walker2d-v4", "--seed", "3"]
 
 
 def test_the_clock_of_a_run_by_hand_starts_with_the_script(arguments):
-    assert equal_time.read_arguments(arguments).launched == equal_time.IMPORTED
+    assert equal_time.read_arguments([*arguments, "--seconds", "5"]).launched == equal_time.IMPORTED
 
 
 @pytest.mark.parametrize(
     ("changed", "complaint"),
     [
-        (["--peer", "sbx-rainbow"], "argument --peer: invalid choice: 'sbx-rainbow'"),
-        (["--seconds", "0"], "--seconds must be a number above 0, not 0.0"),
-        (["--seconds", "nan"], "--seconds must be a number above 0, not nan"),
-        (["--seed", "-1"], "--seed must be from 0 to 4294967295, not -1"),
-        (["--launched", "1e12"], "--launched is no reading of time.monotonic() from before this process"),
-        (["--out", "/no/such/folder/run.csv"], "--out must be a file in a folder that exists, not /no/such/folder"),
-        (["--task", "Walker9d-v4"], "--task Walker9d-v4 cannot be made: "),
-        (["--task", "CartPole-v1"], "--task CartPole-v1 has other observations or actions than a row of numbers"),
+        ("--seconds 5 --peer sbx-rainbow", "argument --peer: invalid choice: 'sbx-rainbow'"),
+        ("--seconds 0", "--seconds must be a number above 0, not 0.0"),
+        ("--seconds nan", "--seconds must be a number above 0, not nan"),
+        ("--seconds 5 --out run.csv", "--out is for --steps: with --seconds nothing is evaluated"),
+        ("--seconds 5 --steps 9", "argument --steps: not allowed with argument --seconds"),
+        ("", "one of the arguments --seconds --steps is required"),
+        ("--steps 9 9 --out run.csv", "--steps must be whole numbers from 1 on that rise, not 9 9"),
+        ("--steps 0 9 --out run.csv", "--steps must be whole numbers from 1 on that rise, not 0 9"),
+        ("--steps 9", "--steps needs --out FILE.csv"),
+        ("--steps 9 --out no/folder/run.csv", "--out must be a file in a folder that exists, not no/folder/run.csv"),
+        ("--seconds 5 --seed -1", "--seed must be from 0 to 4294967295, not -1"),
+        ("--seconds 5 --launched 1e12", "--launched is no reading of time.monotonic() from before this process"),
+        ("--seconds 5 --task Walker9d-v4", "--task Walker9d-v4 cannot be made: "),
+        ("--seconds 5 --task CartPole-v1", "--task CartPole-v1 has other observations or actions than a row of"),
     ],
 )
 def test_a_mistake_is_one_clear_line(arguments, changed, complaint, capsys):
     with pytest.raises(SystemExit) as stopped:
-        equal_time.read_arguments([*arguments, *changed])
+        equal_time.read_arguments([*arguments, *changed.split()])
 
     error = capsys.readouterr().err
     assert (stopped.value.code, error.count("\n")) == (2, 1)
@@ -133,7 +141,7 @@ def test_a_mistake_is_one_clear_line(arguments, changed, complaint, capsys):
 def test_without_the_libraries_it_says_which_python_has_them(arguments, monkeypatch, capsys):
     monkeypatch.setattr("equal_time.find_spec", lambda library: None)
     with pytest.raises(SystemExit):
-        equal_time.read_arguments(arguments)
+        equal_time.read_arguments([*arguments, "--seconds", "5"])
     assert "sbx is not installed: `make peers`" in capsys.readouterr().err
 
 
@@ -203,21 +211,14 @@ def test_the_libraries_have_the_settings_of_the_authors():
     assert [found[peer]["scales"] for peer in models.PEERS[:4]] == [None] * 4
 
 
-# A clock that ticks whenever it is asked, once before each step, instead of one that knows how fast the machine is.
 TINY = """
-import itertools, json, sys
-from argparse import Namespace
-import equal_time
+import json, sys
+import equal_time, gymnasium
 
-def with_less_warmup(*given):
-    model = made(*given)
-    model.learning_starts = 30
-    return model
-
-made, equal_time.make_peer = equal_time.make_peer, with_less_warmup
-ticks = itertools.count(1)
-arguments = Namespace(peer=sys.argv[1], task="InvertedPendulum-v4", seed=5, seconds=40.0)
-print(json.dumps(equal_time.train(arguments, equal_time.Clock(0, lambda: next(ticks)))))
+model = equal_time.make_peer(sys.argv[1], "InvertedPendulum-v4", 5)
+model.learning_starts = 30
+found = equal_time.learn(model, gymnasium.make("InvertedPendulum-v4"), [36, 40])
+print(json.dumps(found))
 """
 
 
@@ -225,70 +226,96 @@ print(json.dumps(equal_time.train(arguments, equal_time.Clock(0, lambda: next(ti
 @needs_peers
 @pytest.mark.parametrize("peer", ["sb3-sac", "sbx-crossq"])
 def test_a_peer_is_evaluated_after_the_updates_of_its_steps_and_ends_by_itself(peer):
-    rows = in_the_peers_python(TINY, peer)
+    found = in_the_peers_python(TINY, peer)
 
-    told = [dict(zip(equal_time.COLUMNS, row, strict=True)) for row in rows]
-    assert [row["episode"] for row in told] == [*range(10), *range(10)]
-    assert {(row["peer"], row["task"], row["seed"], row["limit"]) for row in told} == {
-        (peer, "InvertedPendulum-v4", 5, 40.0)
-    }
-    first, last = told[0], told[-1]
-    assert (first["seconds"], last["seconds"]) == (36, 40)
-    for row in (first, last):
-        assert row["updates"] == row["step"] - 30 > 0
-    assert first["step"] < last["step"]
-    assert all(row["return"] == row["length"] for row in told)  # its reward is 1 for each step
+    assert [(step, updates, len(episodes)) for step, updates, episodes in found] == [(36, 6, 10), (40, 10, 10)]
+    assert all(total == length for *_, episodes in found for total, length in episodes)  # its reward is 1 for each step
 
 
-# The list of runs.
+# How fast each is.
 
-
-def timed_rows(task: str, *seconds: float) -> list[dict[str, Any]]:
-    words = [runner.training(STUDY, task, repetition) for repetition in range(len(seconds))]
-    return [
-        {"task": task, "repetition": i, "seconds": one, "load": 0.0, "command": " ".join(["csac", *words[i]])}
-        for i, one in enumerate(seconds)
-    ]
+# Steps per second, and the seconds before the first step: T is 10 s + 100,000 steps / 100.
+PACES = {runner.CANDIDATE: (100.0, 10.0), **{peer: (10.0 * (i + 1), 5.0) for i, peer in enumerate(runner.PEERS)}}
+T = 1010.0
 
 
 @pytest.fixture
-def folder(tmp_path) -> Path:
-    """Where both tasks are timed: 20 s and 30.1 s."""
-    rows = [*timed_rows("Walker2d-v4", 19.0, 20.04, 99.0), *timed_rows("Ant-v4", 30.06, 1.0, 40.0)]
-    write_rows(tmp_path / "seconds.csv", rows)
+def measured(monkeypatch) -> list[tuple[str, str]]:
+    """What is measured, at PACES; the second of three repetitions is right, the others are too fast and too slow."""
+    made: list[tuple[str, str]] = []
+
+    def measure(contender: str, study: Any, task: str) -> runner.Speed:
+        made.append((contender, task))
+        pace, start = PACES[contender]
+        pace *= (1.5, 1.0, 0.5)[(made.count((contender, task)) - 1) % 3]
+        return runner.Speed((40.0, 60.0), (pace * (40 - start), pace * (60 - start)))
+
+    monkeypatch.setattr(runner, "measure", measure)
+    monkeypatch.setattr(runner, "time_training", lambda words: 1.0)
+    monkeypatch.setattr(runner, "machine", lambda seconds: ["a processor"])
+    monkeypatch.setattr(runner, "PEERS_PYTHON", __file__)
+    return made
+
+
+@pytest.fixture
+def folder(tmp_path, measured) -> Path:
+    """Where everything has its speed."""
+    assert runner.main(["speeds", "--folder", str(tmp_path)]) == 0
+    measured.clear()
     return tmp_path
 
 
-@pytest.fixture
-def started(monkeypatch) -> list[list[str]]:
-    """The commands of the peers, which fail for SBX's TQC on Ant and else write a file."""
-    commands: list[list[str]] = []
-
-    def run_one(command: list[str], cores: int) -> dict[str, Any]:
-        commands.append(command)
-        given = dict(zip(command[2::2], command[3::2], strict=True))
-        if (given["--peer"], given["--task"]) == ("sbx-tqc", "Ant-v4"):
-            raise RuntimeError("it broke")
-        write_rows(Path(given["--out"]), [{"limit": float(given["--seconds"])}])
-        return {"step": 1_000, "updates": 900, "seconds": float(given["--seconds"])}
-
-    monkeypatch.setattr(runner, "run_one", run_one)
-    monkeypatch.setattr(runner, "PEERS_PYTHON", __file__)
-    return commands
+def test_a_speed_is_a_line_through_two_moments():
+    speed = runner.Speed((40.0, 60.0), (700.0, 1_100.0))
+    assert (speed.rate, speed.steps_at(100.0), speed.seconds_at(1_900.0)) == (20.0, 1_900.0, 100.0)
 
 
-def test_t_is_the_median_of_three_runs(folder):
-    rows = runner.timed(folder, STUDY)
-    assert runner.limits(rows, STUDY.tasks) == {"Walker2d-v4": 20.0, "Ant-v4": 30.1}
-    with pytest.raises(InputError, match="Ant-v4 was timed 2 times, not 3: python -m"):
-        runner.limits(rows[:-1], STUDY.tasks)
+def test_the_plan_has_the_steps_of_each_in_the_time_of_the_candidate(folder):
+    limits, steps = runner.read_plan(folder)
+    assert limits == dict.fromkeys(STUDY.tasks, T)
+    assert steps[runner.CANDIDATE, "Ant-v4"][-1] == 100_000
+    for i, peer in enumerate(runner.PEERS):
+        pace = 10 * (i + 1)
+        assert steps[peer, "Ant-v4"] == [round(pace * (share * T - 5)) for share in runner.SHARES]
+    assert (folder / "machine.txt").read_text() == "a processor\n"
 
 
-def test_the_time_of_another_candidate_is_refused(folder):
-    other = dataclasses.replace(STUDY.methods[2], hyperparameters={"policy_delay": 1})
-    study = dataclasses.replace(STUDY, methods=(*STUDY.methods[:2], other))
-    with pytest.raises(InputError, match=r"seconds.csv was measured with another candidate than confirm.toml has"):
-        runner.timed(folder, study)
+def test_a_share_of_the_time_without_a_step_is_left_out():
+    slow = runner.Speed((800.0, 900.0), (100.0, 300.0))
+    speeds = {(contender, "Ant-v4"): [slow] * 3 for contender in runner.PEERS}
+    speeds[runner.CANDIDATE, "Ant-v4"] = [runner.Speed((10.0, 510.0), (0.0, 50_000.0))] * 3
+    told = [row for row in runner.plan(speeds, ["Ant-v4"]) if row["contender"] == "sb3-sac"]
+    assert [row["share"] for row in told] == [0.8, 0.85, 0.9, 0.95, 1.0]  # its first step is over after 750 s
+    assert told[-1]["steps"] == 520
+
+
+def test_only_what_was_not_measured_is_measured(folder, measured):
+    path = folder / "speeds.csv"
+    rows = read_rows(path)
+    assert len(rows) == 3 * 2 * 6
+    write_rows(path, rows[:-1])
+    (folder / "plan.csv").unlink()
+
+    assert runner.main(["speeds", "--folder", str(folder)]) == 0
+
+    assert measured == [("sbx-simba", "Ant-v4")]
+    assert len(read_rows(path)) == len(rows)
+    assert (folder / "plan.csv").exists()
+
+
+def test_without_every_speed_there_is_no_plan(folder):
+    speeds = runner.measured(folder, STUDY)
+    speeds["sbx-tqc", "Ant-v4"].pop()
+    with pytest.raises(InputError, match="sbx-tqc on Ant-v4 was measured 2 times, not 3: go on with speeds"):
+        runner.plan(speeds, STUDY.tasks)
+
+
+def test_the_speed_of_another_candidate_is_refused(folder):
+    (index,) = [i for i, method in enumerate(STUDY.methods) if method.label == runner.CANDIDATE]
+    other = dataclasses.replace(STUDY.methods[index], hyperparameters={"policy_delay": 1})
+    methods = (*STUDY.methods[:index], other, *STUDY.methods[index + 1 :])
+    with pytest.raises(InputError, match=r"speeds.csv was measured with another candidate than confirm.toml has"):
+        runner.measured(folder, dataclasses.replace(STUDY, methods=methods))
 
 
 def test_the_candidate_is_timed_with_every_hyperparameter_of_stage_1(monkeypatch):
@@ -299,52 +326,92 @@ def test_the_candidate_is_timed_with_every_hyperparameter_of_stage_1(monkeypatch
         return SimpleNamespace(manifest=SimpleNamespace(state="finished", failures={}))
 
     monkeypatch.setattr("csac.training.train.train", train)
-    csac(runner.training(STUDY, "Ant-v4", 2))
+    csac(runner.training(STUDY, "Ant-v4", 20_000))
 
     (candidate,) = [method for method in STUDY.methods if method.label == runner.CANDIDATE]
     assert dataclasses.asdict(trained["algorithm"]) == candidate.hyperparameters_on("Ant-v4")
-    assert (trained["task"], trained["steps"], trained["first_seed"]) == ("Ant-v4", 100_000, 102)
-    assert (trained["evaluation_interval"], trained["evaluation_episodes"]) == (100_000, 1)
+    assert (trained["task"], trained["steps"], trained["first_seed"]) == ("Ant-v4", 20_000, 100)
+    assert (trained["evaluation_interval"], trained["evaluation_episodes"]) == (20_000, 1)
 
 
-def test_only_what_was_not_timed_is_timed(folder, monkeypatch):
-    rows = runner.timed(folder, STUDY)
-    write_rows(folder / "seconds.csv", [row for row in rows if (row["task"], row["repetition"]) != ("Ant-v4", 1)])
-    monkeypatch.setattr(runner, "time_training", lambda words: 31.5)
-    monkeypatch.setattr(runner, "machine", lambda seconds: ["a processor"])
+def test_the_candidate_s_speed_is_that_of_two_commands_and_a_peer_s_that_of_its_marks(monkeypatch):
+    monkeypatch.setattr(runner, "time_training", lambda words: float(words[words.index("--steps") + 1]) / 100 + 10)
+    monkeypatch.setattr(runner, "run_one", lambda command, cores: {"marks": [[41.0, 820], [61.0, 1220]]})
+    assert runner.measure(runner.CANDIDATE, STUDY, "Ant-v4") == runner.Speed((150.0, 210.0), (14_000, 20_000))
+    assert runner.measure("sbx-sac", STUDY, "Ant-v4") == runner.Speed((41.0, 61.0), (820, 1220))
 
-    assert runner.main(["seconds", "--folder", str(folder)]) == 0
 
-    assert runner.timed(folder, STUDY)[:-1] == [*rows[:4], rows[5]]
-    assert runner.limits(runner.timed(folder, STUDY), ["Ant-v4"]) == {"Ant-v4": 31.5}
-    assert (folder / "machine.txt").read_text() == "a processor\n"
+# The runs that learn.
+
+
+@pytest.fixture
+def started(monkeypatch) -> list[tuple[dict[str, str], list[int], list[int]]]:
+    """Arguments, steps and cores of the runs, which fail for SBX's TQC on Ant and else write a file."""
+    commands: list[tuple[dict[str, str], list[int], list[int]]] = []
+
+    def run(processes: list[Process], environment: Any) -> list[dict[str, Any]]:
+        ((command, cores),) = processes
+        at = command.index("--steps")
+        given, steps = dict(zip(command[2:at:2], command[3:at:2], strict=True)), [int(one) for one in command[at + 1 :]]
+        commands.append((given, steps, list(cores)))
+        if (given["--peer"], given["--task"]) == ("sbx-tqc", "Ant-v4"):
+            raise RuntimeError("it broke")
+        write_rows(Path(given["--out"]), [{"step": one} for one in steps for _ in range(10)])
+        return [{"step": steps[-1], "updates": 900}]
+
+    monkeypatch.setattr(runner, "run", run)
+    monkeypatch.setattr(runner, "usable_cores", lambda: [4, 7])
+    return commands
 
 
 def test_peers_run_seed_by_seed_and_what_is_there_is_not_run_again(folder, started, capsys):
     assert runner.main(["run", "--folder", str(folder)]) == 3
 
-    given = [dict(zip(command[2::2], command[3::2], strict=True)) for command in started]
-    assert [one["--peer"] for one in given[:6]] == [*models.PEERS, "sb3-sac"]
-    assert [one["--task"] for one in given[:10]] == ["Walker2d-v4"] * 5 + ["Ant-v4"] * 5
-    assert [one["--seed"] for one in given[::10]] == ["100", "101", "102", "103", "104"]
-    assert {(one["--task"], one["--seconds"]) for one in given} == {("Walker2d-v4", "20.0"), ("Ant-v4", "30.1")}
+    assert [given["--peer"] for given, *_ in started[:6]] == [*models.PEERS, "sb3-sac"]
+    assert [given["--task"] for given, *_ in started[:10]] == ["Walker2d-v4"] * 5 + ["Ant-v4"] * 5
+    assert [given["--seed"] for given, *_ in started[::10]] == ["100", "101", "102", "103", "104"]
+    _, steps = runner.read_plan(folder)
+    assert all(wanted == steps[given["--peer"], given["--task"]] for given, wanted, _ in started)
+    assert {tuple(cores) for *_, cores in started} == {(4,)}
     assert "failed: sbx-tqc on Ant-v4, seed 100: it broke" in capsys.readouterr().err
-    with (folder / "load.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 45
 
     started.clear()
     assert runner.main(["run", "--folder", str(folder)]) == 3
-    assert [command[command.index("--peer") + 1] for command in started] == ["sbx-tqc"] * 5
-    assert "45 of 50 runs are there; the others take 0.0 hours" in capsys.readouterr().out
+    assert [given["--peer"] for given, *_ in started] == ["sbx-tqc"] * 5
+    assert "45 of 50 runs are there; the others take 1.4 hours or more" in capsys.readouterr().out
 
 
-def test_a_run_of_another_t_is_refused(folder, started, capsys):
+def test_parts_are_disjoint_are_everything_and_have_their_own_cores(folder, started):
+    for part in ("1/2", "2/2"):
+        runner.main(["run", "--folder", str(folder), "--part", part])
+
+    files = [given["--out"] for given, *_ in started]
+    assert sorted(files) == sorted(str(one.path) for one in runner.runs(folder, STUDY))
+    assert [cores for *_, cores in started] == [[4]] * 25 + [[7]] * 25
+
+
+@pytest.mark.parametrize("part", ["0/2", "3/2", "half", "1/2/3", "-1/2"])
+def test_what_is_no_part_is_refused(part, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        runner.main(["run", f"--part={part}", "--folder", str(tmp_path)])
+    assert stopped.value.code == 2
+    assert f"{part!r} is no part such as 1/2" in capsys.readouterr().err
+
+
+def test_a_run_of_another_plan_is_refused(folder, started, capsys):
     path = folder / "Ant-v4" / "sbx-sac" / "seed-103.csv"
     path.parent.mkdir(parents=True)
-    write_rows(path, [{"limit": 29.0}])
+    write_rows(path, [{"step": 29}])
 
     assert runner.main(["run", "--folder", str(folder)]) == 2
-    assert f"{path} is of 29 seconds, not of 30.1: remove it" in capsys.readouterr().err
+    assert f"{path} is not of 1,920 to 20,100 steps, as plan.csv has it: remove it" in capsys.readouterr().err
+    assert not started
+
+
+def test_before_the_speeds_nothing_is_run(tmp_path, started, monkeypatch, capsys):
+    monkeypatch.setattr(runner, "PEERS_PYTHON", __file__)
+    assert runner.main(["run", "--folder", str(tmp_path)]) == 2
+    assert "plan.csv does not exist: python -m benchmarks.equal_time speeds writes it" in capsys.readouterr().err
     assert not started
 
 
@@ -352,10 +419,10 @@ def test_the_script_understands_what_it_is_given(folder, monkeypatch):
     monkeypatch.setattr("equal_time.unusable", lambda peer, task: "")
     for run in runner.runs(folder, STUDY)[:10]:
         run.path.parent.mkdir(parents=True, exist_ok=True)
-        python, script, *given = runner.command(run, 20.0)
+        python, script, *given = runner.command(run, [20, 30])
         read = equal_time.read_arguments(given)
-        assert (read.peer, read.task, read.seed, read.seconds, read.out) == (*run[:3], 20.0, run.path)
-        assert (python, Path(script)) == (PEERS_PYTHON, Path(equal_time.__file__))
+        assert (read.peer, read.task, read.seed, read.steps, read.out) == (*run[:3], [20, 30], run.path)
+        assert (python, Path(script)) == (runner.PEERS_PYTHON, Path(equal_time.__file__))
 
 
 def test_the_peers_are_the_same_everywhere():
