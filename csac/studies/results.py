@@ -64,7 +64,7 @@ class Runs:
 class Results:
     """Records from files that were collected: `cells/<task>/<arm>/seed-<k>.json` and its tables.
 
-    A run does not depend on how long it goes on: one of more steps stands for the cell that was not run itself.
+    A run without a schedule does not depend on how long it goes on: a longer one stands for a cell that was not run.
     """
 
     def __init__(self, directory: str | Path, may_be_empty: bool = False) -> None:
@@ -90,6 +90,8 @@ class Results:
 
     def _of_longer(self, cell: Cell) -> Record | None:
         """Return the beginning of a longer run, which has no policy of that time to test, and not how long it took."""
+        if cell.make_algorithm().cadence.has_schedule:
+            return None
         for steps, path in sorted(self._of_any_length.get(_whatever_its_length(cell), {}).items()):
             if steps > cell.steps and cell.steps % cell.evaluation_interval == 0:
                 whole = _read(path)

@@ -2,6 +2,7 @@ import io
 import re
 import shlex
 import signal
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -10,7 +11,7 @@ from studying import TINY, cell, make_run, write
 from csac.cli import main
 from csac.studies import commands
 from csac.studies.calibration import Calibration, Cost, predict
-from csac.studies.cells import HOME, Store
+from csac.studies.cells import HOME, Cell, Store
 from csac.studies.job import Ended, Started, Stopped
 from csac.studies.results import Results, Runs, collect
 from csac.studies.study import cells_of, read_study
@@ -89,10 +90,16 @@ def test_a_longer_run_that_was_collected_stands_for_a_shorter_one(tmp_path, monk
     assert csac("study run shorter.toml --engine local --seeds 1 --directory another/machine --results out") == 0
 
 
+def ppo(**hyperparameters):
+    given = {"evaluation_interval": 100, "evaluation_episodes": 2}
+    return Cell.make("Hopper-v4", "ppo", hyperparameters, seed=0, steps=300, **given)
+
+
 def test_what_no_longer_run_has_is_not_taken_from_one():
-    for seed, state in enumerate(("finished", "failed")):
-        failures = {seed: "step 290: the actor is not finite"} if state == "failed" else {}
-        one = cell(seed=seed)
+    schedules = [ppo(learning_rate_schedule=schedule) for schedule in ("linear", "constant")]
+    for one in (cell(), cell(seed=1), *schedules):
+        seed, state = one.seed, "failed" if one.seed == 1 else "finished"
+        failures = {1: "step 290: the actor is not finite"} if state == "failed" else {}
         run = make_run(Store(), one, steps_done=300, state=state, failures=failures)
         rows = [{"seed": seed, "step": step, "episode": 0, "return": 1.0, "length": 9} for step in (100, 200, 300)]
         run.append("evaluations", rows)
@@ -104,6 +111,9 @@ def test_what_no_longer_run_has_is_not_taken_from_one():
     assert results.status(cell(steps=400), rollouts=0) is None, "it is shorter"
     assert results.status(cell(seed=1, steps=200), rollouts=0) is None, "it failed"
     assert results.status(cell(steps=200, evaluation_episodes=3), rollouts=0) is None, "it is another"
+    falling, constant = (results.status(replace(one, steps=200), rollouts=0) for one in schedules)
+    assert falling is None, "its learning rate fell more slowly"
+    assert constant == ("complete", 200, "", 0.0)
 
 
 def test_on_a_terminal_where_nothing_is_left_to_run_it_is_said(engine, monkeypatch):
