@@ -125,7 +125,11 @@ def measure(contender: str, study: Study, task: str) -> Speed:
         answer = run_one(_script(contender, *what, "--launched", repr(time.monotonic())), CORES)
     except RuntimeError as error:
         raise InputError(f"{contender} on {task}: {error}") from None
-    (first, before), (second, after) = answer["marks"]
+    (first, before, updates), (second, after, _) = answer["marks"]
+    if not (updates and before < after):
+        raise InputError(
+            f"{contender} on {task} still warmed up after {first:.0f} s: this machine is too slow to time it"
+        )
     return Speed((first, second), (before, after))
 
 
@@ -144,7 +148,7 @@ def measured(folder: Path, study: Study) -> Speeds:
 def measure_speeds(folder: Path, study: Study) -> None:
     """Measure what speeds.csv has not got, all in turns, and write plan.csv.
 
-    The candidate's first run on a task is not counted: it compiles what the others find.
+    The candidate's first runs on a task are not counted: they compile what the others find.
     """
     _need_peers()
     folder.mkdir(parents=True, exist_ok=True)
@@ -153,7 +157,8 @@ def measure_speeds(folder: Path, study: Study) -> None:
         if len(measured(folder, study).get((contender, task), [])) > repetition:
             continue
         if contender == CANDIDATE and task not in prepared:
-            time_training(training(study, task, TIMED_STEPS[0]))
+            for steps in TIMED_STEPS:  # which have programs of their own: the replay has a row for each step
+                time_training(training(study, task, steps))
             prepared.add(task)
         others = watch_load()
         speed, load = measure(contender, study, task), others()
@@ -192,11 +197,19 @@ def plan(speeds: Speeds, tasks: Iterable[str]) -> list[Row]:
     return rows
 
 
-def read_plan(folder: Path) -> tuple[dict[str, float], dict[tuple[str, str], list[int]]]:
-    """Return T of each task, and the steps of each contender on it. Raises InputError where there is no plan."""
+def read_plan(folder: Path, study: Study) -> tuple[dict[str, float], dict[tuple[str, str], list[int]]]:
+    """Return T of each task, and the steps of each contender on it.
+
+    Raises:
+        InputError: there is no plan, or it is not what the speeds say.
+    """
     path = folder / "plan.csv"
     if not path.exists():
         raise InputError(f"{path} does not exist: python -m benchmarks.equal_time speeds writes it")
+    if [row["steps"] for row in read_rows(path)] != [
+        row["steps"] for row in plan(measured(folder, study), study.tasks)
+    ]:
+        raise InputError(f"{path} is not what speeds.csv says: python -m benchmarks.equal_time speeds writes it again")
     limits: dict[str, float] = {}
     steps: dict[tuple[str, str], list[int]] = {}
     for row in read_rows(path):
@@ -239,7 +252,7 @@ def command(one: Run, steps: Sequence[int]) -> list[str]:
 def run_peers(folder: Path, study: Study, part: tuple[int, int]) -> list[Run]:
     """Make the runs of a part that are missing, one at a time, and return those that failed: they leave no file."""
     _need_peers()
-    limits, steps = read_plan(folder)
+    limits, steps = read_plan(folder, study)
     which, parts = part
     planned = runs(folder, study)[which - 1 :: parts]
     left, failed = waiting(planned, steps), []
@@ -299,10 +312,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--folder", type=Path, default=FOLDER, help="where the files go (results/strong/equal-time)")
     given = parser.parse_args(arguments)
     try:
-        if not sys.platform.startswith("linux") or len(usable_cores()) < CORES:
-            raise InputError("this needs Linux and two processors: run it on such a machine")
+        if not sys.platform.startswith("linux"):
+            raise InputError("this needs Linux: run it on such a machine")
         study = read_study(STUDY)
         if given.what == "speeds":
+            if len(usable_cores()) < CORES:
+                raise InputError(f"speeds are those of {CORES} processors: run it on such a machine")
             measure_speeds(given.folder, study)
             return 0
         return 3 if run_peers(given.folder, study, given.part) else 0

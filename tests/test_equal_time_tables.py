@@ -28,14 +28,18 @@ RETURNS = dict(zip(PEERS, [(100.0, 200.0), (50.0, 300.0), (350.0, 90.0), (450.0,
 
 
 def write_peer(path: Path, limit: float, early: float, late: float) -> None:
-    """Evaluations of ten episodes, whose returns are 1 above and 1 below `early`, or `late` in the last fifth."""
+    """Evaluations of ten episodes, whose returns are 1 above and 1 below their mean.
+
+    That is `early`, and in the last fifth half, half, one and a half times and one and a half times `late`.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("peer", "task", "seed", "step", "updates", "episode", "return", "length"))
         for share in SHARES:
             for episode in range(10):
-                value = (late if share > 0.8 else early) + (1 if episode % 2 else -1)
+                mean = early if share <= 0.8 else late * (0.5 if share <= 0.9 else 1.5)
+                value = mean + (1 if episode % 2 else -1)
                 writer.writerow(("a peer", "a task", 0, round(100 * share * limit), 900, episode, value, 7))
 
 
@@ -73,7 +77,7 @@ def test_the_return_at_equal_time_is_the_mean_of_the_last_fifth(folder):
     assert "| Ant-v4 | SBX TQC | 100.0 | 30 | 3,000 |" in lines
     assert f"| Ant-v4 | {CANDIDATE} | 5000.0 | 30 | 100,000 |" in lines
     assert "**Ant-v4: seeds 100, 101, 102, 103, 104**" in lines
-    crossq = "| 225.0 | 225.0 | 225.0 | 225.0 | 450.0 |"  # at 0.2, 0.4, 0.6, 0.8 and 1 of the time
+    crossq = "| 225.0 | 225.0 | 225.0 | 225.0 | 675.0 |"  # at 0.2, 0.4, 0.6, 0.8 and 1 of the time
     assert f"| SBX CrossQ | 450.0 ± 0.0 | 450.0 {crossq}" in lines
     assert f"| {CANDIDATE} | 400.0 ± 0.0 | 400.0 | 7.00 | 7.00 | 7.00 | 7.00 | 500.0 |" in lines  # Walker2d
     assert f"| {CANDIDATE} | 100.0 ± 0.0 | 100.0 | 7.00 | 7.00 | 7.00 | 7.00 | 100.0 |" in lines  # Ant
@@ -87,7 +91,7 @@ def test_a_share_by_which_a_peer_has_made_no_step_is_empty(folder):
         rows = run.read_text().splitlines()
         run.write_text("\n".join([rows[0], *rows[41:]]))
 
-    assert "| SBX TQC | 90.00 ± 0.00 | 90.00 |  |  | 45.00 | 45.00 | 90.00 |" in told(folder).splitlines()
+    assert "| SBX TQC | 90.00 ± 0.00 | 90.00 |  |  | 45.00 | 45.00 | 135.0 |" in told(folder).splitlines()
 
 
 def test_scores_are_shares_of_sb3_s_sac(folder):

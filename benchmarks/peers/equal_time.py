@@ -4,9 +4,9 @@ r"""Train one peer with one seed, to learn how fast it is on a task or what it h
     .venv-peers/bin/python benchmarks/peers/equal_time.py --peer sbx-tqc --task Ant-v4 --seed 7 --out a.csv \
         --steps 900 1800
 
-With `--seconds` nothing is evaluated: a line of JSON has how many steps were over after two thirds of the seconds and
-at their end, which are those since the process was started: imports and compilation count. With `--steps` it is
-evaluated after each of them, in 10 deterministic episodes, and training ends with the last. The peers and their
+With `--seconds` nothing is evaluated: a line of JSON has how many steps and updates were over after two thirds of the
+seconds and at their end, which are those since the process was started: imports and compilation count. With `--steps`
+it is evaluated after each of them, in 10 deterministic episodes, and training ends with the last. The peers and their
 settings are in models.py; `python -m benchmarks.equal_time` runs all of them.
 """
 
@@ -111,13 +111,13 @@ def train(model, steps, look):
 
 
 def count_steps(model, seconds, launched, now=time.monotonic):
-    """Return the seconds since `launched` and the steps at two thirds of `seconds` and at their end."""
+    """Return the seconds since `launched`, the steps and the updates at two thirds of `seconds` and at their end."""
     marks, left = [], [share * seconds for share in SHARES]
 
     def look():
         passed = now() - launched
         while left and passed >= left[0]:
-            marks.append((passed, model.num_timesteps))
+            marks.append((passed, model.num_timesteps, model._n_updates))
             del left[0]
         return not left
 

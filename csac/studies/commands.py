@@ -147,7 +147,7 @@ class Run(Chosen):
     """Where the networks learn."""
     results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
     """Copy the evaluations and a small manifest of each cell that is over there: what a report needs. What was copied
-    there before, on this machine or another, is not run again."""
+    there before, on this machine or another, is not run again, nor what is the beginning of it."""
     wandb: FlagCreatePairsOff[bool] = False
     """Log to Weights & Biases too: a run for each cell, in the project WANDB_PROJECT or else csac (docs/python.md)."""
     keep_checkpoints: FlagCreatePairsOff[bool] = False
@@ -288,15 +288,16 @@ def run(options: Run) -> int:
         if not 0 <= options.cell < len(cells):
             raise InputError(f"--cell counts from 0 to {len(cells) - 1}, not {options.cell}")
         cells = [cells[options.cell]]
+    if options.results:
+        results = Results(options.results, may_be_empty=True)
+        for cell in cells:
+            if not results.has(cell):  # what another machine may have run stays as it is
+                collect(store, cell, options.results)
     collected = _collected(studies, cells, options.results)
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     _say(console, _intention(studies, cells, statuses.values()), "bold")
     jobs = [job for job in _jobs(studies, cells, store, options) if job.cell.key not in collected and not is_over(job)]
     by_key = {cell.key: cell for cell in cells}
-    if options.results:
-        for cell in cells:
-            if cell.key not in collected:  # which another machine may have run
-                collect(store, cell, options.results)
     done = {key: status.steps for key, status in statuses.items()}
     progress = StudyProgress([job.cell for job in jobs], labels, done, console)
 

@@ -83,6 +83,10 @@ class Results:
                 f"{self.directory} holds no results of a study; csac study run NAME --results DIR makes them"
             )
 
+    def has(self, cell: Cell) -> bool:
+        """Whether the cell itself was collected, and not a longer run alone."""
+        return cell.key in self._files
+
     def record(self, cell: Cell) -> Record | None:
         """Return what a cell has given, or None where it was not collected."""
         path = self._files.get(cell.key)

@@ -2,6 +2,7 @@
 
     python results/reference/evidence.py tables results/reference/screen.toml results/reference/confirm.toml
     python results/reference/evidence.py tables results/reference/tenth.toml --seeds 3 4 --into PAGE.md#NAME
+    python results/reference/evidence.py tables results/strong/confirm.toml --methods "SAC, automatic" "CSAC, candidate"
     python results/reference/evidence.py write chosen       (or options)
     python results/reference/evidence.py null --tasks 3
 
@@ -408,6 +409,7 @@ def main() -> None:
     tables = commands.add_parser("tables", help="print the tables of studies")
     tables.add_argument("studies", nargs="+", type=Path, metavar="STUDY.toml")
     tables.add_argument("--seeds", nargs="+", type=int, default=(), help="only these, where the study has them")
+    tables.add_argument("--methods", nargs="+", help="only these: what is told is told on the seeds that they have")
     tables.add_argument("--into", metavar="PAGE.md#NAME", help="write between the marks NAME of a page")
     writing = commands.add_parser("write", help="write the arms of a stage, by the results of those before it")
     writing.add_argument("stage", choices=STAGES)
@@ -420,7 +422,8 @@ def main() -> None:
     try:
         if arguments.command == "tables":
             source = Results(arguments.results)
-            text = "\n\n".join(told(read_study(path), source, arguments.seeds) for path in arguments.studies) + "\n"
+            studies = [read_study(path).narrowed(algorithms=arguments.methods) for path in arguments.studies]
+            text = "\n\n".join(told(study, source, arguments.seeds) for study in studies) + "\n"
             if arguments.into:
                 page, _, name = arguments.into.partition("#")
                 write_between(Path(page), name, text)

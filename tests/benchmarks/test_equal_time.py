@@ -56,9 +56,9 @@ def _callbacks(monkeypatch):
 
 @pytest.mark.usefixtures("_callbacks")
 def test_steps_are_counted_after_two_thirds_of_the_seconds_and_at_their_end():
-    model = Model(pace=2.0)
+    model = Model(pace=2.0, warmup=4)
     # Launched 10 s before, a step each 2 s: 11 steps are over after 32 s, and 19 after 48 s.
-    assert equal_time.count_steps(model, 48.0, launched=90.0, now=model.now) == [(32.0, 11), (48.0, 19)]
+    assert equal_time.count_steps(model, 48.0, launched=90.0, now=model.now) == [(32.0, 11, 7), (48.0, 19, 15)]
 
 
 @pytest.mark.usefixtures("_callbacks")
@@ -251,7 +251,7 @@ def measured(monkeypatch) -> list[tuple[str, str]]:
         return runner.Speed((40.0, 60.0), (pace * (40 - start), pace * (60 - start)))
 
     monkeypatch.setattr(runner, "measure", measure)
-    monkeypatch.setattr(runner, "time_training", lambda words: 1.0)
+    monkeypatch.setattr(runner, "time_training", lambda words: made.append(("prepared", words[1])) or 1.0)
     monkeypatch.setattr(runner, "machine", lambda seconds: ["a processor"])
     monkeypatch.setattr(runner, "PEERS_PYTHON", __file__)
     return made
@@ -261,6 +261,9 @@ def measured(monkeypatch) -> list[tuple[str, str]]:
 def folder(tmp_path, measured) -> Path:
     """Where everything has its speed."""
     assert runner.main(["speeds", "--folder", str(tmp_path)]) == 0
+    prepared = [("prepared", STUDY.tasks[0])] * 2  # both lengths have programs of their own
+    assert measured[:3] == [*prepared, (runner.CANDIDATE, STUDY.tasks[0])]
+    assert len(measured) == 3 * 2 * 6 + 2 * 2
     measured.clear()
     return tmp_path
 
@@ -271,7 +274,7 @@ def test_a_speed_is_a_line_through_two_moments():
 
 
 def test_the_plan_has_the_steps_of_each_in_the_time_of_the_candidate(folder):
-    limits, steps = runner.read_plan(folder)
+    limits, steps = runner.read_plan(folder, STUDY)
     assert limits == dict.fromkeys(STUDY.tasks, T)
     assert steps[runner.CANDIDATE, "Ant-v4"][-1] == 100_000
     for i, peer in enumerate(runner.PEERS):
@@ -336,9 +339,22 @@ def test_the_candidate_is_timed_with_every_hyperparameter_of_stage_1(monkeypatch
 
 def test_the_candidate_s_speed_is_that_of_two_commands_and_a_peer_s_that_of_its_marks(monkeypatch):
     monkeypatch.setattr(runner, "time_training", lambda words: float(words[words.index("--steps") + 1]) / 100 + 10)
-    monkeypatch.setattr(runner, "run_one", lambda command, cores: {"marks": [[41.0, 820], [61.0, 1220]]})
+    monkeypatch.setattr("equal_time.unusable", lambda peer, task: "")
+    given: list[Any] = []
+    answer = {"marks": [[41.0, 820, 720], [61.0, 1220, 1120]]}
+
+    def run_one(command: list[str], cores: int) -> dict[str, Any]:
+        given.append(equal_time.read_arguments(command[2:]))
+        return answer
+
+    monkeypatch.setattr(runner, "run_one", run_one)
     assert runner.measure(runner.CANDIDATE, STUDY, "Ant-v4") == runner.Speed((150.0, 210.0), (14_000, 20_000))
     assert runner.measure("sbx-sac", STUDY, "Ant-v4") == runner.Speed((41.0, 61.0), (820, 1220))
+    assert [(one.peer, one.task, one.seed, one.seconds) for one in given] == [("sbx-sac", "Ant-v4", 100, 60.0)]
+    for marks in ([[41.0, 20, 0], [61.0, 40, 10]], [[64.0, 820, 720], [64.0, 820, 720]]):
+        answer["marks"] = marks
+        with pytest.raises(InputError, match=r"sbx-sac on Ant-v4 still warmed up after \d+ s: this machine is too"):
+            runner.measure("sbx-sac", STUDY, "Ant-v4")
 
 
 # The runs that learn.
@@ -370,7 +386,7 @@ def test_peers_run_seed_by_seed_and_what_is_there_is_not_run_again(folder, start
     assert [given["--peer"] for given, *_ in started[:6]] == [*models.PEERS, "sb3-sac"]
     assert [given["--task"] for given, *_ in started[:10]] == ["Walker2d-v4"] * 5 + ["Ant-v4"] * 5
     assert [given["--seed"] for given, *_ in started[::10]] == ["100", "101", "102", "103", "104"]
-    _, steps = runner.read_plan(folder)
+    _, steps = runner.read_plan(folder, STUDY)
     assert all(wanted == steps[given["--peer"], given["--task"]] for given, wanted, _ in started)
     assert {tuple(cores) for *_, cores in started} == {(4,)}
     assert "failed: sbx-tqc on Ant-v4, seed 100: it broke" in capsys.readouterr().err
@@ -405,6 +421,16 @@ def test_a_run_of_another_plan_is_refused(folder, started, capsys):
 
     assert runner.main(["run", "--folder", str(folder)]) == 2
     assert f"{path} is not of 1,920 to 20,100 steps, as plan.csv has it: remove it" in capsys.readouterr().err
+    assert not started
+
+
+def test_a_plan_that_is_not_of_the_speeds_is_refused(folder, started, capsys):
+    rows = read_rows(folder / "speeds.csv")
+    write_rows(folder / "speeds.csv", [{**row, "last_steps": row["last_steps"] + 7} for row in rows])
+    assert runner.main(["run", "--folder", str(folder)]) == 2
+    assert (
+        "plan.csv is not what speeds.csv says: python -m benchmarks.equal_time speeds writes" in capsys.readouterr().err
+    )
     assert not started
 
 

@@ -76,7 +76,9 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
 
 
 def test_a_longer_run_that_was_collected_stands_for_a_shorter_one(tmp_path, monkeypatch):
-    shorter = write(tmp_path / "shorter.toml", TINY.replace("steps = 300", "steps = 200"))
+    whole = TINY.replace("replay_size = 150", "replay_size = 1_000")  # so that the replay has a row for each step
+    write(tmp_path / "tiny.toml", whole)
+    shorter = write(tmp_path / "shorter.toml", whole.replace("steps = 300", "steps = 200"))
     assert csac("study run tiny.toml --engine local --seeds 1 --results out") == 0
     assert csac("study run shorter.toml --engine local --seeds 1 --results itself") == 0
     (one, _) = cells_of([read_study(shorter)])
@@ -88,15 +90,21 @@ def test_a_longer_run_that_was_collected_stands_for_a_shorter_one(tmp_path, monk
     assert (part.manifest.steps, part.manifest.steps_done, part.seconds, part.rollouts) == (200, 200, 0.0, None)
     monkeypatch.setattr(commands, "run_here", lambda jobs, tell: pytest.fail("what a longer run has is not run"))
     assert csac("study run shorter.toml --engine local --seeds 1 --directory another/machine --results out") == 0
+    assert not Results("out").has(one)
+    assert csac("study run shorter.toml --engine local --seeds 1 --results out") == 0, "it has run here, by itself"
+    assert Results("out").has(one)
+    collected = Results("out").record(one)
+    assert collected is not None
+    assert (collected.seconds, collected.evaluations.tobytes()) == (itself.seconds, itself.evaluations.tobytes())
 
 
-def ppo(**hyperparameters):
-    given = {"evaluation_interval": 100, "evaluation_episodes": 2}
-    return Cell.make("Hopper-v4", "ppo", hyperparameters, seed=0, steps=300, **given)
+def ppo(schedule):
+    changes = {"learning_rate_schedule": schedule}
+    return Cell.make("Hopper-v4", "ppo", changes, seed=0, steps=300, evaluation_interval=100, evaluation_episodes=2)
 
 
 def test_what_no_longer_run_has_is_not_taken_from_one():
-    schedules = [ppo(learning_rate_schedule=schedule) for schedule in ("linear", "constant")]
+    schedules = [ppo(schedule) for schedule in ("linear", "constant")]
     for one in (cell(), cell(seed=1), *schedules):
         seed, state = one.seed, "failed" if one.seed == 1 else "finished"
         failures = {1: "step 290: the actor is not finite"} if state == "failed" else {}
