@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp
-from csac.algorithms.normalisation import Moments, batch_moments, fold
+from csac.algorithms.normalisation import Moments, fold, normalised_pass
 from csac.algorithms.shapes import Action, Key, Observation, Scalar
 from csac.types import Metrics, Spec, Transition
 
@@ -65,7 +65,12 @@ def least_q_value(critics: Critics, observation: Observation, action: Action) ->
 
 def critic_loss(critics: Critics, transition: Transition, target: Scalar) -> tuple[Scalar, Metrics]:
     """Return L(θ₁) + L(θ₂) with L(θᵢ) = [Qᵢ(s, a) - y]² (the paper's Eq. Q_TD_1), and what to log."""
-    first, second = q_values(critics, transition.observation, transition.action)
+    return squared_errors(q_values(critics, transition.observation, transition.action), target)
+
+
+def squared_errors(values: tuple[Scalar, Scalar], target: Scalar) -> tuple[Scalar, Metrics]:
+    """Return [Q₁ - y]² + [Q₂ - y]², and what to log."""
+    first, second = values
     loss = (first - target) ** 2 + (second - target) ** 2
     return loss, {"critic_loss": loss, "q_mean": (first + second) / 2.0}
 
@@ -119,12 +124,12 @@ def normalised_critic_loss(
         jnp.concatenate([transition.observation, transition.action]),
         jnp.concatenate([transition.next_observation, next_action(transition.next_observation, noise)]),
     )
-    first, second = critics
-    moments = batch_moments(first, pairs), batch_moments(second, pairs)
-    folded = fold_critics(critics, moments)
-    target = critic_target(transition, noise, target_critics=jax.lax.stop_gradient(folded))
-    loss, metrics = critic_loss(folded, transition, jax.lax.stop_gradient(target))
-    return loss, {**metrics, "moments": moments}
+    first, second = (normalised_pass(critic, pairs) for critic in critics)
+    # What the target asks these critics was computed in that pass: XLA finds the same products, and makes them once.
+    target = critic_target(transition, noise, target_critics=jax.lax.stop_gradient((first.folded, second.folded)))
+    values = first.outputs[0][0], second.outputs[0][0]
+    loss, metrics = squared_errors(values, jax.lax.stop_gradient(target))
+    return loss, {**metrics, "moments": (first.moments, second.moments)}
 
 
 def fold_critics(critics: Critics, moments: tuple[Sequence[Moments], Sequence[Moments]]) -> Critics:

@@ -49,16 +49,26 @@ def fold(network: MLP, moments: Sequence[Moments]) -> MLP:
     return MLP(tuple(map(fold_layer, network.layers, moments)), network.activation)
 
 
-def batch_moments(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> tuple[Moments, ...]:
-    """Return the moments of each layer's inputs where those of the layers before are normalised.
+class Pass(NamedTuple):
+    """What one pass through a normalised network gives."""
+
+    outputs: Sequence[Float[Array, " out"]]
+    moments: tuple[Moments, ...]  # of each layer's inputs
+    folded: MLP  # the network as it was seen: its normalisation by these moments folded in
+
+
+def normalised_pass(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> Pass:
+    """Return what a network says of `inputs` where each layer sees its own normalised by their moments.
 
     It is a function of one example, mapped over the axis `BATCH` by `jax.vmap`; an example has one or several `inputs`.
     Gradients pass through the moments, as batch normalisation has it. The last layer's inputs are not centred: the mean
     of what the network says would be its one bias, which Adam moves by no more than the learning rate in an update.
     """
-    found = []
+    moments, folded = [], []
     for layer in network.layers:
-        found.append(moments_of(inputs, centred=layer is not network.layers[-1]))
-        weight, bias = fold_layer(layer, found[-1])
-        inputs = [network.activate(values @ weight + bias) for values in inputs]
-    return tuple(found)
+        if folded:
+            inputs = [network.activate(values) for values in inputs]
+        moments.append(moments_of(inputs, centred=layer is not network.layers[-1]))
+        folded.append(fold_layer(layer, moments[-1]))
+        inputs = [values @ folded[-1].weight + folded[-1].bias for values in inputs]
+    return Pass(inputs, tuple(moments), MLP(tuple(folded), network.activation))
