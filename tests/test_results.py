@@ -73,12 +73,21 @@ def test_the_table_of_the_relative_entropy_follows_from_its_runs(copied, monkeyp
     assert (script.parent / "mechanism.png").stat().st_size > 10_000
 
 
-def test_the_tables_of_the_evidence_follow_from_its_cells(copied, monkeypatch):
-    page = copied / "results" / "reference" / "README.md"
+EVIDENCE = {"reference": ["stage-0", "stage-0-fresh"], "strong": ["primary"]}
+
+
+@pytest.mark.parametrize(("name", "tables"), EVIDENCE.items(), ids=EVIDENCE)
+def test_the_tables_of_the_evidence_follow_from_its_cells(copied, monkeypatch, name, tables):
+    page = copied / "results" / name / "README.md"
     before = page.read_text()
-    page.write_text(re.sub(r"(<!-- (\S+): begin -->\n).*?(<!-- \2: end -->)", r"\1\3", before, flags=re.DOTALL))
+    emptied = before
+    for table in tables:
+        marks = rf"(<!-- {table}: begin -->\n).*?(<!-- {table}: end -->)"
+        emptied, count = re.subn(marks, r"\1\2", emptied, flags=re.DOTALL)
+        assert count == 1
+    page.write_text(emptied)
     lines = re.findall(r"^python (results/reference/evidence.py tables .*)$", before, re.MULTILINE)
-    assert len(lines) == before.count(": begin -->")
+    assert len(lines) == len(tables)
     for line in lines:
         monkeypatch.setattr(sys, "argv", shlex.split(line))
         runpy.run_path(sys.argv[0], run_name="__main__")
