@@ -1,5 +1,6 @@
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -196,13 +197,14 @@ def test_mistakes_in_a_file_are_told_in_one_line(tmp_path, change, message):
 EVIDENCE = Path(__file__).parents[2] / "results" / "reference"
 
 
-def test_the_screen_is_the_named_study_at_a_tenth_and_one_arm_more():
+def test_the_screen_is_the_named_study_at_100_000_steps_and_one_arm_more():
+    # A tenth of Hopper's are 200,000: what the protocol takes is their first half.
     (named,) = NAMED["reference"]
     screen = read_study(EVIDENCE / "screen.toml")
     named = named.shortened(0.1).narrowed(tasks=screen.tasks, seeds=3)
     beside = {entry.cell.key: entry.method.label for entry in screen.entries()}
     for cell in cells_of([named]):
-        del beside[cell.key]
+        del beside[replace(cell, steps=100_000).key]
     assert set(beside.values()) == {"CSAC, periodic 1000, in the actor only"}
 
 
@@ -231,7 +233,7 @@ def test_both_protocols_share_the_runs_of_what_they_compare_with():
     folder = EVIDENCE.parent / "strong"
     there = {one.key for name in ("confirm", "ant") for one in cells_of([read_study(EVIDENCE / f"{name}.toml")])}
     for path, labels in (
-        (folder / "confirm.toml", {"SAC, automatic", "CSAC"}),
+        (folder / "confirm.toml", {"SAC, automatic", "CSAC, paper"}),
         (folder / "aims.toml", {"SAC, automatic"}),
     ):
         assert {entry.method.label for entry in read_study(path).entries() if entry.cell.key in there} == labels
