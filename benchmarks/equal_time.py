@@ -1,6 +1,6 @@
 """What csac's candidate and its peers reach in equal time: stage 4 of results/strong/PROTOCOL.md, run by run.
 
-    python -m benchmarks.equal_time speeds            # how fast each is: some 40 minutes with nothing else running
+    python -m benchmarks.equal_time speeds            # how fast each is; nothing else may run for half an hour
     python -m benchmarks.equal_time run --part 1/2    # what each peer learns in as many steps as T has room for
     python -m benchmarks.equal_time run --part 2/2    # the other half, at the same time or on another machine
 

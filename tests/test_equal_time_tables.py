@@ -191,5 +191,5 @@ def test_without_a_whole_plan_there_are_no_tables(folder):
 
 def test_the_tables_are_of_the_runs_that_are_made():
     assert tuple(TABLES.PEERS) == PEERS
-    assert TABLES.CANDIDATE == CANDIDATE
+    assert (TABLES.CANDIDATE, TABLES.STEPS) == (CANDIDATE, STEPS)
     assert FOLDER.parent == SCRIPT.parent == STUDY.parent
