@@ -55,6 +55,8 @@ class Arm:
     failures: dict[int, str] = field(default_factory=dict)
     missing: list[int] = field(default_factory=list)
     """Seeds that are not over."""
+    beginnings: dict[int, int] = field(default_factory=dict)
+    """Of each seed that is the beginning of a longer run, the steps of that."""
 
     @property
     def rows(self) -> np.ndarray:
@@ -82,19 +84,22 @@ class Arm:
 
 
 def gather(study: Study, source: Source) -> list[Arm]:
-    """Return every arm of a study with what its cells have given, task by task."""
+    """Return every arm of a study with what its cells have given, task by task.
+
+    The beginning of a longer run has no policy of its own to test: where the study tests policies, it is missing.
+    """
     arms: dict[tuple[str, tuple[str, ...], str], Arm] = {}
     for method, condition, cell in study.entries():
         given = (method.algorithm, method.hyperparameters, method.published, method.preset)
         made = Arm(method.label, cell.task, condition, *given)
         arm = arms.setdefault((cell.task, condition, method.label), made)
         record = source.record(cell)
-        if record is None:
+        if record is None or (record.longer and study.rollouts_each):
             arm.missing.append(cell.seed)
         elif record.failure:
             arm.failures[cell.seed] = record.failure
         else:
-            _add(arm, record)
+            _add(arm, record, cell.seed)
     order = {task: index for index, task in enumerate(study.tasks)}
     return sorted(arms.values(), key=lambda arm: order[arm.task])
 
@@ -122,13 +127,15 @@ def tasks_of(arms: Sequence[Arm]) -> dict[str, list[Arm]]:
     return {task: [arm for arm in arms if arm.task == task] for task in dict.fromkeys(arm.task for arm in arms)}
 
 
-def _add(arm: Arm, record: Record) -> None:
+def _add(arm: Arm, record: Record, seed: int) -> None:
     arm.manifests.append(record.manifest)
     if record.seconds:
         one = record.manifest
         arm.times.append(Time(record.seconds, one.steps, tuple(one.seeds), record.interrupted))
     arm.evaluations.append(record.evaluations)
     arm.tests += [] if record.rollouts is None else [record.rollouts]
+    if record.longer:
+        arm.beginnings[seed] = record.longer
 
 
 def _joined(tables: Sequence[np.ndarray]) -> np.ndarray:

@@ -30,6 +30,8 @@ class Record(NamedTuple):
     rollouts: np.ndarray | None
     interrupted: bool | None = None
     """Whether it was ever stopped and resumed, None where that was not written down."""
+    longer: int = 0
+    """Steps of the longer run that it is the beginning of, 0 where it is a run of its own."""
 
     @property
     def failure(self) -> str:
@@ -102,7 +104,7 @@ class Results:
                 begun = dataclasses.replace(whole.manifest, steps=cell.steps, steps_done=cell.steps)
                 rows = whole.evaluations[whole.evaluations["step"] <= cell.steps]
                 if not whole.failure:
-                    return Record(begun, 0.0, rows, None, whole.interrupted)
+                    return Record(begun, 0.0, rows, None, whole.interrupted, steps)
         return None
 
     def status(self, cell: Cell, rollouts: int) -> Status | None:

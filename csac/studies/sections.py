@@ -223,7 +223,7 @@ def success(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
 
 
 def provenance(arms: Sequence[Arm], more: Sequence[str] = ()) -> Iterator[Part]:
-    """Versions, commit, device and wall time of every run."""
+    """Versions, commit, device and wall time of every run, and which of them went on for longer."""
     manifests = [manifest for arm in arms for manifest in arm.manifests]
     if not manifests:
         return
@@ -239,7 +239,7 @@ def provenance(arms: Sequence[Arm], more: Sequence[str] = ()) -> Iterator[Part]:
     if seconds:
         runs = f"{len(seconds)} run{'s' * (len(seconds) > 1)}"
         lines.append(f"Wall time: {duration(sum(seconds))} in {runs}" + ", one after another" * (len(seconds) > 1))
-    yield Items(tuple(lines))
+    yield Items((*lines, *_beginnings(arms)))
 
 
 def commands(lines: Sequence[str], runs: Sequence[str], told: str) -> Iterator[Part]:
@@ -272,6 +272,22 @@ def plain(value: Any) -> str:
 
 def _changes(condition: Sequence[str]) -> str:
     return ", ".join(f"{text} after step {step:,}" if step else text for step, text in marks_of(condition))
+
+
+def _beginnings(arms: Sequence[Arm]) -> Iterator[str]:
+    """Tell which seeds are only the beginnings of longer runs, whose time is not theirs."""
+    for arm in arms:
+        for steps in sorted(set(arm.beginnings.values())):
+            own = [seed for seed, longer in arm.beginnings.items() if longer == steps]
+            several = len(own) > 1
+            seeds = f"seed{'s' * several} {', '.join(map(str, own))}"
+            where = ", ".join(filter(None, (arm.label, described(arm.task, arm.condition))))
+            what = (
+                f"the beginnings of runs of {steps:,} steps"
+                if several
+                else f"the beginning of a run of {steps:,} steps"
+            )
+            yield f"{where}, {seeds}: {what}"
 
 
 def _runs(arms: Sequence[Arm]) -> list[tuple[str, np.ndarray]]:

@@ -3,6 +3,7 @@ import re
 import shlex
 import signal
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -122,6 +123,25 @@ def test_what_no_longer_run_has_is_not_taken_from_one():
     falling, constant = (results.status(replace(one, steps=200), rollouts=0) for one in schedules)
     assert falling is None, "its learning rate fell more slowly"
     assert constant == ("complete", 200, "", 0.0)
+
+
+def test_a_report_says_what_is_the_beginning_of_a_longer_run_and_never_counts_it_as_tested(tmp_path):
+    shorter = cell(steps=200)
+    run = make_run(Store(), replace(shorter, steps=300), steps_done=300, state="finished")
+    rows = [{"seed": 0, "step": step, "episode": 0, "return": 1.0, "length": 9} for step in (100, 200, 300)]
+    run.append("evaluations", rows)
+    collect(Store(), replace(shorter, steps=300), "out")
+    text = TINY.replace("steps = 300", "steps = 200")
+    write(tmp_path / "shorter.toml", text)
+    write(tmp_path / "tested.toml", text.replace("steps = 200", "steps = 200\nrollouts = 2"))
+
+    assert csac("study report shorter.toml --seeds 1 --results out --out shorter") == 0
+    assert csac("study report tested.toml --seeds 1 --results out --out tested") == 0
+
+    report, tested = (Path(name, "report.md").read_text() for name in ("shorter", "tested"))
+    assert "1 of 1 cells are complete." in report
+    assert "SAC, Hopper-v4, seed 0: the beginning of a run of 300 steps" in report
+    assert "0 of 1 cells are complete, 1 are not over." in tested
 
 
 def test_on_a_terminal_where_nothing_is_left_to_run_it_is_said(engine, monkeypatch):
