@@ -196,7 +196,8 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
     The returns are those of the evaluation that belongs to the policy: the seed's last one, which a run that stopped
     between two has left behind (`step` and `steps` tell), or its best; the interval
     is over that evaluation's episodes. Those of `all_seeds` are of their last evaluations, and the interval over seeds,
-    of which those that failed in training are left out as in every table.
+    of which those that failed in training are left out as in every table. `learnt_weights` are those of entropy and
+    relative entropy that the hyperparameters leave to be learnt, as metrics.csv last told of them by then.
     """
     manifest, rows = run.manifest, run.evaluations
     own = rows[rows["seed"] == seed] if len(rows) else rows
@@ -205,6 +206,7 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
         steps, _, returns = evaluation_matrix(own)
         step = int(steps[np.argmax(returns[0]) if which == "best" else -1])
         evaluation = {"step": step, **returns_as_fields(own["return"][own["step"] == step])}
+    at = evaluation.get("step", manifest.steps_done) if which == "best" else manifest.steps_of(seed)
     last = last_evaluations(rows, points=1) if len(rows) else {}
     sound = [value for label, value in last.items() if label not in manifest.failures]
     over = returns_as_fields(np.array(sound)) if sound else {}
@@ -218,7 +220,8 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
         "preset": manifest.preset,
         "seed": seed,
         "checkpoint": which,
-        "steps": evaluation.get("step", manifest.steps_done) if which == "best" else manifest.steps_of(seed),
+        "steps": at,
+        "learnt_weights": _learnt_weights(run, seed, at),
         "commit": manifest.commit,
         "versions": manifest.versions,
         "command": manifest.command,
@@ -226,6 +229,14 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
         "evaluation": evaluation,
         "all_seeds": over,
     }
+
+
+def _learnt_weights(run: RunDirectory, seed: int, step: int) -> dict[str, float]:
+    """Return what the weights that are learnt had become at this step, as far as metrics.csv knows."""
+    rows, given = run.rows("metrics"), run.manifest.hyperparameters
+    rows = rows[(rows["seed"] == seed) & (rows["step"] <= step)]
+    columns = [name for name in rows.dtype.names or () if given.get(name) in ("auto", "automatic")]
+    return {name: float(rows[name][-1]) for name in columns if len(rows)}
 
 
 def _places(run: RunDirectory, formats: Sequence[Format], place: str | Path | None) -> dict[str, Path]:

@@ -297,6 +297,21 @@ def test_seeds_that_failed_count_in_no_mean_and_end_where_they_failed(tmp_path):
     assert origin["steps"] == 200  # nobody says when it was
 
 
+def test_weights_that_are_learnt_come_with_what_they_had_become(tmp_path):
+    run = make_run(tmp_path / "run")
+    run.update_manifest(hyperparameters={"entropy_weight": "auto", "relative_entropy_weight": 0.5})
+    rows = [(0, 100, 0.4), (1, 100, 0.3), (0, 200, 0.2), (1, 200, 0.1)]
+    run.append("metrics", [{"seed": seed, "step": step, "entropy_weight": value} for seed, step, value in rows])
+
+    exported = export(tmp_path / "run", seed=0, which="last", options=dataclasses.replace(QUICK, card=True))
+
+    assert exported.contract.provenance["learnt_weights"] == {"entropy_weight": 0.2}
+    assert provenance(RunDirectory.open(run.path), 0, "best")["learnt_weights"] == {"entropy_weight": 0.4}
+    card = (exported.place / "README.md").read_text()
+    assert "| entropy_weight | `auto`, at last 0.2 |" in card
+    assert "| relative_entropy_weight | `0.5` |" in card
+
+
 @needs_compiler
 def test_every_format_at_once_each_in_a_folder(tmp_path):
     pytest.importorskip("onnxruntime")
