@@ -1,11 +1,14 @@
-"""How much each reference policy slows improvement down: what theory predicts beside what CSAC's own equations do.
+"""How much each reference policy slows improvement down: what theory predicts beside what is measured.
 
     python examples/reference_lag.py
 
 The first table is in refreshes: iterations of conservative value iteration, each with its exact improvement, in a small
-random task. The second is in updates: gradient descent on CSAC's actor loss, with a Q that always pulls one way.
+random task (tests/algorithms/test_csac_theory.py shows that CSAC's equations are those). The other two are in updates:
+plain gradient descent on CSAC's actor loss with its reference policies. In the second Q always pulls one way, in the
+third the bracket has a best policy, exp(Q/sigma), and the distance to it is halved.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -68,18 +71,58 @@ def predicted_slow_down(choice: Choice, resistance: float) -> float:
 
 def measured_slow_down(choice: Choice, tau: float, std: float, learning_rate: float, updates: int = 6000) -> float:
     """Return how many times longer the mean of a Gaussian takes than without relative entropy, after a transient."""
-    free, held = (_speed(choice, weight, std, learning_rate, updates) for weight in (0.0, tau))
-    return free / held
+
+    def speed(weight: float) -> float:
+        way = means(choice, Weights(0.0, weight), std, learning_rate, updates, even_pull)
+        return float(way[-1] - way[updates // 2 - 1]) / (updates - updates // 2)
+
+    return speed(0.0) / speed(tau)
 
 
-def _speed(choice: Choice, tau: float, std: float, learning_rate: float, updates: int) -> float:
-    """Return how far the mean goes in an update, over the second half of them."""
-    algorithm = CSAC(relative_entropy_weight=tau, relative_entropy_estimator="closed_form")
-    critic = lambda inputs: 1e-2 * jnp.arctanh(inputs[1:])  # noqa: E731  (rises evenly with the mean)
+def predicted_half_life(choice: Choice, weights: Weights, std: float, learning_rate: float) -> float:
+    """Return in how many updates half of the distance to exp(Q/σ) is gone, once the first ones are over.
+
+    An update takes the mean by `pull` of the distance to the end and by `resistance` of that to the reference. What is
+    left is an eigenvalue of the two together; after a whole period of `periodic` it is α + (1 - α) (1 - pull -
+    resistance)^N with α = τ / (τ + σ). A lag L that is short beside 1 / pull makes it ln 2 x (1 / pull + τ / σ x L);
+    where it is long, the policy waits for its reference: every L updates are a refresh, which leaves α.
+    """
+    pull, resistance = (float(learning_rate * weight / std**2) for weight in weights)
+    if choice.policy == "algorithm1":
+        return float(np.log(0.5) / np.log(1.0 - pull))
+    if choice.policy == "periodic":
+        alpha = resistance / (pull + resistance)
+        left = alpha + (1.0 - alpha) * (1.0 - pull - resistance) ** choice.period
+        return float(choice.period * np.log(0.5) / np.log(left))
+    rate = 1.0 if choice.policy == "previous" else choice.rate
+    together = np.array([[1.0 - pull - resistance, resistance], [rate, 1.0 - rate]])  # of the mean, and of the kept one
+    return float(np.log(0.5) / np.log(np.abs(np.linalg.eigvals(together)).max()))
+
+
+def measured_half_life(choice: Choice, weights: Weights, std: float, learning_rate: float) -> float:
+    """Return in how many updates half of the distance to exp(Q/σ) is gone, measured well after the start."""
+    period = choice.period if choice.policy == "periodic" else 1
+    periods = int(np.ceil(3 * predicted_half_life(choice, weights, std, learning_rate) / period))
+    updates = 2 * period * periods  # both halves end with a period
+    distance = 1.0 - np.asarray(means(choice, weights, std, learning_rate, updates, _pull_to_one(weights, std)))
+    left = distance[-1] / distance[updates // 2 - 1]
+    return float(updates // 2 * np.log(0.5) / np.log(left))
+
+
+def largest_stable_resistance(choice: Choice) -> float:
+    """Return the learning rate x τ / std² from which on plain descent goes to and fro in growing steps."""
+    return {"algorithm1": np.inf, "previous": 1.0, "average": 2.0 - choice.rate, "periodic": 2.0}[choice.policy]
+
+
+def means(
+    choice: Choice, weights: Weights, std: float, learning_rate: float, updates: int, critic: Callable
+) -> jax.Array:
+    """Return the mean of a Gaussian policy after each update [update] by plain descent on CSAC's actor loss, from 0."""
+    algorithm = CSAC(relative_entropy_weight=float(weights.relative_entropy), relative_entropy_estimator="closed_form")
 
     def loss(actor: MLP, reference: MLP | None) -> jax.Array:
         networks = {"reference": reference, "critics": (critic, critic)}
-        return algorithm.actor_loss(actor, jnp.zeros(1), jnp.zeros(1), weights=Weights(0.0, tau), **networks)[0]
+        return algorithm.actor_loss(actor, jnp.zeros(1), jnp.zeros(1), weights=weights, **networks)[0]
 
     def update(carry: tuple[MLP, MLP], step: jax.Array) -> tuple[tuple[MLP, MLP], jax.Array]:
         actor, kept = carry
@@ -91,8 +134,23 @@ def _speed(choice: Choice, tau: float, std: float, learning_rate: float, updates
         return (moved, kept), moved.layers[0].bias[0]
 
     first = _gaussian(jnp.zeros(()), std)
-    _, means = jax.lax.scan(update, (first, first), jnp.arange(updates))
-    return float(means[-1] - means[updates // 2 - 1]) / (updates - updates // 2)
+    return jax.lax.scan(update, (first, first), jnp.arange(updates))[1]
+
+
+def even_pull(inputs: jax.Array) -> jax.Array:
+    """A Q that rises evenly with the mean."""
+    return 1e-2 * jnp.arctanh(inputs[1:])
+
+
+def _pull_to_one(weights: Weights, std: float) -> Callable:
+    """Return a Q whose best policy of this entropy has the mean 1 before the tanh, whose volume it takes back."""
+
+    def critic(inputs: jax.Array) -> jax.Array:
+        action = inputs[1:]
+        distance = jnp.arctanh(action) - 1.0
+        return -weights.entropy * (0.5 * (distance / std) ** 2 + jnp.log1p(-(action**2)))
+
+    return critic
 
 
 def _gaussian(mean: jax.Array, std: float) -> MLP:
@@ -111,6 +169,24 @@ def main() -> None:
 
     std, learning_rate = 0.5, 0.01
     print(f"\nUpdates: how many times longer the same way takes; std = {std}, learning rate {learning_rate}")
+
+    def slow_down(choice: Choice, tau: float) -> tuple[float, float]:
+        predicted = predicted_slow_down(choice, learning_rate * tau / std**2)
+        return predicted, measured_slow_down(choice, tau, std, learning_rate)
+
+    _print_by_reference(slow_down, 3)
+    print(f"\nUpdates until half of the distance to SAC's policy is left; sigma = {sigma}, the others the same")
+
+    def half_life(choice: Choice, tau: float) -> tuple[float, float]:
+        weights = Weights(sigma, tau)
+        own = (choice, weights, std, learning_rate)
+        return predicted_half_life(*own), measured_half_life(*own)
+
+    _print_by_reference(half_life, 1)
+
+
+def _print_by_reference(values: Callable[[Choice, float], tuple[float, float]], decimals: int) -> None:
+    """Print a row for each reference, and for each weight what is predicted beside what is measured."""
     print("reference        | tau = 0.05: predicted measured |  0.5: predicted measured |    5: predicted measured")
     choices = (
         Choice("algorithm1"),
@@ -122,10 +198,8 @@ def main() -> None:
     )
     for choice in choices:
         number = {"periodic": f" {choice.period}", "average": f" {choice.rate}"}.get(choice.policy, "")
-        cells = []
-        for tau in (0.05, 0.5, 5.0):
-            predicted = predicted_slow_down(choice, learning_rate * tau / std**2)
-            cells.append(f"{predicted:9.3f} {measured_slow_down(choice, tau, std, learning_rate):8.3f}")
+        pairs = [values(choice, tau) for tau in (0.05, 0.5, 5.0)]
+        cells = [f"{predicted:9.{decimals}f} {measured:8.{decimals}f}" for predicted, measured in pairs]
         print(f"{choice.policy + number:<16} | {cells[0]:>29} | {cells[1]:>23} | {cells[2]:>23}")
 
 

@@ -112,6 +112,8 @@ def test_what_a_refresh_comes_to_is_held_at_its_target_where_the_policy_strives_
     assert held[PERIOD - 1 :: PERIOD][-20:].mean() == pytest.approx(0.05, rel=0.03)
     assert held[-20 * PERIOD :].mean() < 0.95 * 0.05
     assert 3.0 < weights[-1000:].min() < weights[-1000:].max() < 6.0
+    free, _ = relative_entropies(1000.0, updates=3000, actor_learning_rate=0.003)
+    assert free[PERIOD - 1 :: PERIOD][-10:].mean() > 2 * 0.05, "it was τ that held it"
 
 
 def test_the_weight_falls_to_its_floor_where_the_policy_stays_near_by_itself():
@@ -119,7 +121,43 @@ def test_the_weight_falls_to_its_floor_where_the_policy_stays_near_by_itself():
     np.testing.assert_allclose(weights[:PERIOD], 0.5, rtol=1e-6)  # nothing is measured before the first renewal
     assert weights[PERIOD] < 0.499
     assert weights[-1] == pytest.approx(LEAST_WEIGHT, rel=1e-5)
-    assert free[-1000:].mean() > 5.0  # so that what held it above was τ
+    assert free[-1000:].mean() > 5.0
+
+
+def entropies(target, updates=3000):
+    """The entropy and σ of each update of a policy that Q = 3a pulls to the edge of its actions."""
+    algorithm = CSAC(
+        entropy_weight="auto",
+        relative_entropy_weight=0.0,
+        target_entropy=target,
+        weight_learning_rate=0.01,
+        **CLOSED_FORM,
+        **{**LINEAR, "actor_learning_rate": 0.01, "critic_learning_rate": 1e-9, "discount": 0.0},
+    )
+    batch, critic = batch_of(*[transition()] * 64), linear([[0.0], [3.0]], [0.0])
+
+    def one(state, step):
+        key = jax.random.fold_in(jax.random.key(0), step)
+        state, metrics = algorithm.update(state._replace(critics=(critic, critic)), batch, key, step)
+        return state, (metrics["entropy"], metrics["entropy_weight"])
+
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(actor=gaussian(0.0, 0.5))
+    _, found = jax.jit(lambda state: jax.lax.scan(one, state, jnp.arange(updates)))(state)
+    return [np.asarray(values, np.float64) for values in found]
+
+
+def test_the_entropy_is_held_at_its_target_where_the_value_pulls_the_policy_together():
+    # The best policy, exp(3a/σ) on [-1, 1], has an entropy of 1 + log(σ/3) where σ is small: -1 at σ = 3/e² = 0.41.
+    # A tanh-Gaussian is not quite that.
+    held, weights = entropies(-1.0)
+    assert held[-1000:].mean() == pytest.approx(-1.0, abs=0.03)
+    assert weights[-1000:].mean() == pytest.approx(0.41, rel=0.2)
+
+
+def test_the_entropy_s_weight_falls_to_its_floor_where_the_policy_stays_wide_by_itself():
+    free, weights = entropies(-100.0)
+    assert weights[-1] == pytest.approx(LEAST_WEIGHT, rel=1e-5)
+    assert -100.0 < free[-1] < -1.0
 
 
 def test_both_weights_are_told_as_they_were_used():

@@ -369,6 +369,19 @@ def test_the_fixed_point_is_that_of_sac_whatever_the_relative_entropy_weighs(tau
 
 
 @pytest.mark.usefixtures("tables")
+@pytest.mark.parametrize("tau", [0.05, 0.5, 5.0])
+def test_in_the_actor_alone_the_relative_entropy_ends_there_too_by_another_way(tau):
+    # At the end the policy is its own reference, so that it makes no difference whether its KL is part of the value.
+    sigma = 0.2
+    restrained = iterate(sigma, tau, 1000, "closed_form", relative_entropy_form="actor_only")
+    expected = soft_value_iteration(sigma)
+    np.testing.assert_allclose(restrained[-1][0], expected, atol=1e-8)
+    np.testing.assert_allclose(np.exp(restrained[-1][1]), softmax(expected / sigma, axis=1), atol=1e-8)
+    both = iterate(sigma, tau, 3, "closed_form")
+    assert np.all(restrained[1][0] > both[1][0] + 1e-3), "the first value has no penalty"
+
+
+@pytest.mark.usefixtures("tables")
 @pytest.mark.parametrize(("sigma", "tau"), [(0.2, 0.5), (0.2, 5.0), (0.0, 0.5), (0.2, 0.0)])
 def test_the_implicit_form_goes_the_same_way_without_a_reference(sigma, tau):
     # Its critics learn the preference P_k = Q_k + τ log π_(k-1) (Eq. actor_update_3). From Q_(k+1)'s target,
