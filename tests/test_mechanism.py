@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equations import CRITICS, LINEAR, ONE, POLICY, REFERENCE
+from equations import CLOSED_FORM, CRITICS, LINEAR, ONE, POLICY, REFERENCE, batch_of, gaussian, transition, update
 
 from csac.algorithms import CSAC
+from csac.algorithms.distributions import kl, policy_at
 
 MECHANISM = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "results" / "reference" / "mechanism.py")))
 
@@ -58,3 +59,52 @@ def test_the_parts_are_those_of_the_actor_s_gradient(estimator):
     slopes = np.where(np.tanh(u) < 2 / 3, -2.0, 1.0) * (1 - np.tanh(u) ** 2)
     assert float(q.mean(axis=0)[2]) == pytest.approx(np.mean(slopes), abs=1e-3)
     assert float(entropy.mean(axis=0)[3]) == pytest.approx(0.2 * np.mean(-1 + 2 * u * np.tanh(u)), abs=1e-3)
+
+
+@pytest.mark.parametrize(("reference_mean", "cosine"), [(0.1, 1.0), (0.7, -1.0)])
+def test_a_look_at_gaussians_that_moved(reference_mean, cosine):
+    # Of the same std 0.5, a distance d of the means is a KL of d² / (2·0.5²) with the slope d / 0.5² in the mean and
+    # none in the std. The actor went from 0.2 to 0.3: descent on the KL goes back where the reference lies behind it,
+    # and on where it lies ahead.
+    algorithm = CSAC(relative_entropy_weight=0.5, **CLOSED_FORM, **LINEAR)
+    actor = gaussian(0.3, 0.5)
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(actor=actor, critics=CRITICS)
+    batches, held_out = jnp.zeros((2, 8, 1)), jnp.zeros((4, 1))  # observations of 0: the weights have no gradient
+    found = MECHANISM.look(
+        algorithm,
+        state,
+        gaussian(0.2, 0.5),
+        gaussian(-0.3, 0.5),
+        gaussian(reference_mean, 0.5),
+        batches,
+        held_out,
+        jax.random.key(1),
+    )
+    distance = abs(0.3 - reference_mean)
+    expected = {
+        "relative_entropy": distance**2 / 0.5,
+        "kl_gradient": 0.5 * distance / 0.25,
+        "kl_noise": 0.0,
+        "cosine": cosine,
+        "update": 0.1,
+        "churn": 0.1**2 / 0.5,
+        "churn_since_last_look": 0.6**2 / 0.5,
+        "std": 0.5,
+    }
+    assert {name: float(getattr(found, name)) for name in expected} == pytest.approx(expected, rel=1e-4, abs=1e-5)
+
+
+@pytest.mark.parametrize("reference_policy", ["algorithm1", "previous", "periodic", "average"])
+def test_the_reference_is_that_of_the_next_update(reference_policy):
+    algorithm = CSAC(reference_policy=reference_policy, reference_period=3, reference_rate=0.3, **CLOSED_FORM, **LINEAR)
+    state = algorithm.init(jax.random.key(0), ONE, 1000)
+    batch = batch_of(transition(), transition(observation=-1.0, action=-0.5))
+    told, found = [], []
+    for updates in range(7):
+        reference = MECHANISM.reference_of(algorithm, state, updates)
+        policies = [(policy_at(state.actor, one), policy_at(reference, one)) for one in batch.observation]
+        found.append(np.mean([kl(*pair) for pair in policies]))
+        state, metrics = update(algorithm, state, batch, updates)
+        told.append(metrics["relative_entropy"])
+    np.testing.assert_allclose(found, told, atol=1e-6)
+    assert (max(found) > 1e-4) == (reference_policy != "algorithm1")

@@ -35,7 +35,7 @@ ARMS: dict[str, dict[str, Any]] = {
     for policy in ("algorithm1", "previous", "periodic", "average")
     for estimator in ("closed_form", "sampled")
 }
-INTERVAL = 497  # steps between two looks: prime to the period of 1,000, so that its every phase is seen
+INTERVAL = 137  # steps between two looks: seven of them are not quite a period of 1,000, which is seen at all ages
 LOOKS_PER_ROLLOUT = 4
 BATCHES = 16  # of the training's size, to tell the gradient from its noise
 ROLLOUT_STEPS = 2_000
@@ -263,8 +263,11 @@ def run(name: str, task: str, steps: int, warmup_steps: int, seed: int) -> None:
         found = look(
             algorithm, state, before, at_last_look or state.actor, reference, jnp.asarray(batches), held_out, key
         )
+        values = {key: float(value) for key, value in found._asdict().items()}
+        if at_last_look is None:
+            values["churn_since_last_look"] = np.nan
         at_last_look = state.actor
-        rows.append({"step": step, **{key: float(value) for key, value in found._asdict().items()}, **error})
+        rows.append({"step": step, **values, **error})
         print(f"{name}: step {step:,}, relative entropy {rows[-1]['relative_entropy']:.4g}", flush=True)
     environments.close()
     aside.close()
@@ -314,7 +317,7 @@ def _file(name: str) -> Path:
 
 
 def _text(value: float | None) -> str:
-    return "" if value is None else f"{value:.6g}"
+    return "" if value is None or np.isnan(value) else f"{value:.6g}"
 
 
 def _copy(tree: Any) -> Any:
