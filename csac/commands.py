@@ -46,10 +46,15 @@ class Train(Options):
     """More names in the info of an evaluation episode's last step: each becomes a column and a curve of its own."""
     env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
     """Keyword arguments for the environment, as a JSON object."""
-    perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE[@STEP]")] = ()
-    """Change the task after STEP environment steps, as friction=1.5@300000 does: factors on friction, gravity, mass or
-    gain of a MuJoCo task, standard deviations of observation_noise or action_noise. With --from, none leaves out what
-    that run had planned."""
+    perturb: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(
+            metavar="KIND=VALUE[@STEP]",
+            help="Change the task after STEP environment steps, as friction=1.5@300000 does: factors on friction, "
+            "gravity, mass or gain of a MuJoCo task, standard deviations of observation_noise or action_noise. With "
+            "--from, none leaves out what that run had planned.",
+        ),
+    ] = ()
     groups: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
     """Processes to split the seeds over."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
@@ -200,9 +205,14 @@ class Export:
     """How far beyond what was recorded is still good, as a share of its width."""
     watchdog: Annotated[int | None, arg(help_behavior_hint="(default: never)")] = None
     """Keep to the fallback after so many bad observations in a row, until a reset."""
-    rate_limit: Annotated[float | None, arg(help_behavior_hint="(default: no limit)")] = None
-    """The most that an action may change from one step to the next, as a share of its range; the fallback is then the
-    last action, unless another is given."""
+    rate_limit: Annotated[
+        float | None,
+        arg(
+            help="The most that an action may change from one step to the next, as a share of its range; the fallback "
+            "is then the last action, unless another is given.",
+            help_behavior_hint="(default: no limit)",
+        ),
+    ] = None
     episodes: int = 10
     """Episodes to verify with, those of csac evaluate."""
     no_rollouts: FlagCreatePairsOff[bool] = False

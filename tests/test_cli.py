@@ -459,6 +459,23 @@ def test_the_help_of_train_explains_every_hyperparameter(capsys, monkeypatch, na
         assert len(explanation.partition("(default")[0].split()) > 3
 
 
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("train", "gravity, mass or gain of a MuJoCo task, standard deviations of observation_noise or action_noise."),
+        ("export", "as a share of its range; the fallback is then the last action, unless another is given."),
+        ("study run", "as there are workers. ray: as many as a Ray cluster has room for (docs/cluster.md)."),
+        ("study run", "a small manifest of each cell that is over there: what a report needs. What was copied there"),
+    ],
+)
+def test_a_long_explanation_breaks_off_nowhere(capsys, monkeypatch, command, words):
+    monkeypatch.setenv("COLUMNS", "2000")  # tyro would break it where its docstring goes on in another line
+
+    csac(f"{command} --help")
+
+    assert words in capsys.readouterr().out
+
+
 def test_the_help_shows_what_a_preset_sets(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
 

@@ -127,10 +127,12 @@ class Run(Chosen):
 
     engine: Annotated[
         Literal["local", "processes", "ray"] | None,
-        arg(help_behavior_hint="(default: processes, where there are cores)"),
+        arg(
+            help="local: one cell after another, in this process. processes: as many at once as there are workers. "
+            "ray: as many as a Ray cluster has room for (docs/cluster.md).",
+            help_behavior_hint="(default: processes, where there are cores)",
+        ),
     ] = None
-    """local: one cell after another, in this process. processes: as many at once as there are workers. ray: as many as
-    a Ray cluster has room for (docs/cluster.md)."""
     workers: Annotated[int | None, arg(help_behavior_hint="(default: one for each core)")] = None
     """Processes that run a cell each, on their own share of the cores."""
     cell: Annotated[int | None, arg(help_behavior_hint="(default: all)")] = None
@@ -145,9 +147,15 @@ class Run(Chosen):
     """GiB of memory that each cell asks Ray for; 0 asks for none in particular."""
     device: Literal["cpu", "gpu"] = "cpu"
     """Where the networks learn."""
-    results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
-    """Copy the evaluations and a small manifest of each cell that is over there: what a report needs. What was copied
-    there before, on this machine or another, is not run again, nor what is the beginning of it."""
+    results: Annotated[
+        Path | None,
+        arg(
+            metavar="DIR",
+            help="Copy the evaluations and a small manifest of each cell that is over there: what a report needs. What "
+            "was copied there before, on this machine or another, is not run again, nor what is the beginning of it.",
+            help_behavior_hint="(default: none)",
+        ),
+    ] = None
     wandb: FlagCreatePairsOff[bool] = False
     """Log to Weights & Biases too: a run for each cell, in the project WANDB_PROJECT or else csac (docs/python.md)."""
     keep_checkpoints: FlagCreatePairsOff[bool] = False
