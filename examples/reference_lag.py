@@ -85,7 +85,8 @@ def predicted_half_life(choice: Choice, weights: Weights, std: float, learning_r
     An update takes the mean by `pull` of the distance to the end and by `resistance` of that to the reference. What is
     left is an eigenvalue of the two together; after a whole period of `periodic` it is α + (1 - α) (1 - pull -
     resistance)^N with α = τ / (τ + σ). A lag L that is short beside 1 / pull makes it ln 2 x (1 / pull + τ / σ x L);
-    where it is long, the policy waits for its reference: every L updates are a refresh, which leaves α.
+    where it is long, the policy waits for its reference: every L updates are a refresh, which leaves α with
+    `periodic` and takes 1 - α of the way with `average`.
     """
     pull, resistance = (float(learning_rate * weight / std**2) for weight in weights)
     if choice.policy == "algorithm1":
@@ -158,7 +159,7 @@ def _gaussian(mean: jax.Array, std: float) -> MLP:
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the tables."""
     sigma, discount = 0.2, 0.9
     print(f"Refreshes: what one of them leaves of the distance to the end; sigma = {sigma}, discount {discount}")
     print("tau   | alpha = tau/(tau+sigma) | predicted max(alpha, discount) | measured | refreshes to halve, Q given")

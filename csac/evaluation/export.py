@@ -233,10 +233,13 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
 
 def _learnt_weights(run: RunDirectory, seed: int, step: int) -> dict[str, float]:
     """Return what the weights that are learnt had become at this step, as far as metrics.csv knows."""
-    rows, given = run.rows("metrics"), run.manifest.hyperparameters
+    learnt = [name for name, value in run.manifest.hyperparameters.items() if value in ("auto", "automatic")]
+    if not learnt:
+        return {}
+    rows = run.rows("metrics")
     rows = rows[(rows["seed"] == seed) & (rows["step"] <= step)]
-    columns = [name for name in rows.dtype.names or () if given.get(name) in ("auto", "automatic")]
-    return {name: float(rows[name][-1]) for name in columns if len(rows)}
+    columns = [name for name in learnt if name in (rows.dtype.names or ()) and len(rows)]
+    return {name: float(rows[name][-1]) for name in columns if np.isfinite(rows[name][-1])}
 
 
 def _places(run: RunDirectory, formats: Sequence[Format], place: str | Path | None) -> dict[str, Path]:

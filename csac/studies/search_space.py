@@ -6,7 +6,7 @@ not see; nor what changes speed alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -105,6 +105,7 @@ _DISCOUNT = Range(0.95, 0.999, "to 1", "horizons of 20 to 1,000 steps")
 _TARGET_RATE = Range(0.001, 0.05, "logarithmic", "targets that lag 20 to 1,000 updates behind; the papers have 0.005")
 _BATCH_SIZE = Choice((64, 128, 256, 512), "256 in the papers; a larger batch costs as much more time")
 _ENTROPY_WEIGHT = "0.2 in the papers; what is right goes with the size of the rewards"
+_NO_TARGETS = ("critic_normalisation", "none")  # normalised critics do without target networks
 _OFF_POLICY: Mapping[str, Dimension] = {
     "actor_learning_rate": _LEARNING_RATE,
     "critic_learning_rate": _LEARNING_RATE,
@@ -131,6 +132,7 @@ SPACES: Mapping[str, Mapping[str, Dimension]] = MappingProxyType(
                 0.0005, 0.05, "logarithmic", "a factor of ten around the default", ("reference_policy", "average")
             ),
             **_OFF_POLICY,
+            "target_rate": replace(_TARGET_RATE, needs=_NO_TARGETS),
         },
         "sac": {
             "entropy_weight": Range(0.01, 1.0, "logarithmic", _ENTROPY_WEIGHT, ("temperature", "fixed")),
@@ -138,6 +140,7 @@ SPACES: Mapping[str, Mapping[str, Dimension]] = MappingProxyType(
                 _LEARNING_RATE.low, _LEARNING_RATE.high, "logarithmic", _LEARNING_RATE.why, ("temperature", "automatic")
             ),
             **_OFF_POLICY,
+            "target_rate": replace(_TARGET_RATE, needs=_NO_TARGETS),
         },
         "td3": {"policy_delay": Range(1, 4, "linear", "2 in the paper"), **_NOISE, **_OFF_POLICY},
         "sd3": {
@@ -166,6 +169,8 @@ def searched(
 ) -> dict[str, Dimension]:
     """Return what is searched: all that means something, or what is `wanted` of it, but for what is `given`.
 
+    A weight that is learnt (`auto`) is no number to search.
+
     Raises:
         InputError: something is wanted that is not searched, means nothing here or is given; or nothing is left.
     """
@@ -178,11 +183,16 @@ def searched(
         needs = space[name].needs
         if needs and hyperparameters[needs[0]] != needs[1]:
             raise InputError(f"{name} means nothing without --{needs[0].replace('_', '-')} {needs[1]}")
+        if hyperparameters[name] == "auto":
+            raise InputError(f"{name} is auto, and so learnt and not searched: leave it out")
     names = list(space) if wanted is None else wanted
     chosen = {
         name: dimension
         for name, dimension in space.items()
-        if name in names and name not in given and _is_meant(dimension, hyperparameters)
+        if name in names
+        and name not in given
+        and hyperparameters[name] != "auto"
+        and _is_meant(dimension, hyperparameters)
     }
     if not chosen:
         raise InputError("there is nothing to search: every hyperparameter of the search space is given")

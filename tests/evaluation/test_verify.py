@@ -310,6 +310,8 @@ def test_weights_that_are_learnt_come_with_what_they_had_become(tmp_path):
     card = (exported.place / "README.md").read_text()
     assert "| entropy_weight | `auto`, at last 0.2 |" in card
     assert "| relative_entropy_weight | `0.5` |" in card
+    run.update_manifest(hyperparameters={"temperature": "automatic"})  # that of SAC, of which metrics.csv says nothing
+    assert provenance(RunDirectory.open(run.path), 0, "last")["learnt_weights"] == {}
 
 
 @needs_compiler
