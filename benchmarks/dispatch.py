@@ -8,7 +8,7 @@
 `evaluation`    whole intervals of 5,000 steps: no evaluation, in line, and beside
 `copies`        updates alone, with and without XLA's region analysis of what it need not copy
 `first`         several updates in one dispatch: what the first costs more than those that follow it
-`critics`       updates alone, with plain critics, normalised ones, and the candidate of docs/algorithms/critics.md
+`critics`       updates alone, with plain critics, normalised ones, all five pieces, and (CSAC) the preset `strong`
 
 A ratio is that of two measurements of one round. Processes of one kind differ, so each repetition starts new ones.
 """
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from benchmarks.measuring import TASK
 from benchmarks.tables import table
+from csac.presets import hyperparameters
 from csac.processes import Child, die_with_parent, move_to
 
 if TYPE_CHECKING:
@@ -33,7 +34,9 @@ if TYPE_CHECKING:
 
 WARMUP = 500
 NORMALISED = (("critic_normalisation", "batch"),)
-CANDIDATE = (*NORMALISED, ("policy_delay", 3), ("adam_momentum", 0.5), ("normalise_observations", True))
+PIECES = (*NORMALISED, ("policy_delay", 3), ("adam_momentum", 0.5), ("normalise_observations", True))
+PIECES += (("critic_learning_rate", 1e-3), ("actor_learning_rate", 1e-3))
+STRONG = tuple((hyperparameters("strong", "csac", TASK) | {"warmup_steps": 0}).items())
 REGIONS = "--xla_cpu_copy_insertion_use_region_analysis=true"
 Rates = dict[str, list[float]]
 
@@ -82,8 +85,9 @@ def suites() -> dict[str, dict[str, list[Variant]]]:
         "critics": {
             title: [
                 Variant(kind, *setting, changes=changes)
-                for kind, changes in (("plain", ()), ("normalised", NORMALISED), ("candidate", CANDIDATE))
+                for kind, changes in (("plain", ()), ("normalised", NORMALISED), ("all pieces", PIECES))
             ]
+            + [Variant("strong", *setting, changes=STRONG)] * (setting[0] == "csac")
             for title, setting in alone.items()
         },
     }

@@ -159,7 +159,7 @@ def words(text):
         ("help nonsense", "no command is called 'nonsense' (csac --help)"),
         ("train X --device tpu", "--device: 'tpu' is not one of 'cpu', 'gpu' (csac train --help)"),
         ("train X --algorithm dqn", "no algorithm is called 'dqn': choose csac or sac or td3 or sd3 or ppo"),
-        ("train X --preset papr", "no preset is called 'papr': choose paper"),
+        ("train X --preset papr", "no preset is called 'papr': choose paper or strong"),
         (
             "train X --temperature fixed",
             "--temperature is an option of sac, which --algorithm sac chooses (csac train --help)",

@@ -1,9 +1,12 @@
 import dataclasses
+from pathlib import Path
 
 import pytest
 
 from csac import presets
 from csac.algorithms import ALGORITHMS
+from csac.studies.cells import complete
+from csac.studies.study import read_study
 from csac.types import InputError
 
 PAPER_TABLE = {
@@ -27,9 +30,11 @@ def test_paper_gives_the_papers_table(algorithm):
     assert given["entropy_weight"] == 0.2
 
 
-@pytest.mark.parametrize("algorithm", sorted(ALGORITHMS))
-def test_an_algorithm_takes_what_its_preset_gives(algorithm):
-    given = presets.hyperparameters("paper", algorithm, "Walker2d-v4")
+@pytest.mark.parametrize(
+    ("preset", "algorithm"), [*(("paper", name) for name in sorted(ALGORITHMS)), ("strong", "csac")]
+)
+def test_an_algorithm_takes_what_its_preset_gives(preset, algorithm):
+    given = presets.hyperparameters(preset, algorithm, "Walker2d-v4")
 
     made = ALGORITHMS[algorithm](**given)
 
@@ -103,6 +108,23 @@ def test_paper_ppo_has_the_papers_table_and_parls_example_which_are_the_defaults
     assert given == dataclasses.asdict(ALGORITHMS["ppo"]())
 
 
+@pytest.mark.parametrize("task", ["Walker2d-v4", "Ant-v4", "PyFlyt/QuadX-Waypoints-v1"])
+def test_strong_is_the_candidate_of_its_protocol_on_every_task(task):
+    study = read_study(Path(__file__).parents[1] / "results" / "strong" / "confirm.toml")
+    candidate = next(method for method in study.methods if method.label == "CSAC, candidate")
+
+    given = presets.hyperparameters("strong", "csac", task)
+
+    assert complete("csac", given) == candidate.hyperparameters_on(task)
+
+
+def test_strong_names_all_that_a_later_default_could_change():
+    given = presets.hyperparameters("strong", "csac", "Ant-v4")
+
+    unused = {"reference_rate", "target_relative_entropy"}
+    assert {item.name for item in dataclasses.fields(ALGORITHMS["csac"])} - set(given) == unused
+
+
 def test_changing_what_was_given_changes_no_preset():
     presets.hyperparameters("paper", "csac", "Ant-v4")["discount"] = 0.0
 
@@ -110,7 +132,7 @@ def test_changing_what_was_given_changes_no_preset():
 
 
 def test_an_unknown_preset_is_named_with_those_there():
-    with pytest.raises(InputError, match=r"no preset is called 'papre': choose paper"):
+    with pytest.raises(InputError, match=r"no preset is called 'papre': choose paper or strong"):
         presets.hyperparameters("papre", "csac", "Ant-v4")
 
 
@@ -119,10 +141,17 @@ def test_an_algorithm_without_the_preset_is_named():
         presets.hyperparameters("paper", "dqn", "Ant-v4")
 
 
+def test_strong_is_csacs_alone():
+    with pytest.raises(InputError, match=r"'strong' has no 'sac': it has csac"):
+        presets.hyperparameters("strong", "sac", "Ant-v4")
+
+
 def test_a_run_is_of_the_preset_that_all_its_hyperparameters_follow():
     csac = ALGORITHMS["csac"]
     values = dataclasses.asdict(csac(**presets.hyperparameters("paper", "csac", "Ant-v4")))
     assert presets.matching_preset(csac, "Ant-v4", values) == "paper"
+    strong = dataclasses.asdict(csac(**presets.hyperparameters("strong", "csac", "Ant-v4")))
+    assert presets.matching_preset(csac, "Ant-v4", strong) == "strong"
     assert presets.matching_preset(csac, "PyFlyt/QuadX-Waypoints-v1", values) is None  # the paper's tau is another
     assert presets.matching_preset(csac, "Ant-v4", {**values, "reference_policy": "periodic"}) is None
     assert presets.matching_preset(csac, "Ant-v4", {**values, "critic_normalisation": "batch"}) is None

@@ -20,6 +20,7 @@ from csac.algorithms import ALGORITHMS, CSAC, PPO, SAC, SD3, TD3
 from csac.arguments import parse
 from csac.cli import main
 from csac.commands import Chosen
+from csac.presets import hyperparameters
 from csac.record.rendering import markdown
 from csac.record.run import RunDirectory
 from csac.studies.job import Stopped
@@ -327,6 +328,10 @@ def test_what_means_nothing_or_is_given_is_not_searched():
     assert "entropy_weight" in names(SAC(temperature="fixed"))
     assert "discount" not in names(CSAC(), given=("discount", "steps"))
     assert names(CSAC(), wanted=("discount", "batch_size")) == ["discount", "batch_size"]
+    strong = CSAC(**hyperparameters("strong", "csac", "Hopper-v4"))
+    assert set(names(CSAC(reference_policy="periodic"))) - set(names(strong)) == {"entropy_weight", "target_rate"}
+    with pytest.raises(InputError, match="entropy_weight is auto, and so learnt and not searched"):
+        names(strong, wanted=("entropy_weight",))
 
 
 def test_what_is_given_stays_as_given_and_a_preset_is_where_the_search_begins(monkeypatch):
@@ -339,6 +344,17 @@ def test_what_is_given_stays_as_given_and_a_preset_is_where_the_search_begins(mo
     assert len({call["algorithm"].actor_learning_rate for call in fake.calls}) == 3
 
 
+def test_a_search_begins_with_the_preset_that_learns_its_entropy_weight(monkeypatch):
+    fake = FakeTrain(constant)
+    monkeypatch.setattr(training, "train", fake)
+    line = "tune probes:ActionReward-v0 --preset strong --trials 2 --steps 20_000 --evaluation-interval 5000"
+    assert csac(f"{line} --directory out") == 0
+    first, second = (call["algorithm"] for call in fake.calls)
+    assert first == CSAC(**hyperparameters("strong", "csac", "probes:ActionReward-v0"))
+    assert (second.entropy_weight, second.critic_normalisation) == ("auto", "batch")
+    assert second.actor_learning_rate != first.actor_learning_rate
+
+
 # What it leaves.
 
 
@@ -346,6 +362,7 @@ def test_what_is_given_stays_as_given_and_a_preset_is_where_the_search_begins(mo
     "algorithm",
     [
         CSAC(reference_policy="average", actor_hidden_sizes=(64, 32)),
+        CSAC(**hyperparameters("strong", "csac", "Hopper-v4")),
         SAC(temperature="fixed", target_entropy=-2.5),
         TD3(),
         SD3(importance_sampling=True),
