@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 WARMUP = 500
 NORMALISED = (("critic_normalisation", "batch"),)
-PIECES = (*NORMALISED, ("policy_delay", 3), ("adam_momentum", 0.5), ("normalise_observations", True))
-PIECES += (("critic_learning_rate", 1e-3), ("actor_learning_rate", 1e-3))
+RATES = (("critic_learning_rate", 1e-3), ("actor_learning_rate", 1e-3))
+PIECES = (*NORMALISED, *RATES, ("policy_delay", 3), ("adam_momentum", 0.5), ("normalise_observations", True))
 STRONG = tuple((hyperparameters("strong", "csac", TASK) | {"warmup_steps": 0}).items())
 REGIONS = "--xla_cpu_copy_insertion_use_region_analysis=true"
 Rates = dict[str, list[float]]

@@ -1,4 +1,4 @@
-"""Presets as data: (preset, algorithm, task) -> hyperparameters. `paper` is its tables, `strong` what learns most."""
+"""Presets as data: (preset, algorithm, task) -> hyperparameters. `paper`: its tables; `strong`: faster critics."""
 
 from __future__ import annotations
 

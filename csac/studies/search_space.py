@@ -105,13 +105,16 @@ _DISCOUNT = Range(0.95, 0.999, "to 1", "horizons of 20 to 1,000 steps")
 _TARGET_RATE = Range(0.001, 0.05, "logarithmic", "targets that lag 20 to 1,000 updates behind; the papers have 0.005")
 _BATCH_SIZE = Choice((64, 128, 256, 512), "256 in the papers; a larger batch costs as much more time")
 _ENTROPY_WEIGHT = "0.2 in the papers; what is right goes with the size of the rewards"
-_NO_TARGETS = ("critic_normalisation", "none")  # normalised critics do without target networks
 _OFF_POLICY: Mapping[str, Dimension] = {
     "actor_learning_rate": _LEARNING_RATE,
     "critic_learning_rate": _LEARNING_RATE,
     "discount": _DISCOUNT,
     "target_rate": _TARGET_RATE,
     "batch_size": _BATCH_SIZE,
+}
+_NORMALISABLE: Mapping[str, Dimension] = {  # normalised critics do without target networks
+    **_OFF_POLICY,
+    "target_rate": replace(_TARGET_RATE, needs=("critic_normalisation", "none")),
 }
 _NOISE: Mapping[str, Dimension] = {
     "exploration_noise": Range(0.03, 0.5, "logarithmic", "0.1 in the papers"),
@@ -131,16 +134,14 @@ SPACES: Mapping[str, Mapping[str, Dimension]] = MappingProxyType(
             "reference_rate": Range(
                 0.0005, 0.05, "logarithmic", "a factor of ten around the default", ("reference_policy", "average")
             ),
-            **_OFF_POLICY,
-            "target_rate": replace(_TARGET_RATE, needs=_NO_TARGETS),
+            **_NORMALISABLE,
         },
         "sac": {
             "entropy_weight": Range(0.01, 1.0, "logarithmic", _ENTROPY_WEIGHT, ("temperature", "fixed")),
             "temperature_learning_rate": Range(
                 _LEARNING_RATE.low, _LEARNING_RATE.high, "logarithmic", _LEARNING_RATE.why, ("temperature", "automatic")
             ),
-            **_OFF_POLICY,
-            "target_rate": replace(_TARGET_RATE, needs=_NO_TARGETS),
+            **_NORMALISABLE,
         },
         "td3": {"policy_delay": Range(1, 4, "linear", "2 in the paper"), **_NOISE, **_OFF_POLICY},
         "sd3": {

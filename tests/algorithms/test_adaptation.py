@@ -77,6 +77,21 @@ def test_a_weight_rises_where_its_constraint_is_hurt():
 PERIOD = 100
 
 
+def told_by(algorithm, slope_at, updates, examples, names):
+    """Return these metrics of each update, float64 [update], where Q is `slope_at(step)` times the action."""
+    batch = batch_of(*[transition()] * examples)
+
+    def one(state, step):
+        critic = jax.tree.map(lambda leaf: leaf * slope_at(step), linear([[0.0], [1.0]], [0.0]))
+        key = jax.random.fold_in(jax.random.key(0), step)
+        state, metrics = algorithm.update(state._replace(critics=(critic, critic)), batch, key, step)
+        return state, [metrics[name] for name in names]
+
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(actor=gaussian(0.0, 0.5))
+    _, found = jax.jit(lambda state: jax.lax.scan(one, state, jnp.arange(updates)))(state)
+    return [np.asarray(values, np.float64) for values in found]
+
+
 def relative_entropies(target, updates, actor_learning_rate=0.03):
     """The relative entropy and τ of each update of a policy that follows Q."""
     algorithm = CSAC(
@@ -92,18 +107,8 @@ def relative_entropies(target, updates, actor_learning_rate=0.03):
         critic_hidden_sizes=(),
         discount=0.0,
     )
-    batch = batch_of(*[transition()] * 16)
-
-    def one(state, step):
-        side = jnp.where((step // PERIOD) % 2, -3.0, 3.0)
-        critic = jax.tree.map(lambda leaf: leaf * side, linear([[0.0], [1.0]], [0.0]))
-        key = jax.random.fold_in(jax.random.key(0), step)
-        state, metrics = algorithm.update(state._replace(critics=(critic, critic)), batch, key, step)
-        return state, (metrics["relative_entropy"], metrics["relative_entropy_weight"])
-
-    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(actor=gaussian(0.0, 0.5))
-    _, found = jax.jit(lambda state: jax.lax.scan(one, state, jnp.arange(updates)))(state)
-    return [np.asarray(values, np.float64) for values in found]
+    slope_at = lambda step: jnp.where((step // PERIOD) % 2, -3.0, 3.0)  # noqa: E731
+    return told_by(algorithm, slope_at, updates, 16, ("relative_entropy", "relative_entropy_weight"))
 
 
 def test_what_a_refresh_comes_to_is_held_at_its_target_where_the_policy_strives_away():
@@ -134,16 +139,7 @@ def entropies(target, updates=3000):
         **CLOSED_FORM,
         **{**LINEAR, "actor_learning_rate": 0.01, "critic_learning_rate": 1e-9, "discount": 0.0},
     )
-    batch, critic = batch_of(*[transition()] * 64), linear([[0.0], [3.0]], [0.0])
-
-    def one(state, step):
-        key = jax.random.fold_in(jax.random.key(0), step)
-        state, metrics = algorithm.update(state._replace(critics=(critic, critic)), batch, key, step)
-        return state, (metrics["entropy"], metrics["entropy_weight"])
-
-    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(actor=gaussian(0.0, 0.5))
-    _, found = jax.jit(lambda state: jax.lax.scan(one, state, jnp.arange(updates)))(state)
-    return [np.asarray(values, np.float64) for values in found]
+    return told_by(algorithm, lambda step: 3.0, updates, 64, ("entropy", "entropy_weight"))
 
 
 def test_the_entropy_is_held_at_its_target_where_the_value_pulls_the_policy_together():
