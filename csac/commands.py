@@ -33,7 +33,7 @@ class Train(Options):
     algorithm: str = "csac"
     """What learns; its own options are listed below."""
     preset: str | None = None
-    """Start from: paper (its tables), strong (critics that learn faster, CSAC only). Options given here win over it."""
+    """Start from: paper (its tables), strong (critics that learn faster; CSAC, SAC). Options given here win over it."""
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/TASK/ALGORITHM/DATE-TIME)")] = None
     """The run's own directory, new or empty."""
     resume: FlagCreatePairsOff[bool] = False
@@ -93,7 +93,7 @@ class Tune(Options):
     algorithm: str = "csac"
     """What learns; its own options are listed below: each that is given is not searched."""
     preset: str | None = None
-    """Begin the search with: paper, the paper's tables; strong, critics that learn faster (CSAC only)."""
+    """Begin the search with: paper, the paper's tables; strong, critics that learn faster (CSAC, SAC)."""
     trials: int = 50
     """How many trials the study is to have, those of other processes and of earlier calls included."""
     search: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: the whole search space)")] = (

@@ -31,7 +31,7 @@ def test_paper_gives_the_papers_table(algorithm):
 
 
 @pytest.mark.parametrize(
-    ("preset", "algorithm"), [*(("paper", name) for name in sorted(ALGORITHMS)), ("strong", "csac")]
+    ("preset", "algorithm"), [*(("paper", name) for name in sorted(ALGORITHMS)), ("strong", "csac"), ("strong", "sac")]
 )
 def test_an_algorithm_takes_what_its_preset_gives(preset, algorithm):
     given = presets.hyperparameters(preset, algorithm, "Walker2d-v4")
@@ -109,20 +109,23 @@ def test_paper_ppo_has_the_papers_table_and_parls_example_which_are_the_defaults
 
 
 @pytest.mark.parametrize("task", ["Walker2d-v4", "Ant-v4", "PyFlyt/QuadX-Waypoints-v1"])
-def test_strong_is_the_candidate_of_its_protocol_on_every_task(task):
+@pytest.mark.parametrize("algorithm", ["csac", "sac"])
+def test_strong_is_the_candidate_of_its_protocol_on_every_task(algorithm, task):
     study = read_study(Path(__file__).parents[1] / "results" / "strong" / "confirm.toml")
-    candidate = next(method for method in study.methods if method.label == "CSAC, candidate")
+    candidate = next(method for method in study.methods if method.label == f"{algorithm.upper()}, candidate")
 
-    given = presets.hyperparameters("strong", "csac", task)
+    given = presets.hyperparameters("strong", algorithm, task)
 
-    assert complete("csac", given) == candidate.hyperparameters_on(task)
+    assert complete(algorithm, given) == candidate.hyperparameters_on(task)
 
 
-def test_strong_names_all_that_a_later_default_could_change():
-    given = presets.hyperparameters("strong", "csac", "Ant-v4")
+@pytest.mark.parametrize(
+    ("algorithm", "unused"), [("csac", {"reference_rate", "target_relative_entropy"}), ("sac", set())]
+)
+def test_strong_names_all_that_a_later_default_could_change(algorithm, unused):
+    given = presets.hyperparameters("strong", algorithm, "Ant-v4")
 
-    unused = {"reference_rate", "target_relative_entropy"}
-    assert {item.name for item in dataclasses.fields(ALGORITHMS["csac"])} - set(given) == unused
+    assert {item.name for item in dataclasses.fields(ALGORITHMS[algorithm])} - set(given) == unused
 
 
 def test_changing_what_was_given_changes_no_preset():
@@ -141,9 +144,9 @@ def test_an_algorithm_without_the_preset_is_named():
         presets.hyperparameters("paper", "dqn", "Ant-v4")
 
 
-def test_strong_is_csacs_alone():
-    with pytest.raises(InputError, match=r"'strong' has no 'sac': it has csac"):
-        presets.hyperparameters("strong", "sac", "Ant-v4")
+def test_strong_is_of_csac_and_sac_alone():
+    with pytest.raises(InputError, match=r"'strong' has no 'td3': it has csac and sac"):
+        presets.hyperparameters("strong", "td3", "Ant-v4")
 
 
 def test_a_run_is_of_the_preset_that_all_its_hyperparameters_follow():

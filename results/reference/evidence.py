@@ -232,15 +232,21 @@ def overall_table(study: Study, found: dict[str, dict[str, Measured]]) -> Table:
 
 
 def comparison_table(study: Study, found: dict[str, dict[str, Measured]]) -> Table:
-    """Return how each method with relative entropy compares with each without: over all tasks, and on each."""
+    """Return how each method with relative entropy compares with each without, and these with the first of them.
+
+    Over all tasks, and on each.
+    """
     is_perturbed = any(study.conditions)
     seeds = common_seeds(study, found)
     final = scores(found, lambda one: one.final, seeds)
     loss = scores(found, lambda one: one.area_lost if is_perturbed else one.drawdown, seeds)
     rows = []
-    for method in filter(lambda one: has_relative_entropy(study, one), study.methods):
+    without = [one for one in study.methods if not has_relative_entropy(study, one)]
+    for method in study.methods:
         own = counterpart(study, method)
-        for other in filter(lambda one: not has_relative_entropy(study, one), study.methods):
+        for other in without[:1] if method in without else without:
+            if method is other:
+                continue
             pair = method.label, other.label
             cells = [
                 Cell(method.label),
