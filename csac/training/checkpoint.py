@@ -197,6 +197,8 @@ class Checkpoints:
     def commit(self, step: int, files: Files, values: dict[str, Any]) -> None:
         """Make a checkpoint of files that are written already, then remove what no checkpoint needs any more."""
         values = {**values, "pinned": sorted(self.pinned)}
+        # As it will be read: the checksum is of keys in order, and JSON has numbers as texts, where "10" precedes "9".
+        values = json.loads(json.dumps(values))
         fields = {"schema_version": SCHEMA_VERSION, "step": step, "files": files, "values": values}
         content = json.dumps({**fields, "sha256": sha256(_encoded(fields))}, indent=1).encode()
         write_atomically(self.folder / f"step_{step}.json", content)
@@ -217,14 +219,17 @@ class Checkpoints:
         """Remove what no kept checkpoint needs; of later steps than `newest` other groups may have written already."""
         steps = steps_in(self.folder)
         needed: set[str] = set()
+        unread: set[int] = set()
         for step in {*steps[-self.keep :], *self.pinned.intersection(steps)}:
             try:
                 needed |= {f"step_{step}.json", *Checkpoint.open(self.folder, step).files}
-            except Damaged:
-                needed.add(f"step_{step}.json")  # for a person to look at
+            except Damaged:  # or the disk failed only this time: all that it may need stays
+                unread.add(step)
         for path in [*self.folder.glob("step_*"), *self.folder.glob("replay/seed_*")]:
-            is_later = newest is not None and _step_of(path.name) > newest
-            if not is_later and path.relative_to(self.folder).as_posix() not in needed:
+            at = _step_of(path.name)
+            is_later = newest is not None and at > newest
+            may_be_needed = at in unread or (path.parent != self.folder and at <= max(unread, default=-1))
+            if not (is_later or may_be_needed or path.relative_to(self.folder).as_posix() in needed):
                 path.unlink(missing_ok=True)
 
 

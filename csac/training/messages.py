@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from csac.record.run import Table
     from csac.training.plan import Plan
     from csac.training.seed_files import Files
+    from csac.types import InputError
 
 
 TURN_STEPS = 250  # environment steps that a group makes before another may have its cores
@@ -137,4 +138,10 @@ class NotSaved(NamedTuple):
     error: OSError
 
 
-Message = GroupMessage | GroupCrashed | GroupRestarted | NotSaved
+class Refused(NamedTuple):
+    """A group cannot do what was asked for: a user's mistake, and so no failure of its seeds."""
+
+    error: InputError
+
+
+Message = GroupMessage | GroupCrashed | GroupRestarted | NotSaved | Refused

@@ -22,6 +22,7 @@ from csac.training.messages import (
     Noted,
     NotSaved,
     Progress,
+    Refused,
     Rows,
     Saved,
 )
@@ -118,7 +119,7 @@ class Recorder:
                 self._note(text)
             case BegunAnew():
                 self._begun_anew(message)
-            case NotSaved(error):
+            case NotSaved(error) | Refused(error):
                 raise error
 
     def is_complete(self, steps: int) -> bool:
@@ -214,7 +215,8 @@ class Recorder:
 
     def _crashed(self, group: int, message: GroupCrashed) -> None:
         for seed in self.groups[group]:
-            self._note_failure(seed, self._steps[seed], message.reason, message.details)
+            if seed not in self.failures:  # one that had failed before keeps its reason
+                self._note_failure(seed, self._steps[seed], message.reason, message.details)
         self._passed[group] = OVER
         self._commit_whole()
         self._flush()

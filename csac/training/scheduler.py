@@ -22,6 +22,7 @@ from csac.training.messages import (
     Message,
     NotSaved,
     Order,
+    Refused,
     Saved,
     Settings,
 )
@@ -300,6 +301,8 @@ def _work(connection: Connection, settings: Settings, seeds: list[int]) -> None:
                     turns.take(group)
     except (BrokenPipeError, EOFError, ConnectionResetError):
         return  # the parent is gone, and with it whoever would write this down
+    except InputError as error:
+        connection.send(Refused(error))
     except Exception as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         connection.send(GroupCrashed(reason, traceback.format_exc()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import multiprocessing
 import os
 import resource
 import shutil
@@ -41,7 +42,7 @@ from csac.training.checkpoint import (
     remove_unfinished,
     steps_in,
 )
-from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Rows, Saved
+from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Refused, Rows, Saved
 from csac.training.recorder import Recorder
 from csac.training.scheduler import _Scheduler
 from csac.training.seed_files import SeedFiles
@@ -409,6 +410,31 @@ def test_zero_keeps_all(tmp_path):
     for step in (10, 20, 30):
         save(tmp_path, step, keep=0)
     assert steps_in(tmp_path) == [10, 20, 30]
+    for step in (10, 20, 30):
+        Checkpoint.open(tmp_path, step).verify()
+
+
+def test_what_a_list_that_cannot_be_read_may_need_stays(tmp_path):
+    """A disk may fail for a moment, and a person may mend the list."""
+    for step in (10, 20):
+        save(tmp_path, step, seeds=(0, 1), keep=2)
+    path = tmp_path / "step_20.json"
+    content = path.read_bytes()
+    path.write_bytes(b"")
+    files = {}
+    for seed in (0, 1):
+        files |= SeedFiles(tmp_path, seed, {}).write(30, Snapshot({}, {}), ring(50, 30))
+    Checkpoints(tmp_path, 2).commit(30, files, {})
+    path.write_bytes(content)
+    for step in (20, 30):
+        Checkpoint.open(tmp_path, step).verify()
+    assert steps_in(tmp_path) == [20, 30]
+
+
+def test_failures_of_seeds_whose_order_as_texts_is_another_are_no_damage(tmp_path):
+    failures = {2: "a reward is NaN", 10: "killed"}
+    Checkpoints(tmp_path, 1).commit(12, {}, {"failures": failures})
+    assert Checkpoint.open(tmp_path, 12).values["failures"] == {"2": "a reward is NaN", "10": "killed"}
 
 
 def test_a_commit_leaves_alone_what_a_group_ahead_has_written(tmp_path):
@@ -524,6 +550,37 @@ def test_a_step_by_which_every_seed_had_failed_is_no_checkpoint(recorder):
     recorder.handle(1, Progress(450))
     recorder.handle(1, GroupCrashed("killed", ""))
     assert steps_in(recorder.run.path / "checkpoint") == [300]
+
+
+def test_a_crash_leaves_a_seed_that_had_failed_before_its_reason(recorder):
+    recorder.handle(0, Failed(0, 130, "a reward is NaN", "", None))
+    recorder.handle(0, Progress(450))
+    recorder.handle(0, GroupCrashed("killed", ""))
+    assert recorder.failures == {0: "step 130: a reward is NaN"}
+
+
+def test_a_user_s_mistake_in_a_group_is_no_failure_of_its_seeds(recorder):
+    with pytest.raises(InputError, match="made for another csac"):
+        recorder.handle(0, Refused(InputError("made for another csac")))
+    assert not recorder.failures
+
+
+def test_a_worker_that_meets_a_user_s_mistake_says_so(tmp_path, monkeypatch):
+    def refuse(*_: Any) -> None:
+        raise Damaged("the checkpoint does not fit")
+
+    monkeypatch.setattr(scheduler_module, "Group", refuse)
+    for of_a_process_of_its_own in ("die_with_parent", "move_to"):
+        monkeypatch.setattr(scheduler_module, of_a_process_of_its_own, lambda *_: None)
+    settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
+    ours, theirs = multiprocessing.Pipe()
+    with ours, theirs:
+        ours.send([0])  # the cores of its first turn
+        scheduler_module._work(theirs, settings, [0])
+        message = ours.recv()
+    assert isinstance(message, Refused)
+    assert isinstance(message.error, Damaged)
+    assert str(message.error) == "the checkpoint does not fit"
 
 
 class DeadWorker:
