@@ -1,4 +1,5 @@
 import dataclasses
+import io
 import os
 import re
 import shlex
@@ -578,6 +579,13 @@ def test_evaluate_refuses_what_it_cannot_perturb(trained, capsys, perturb, compl
     output = capsys.readouterr()
     assert output.err.startswith(f"csac: {complaint}")
     assert (output.err.count("\n"), output.out) == (1, "")
+
+
+def test_a_command_works_where_stderr_is_no_file(monkeypatch, capsys):
+    monkeypatch.setattr("faulthandler.is_enabled", lambda: False)
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("csac ")
 
 
 def test_a_test_without_the_perturbations_of_the_training_says_so(capsys):

@@ -72,7 +72,7 @@ def _what_it_must_be(value: Any, hint: Any) -> str | None:
         found = [_what_it_must_be(value, kind) for kind in get_args(hint)]
         return None if None in found else ", or ".join(filter(None, found))
     hint, *limits = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    if get_origin(hint) is Literal and value not in get_args(hint):
+    if get_origin(hint) is Literal and not (isinstance(value, str) and value in get_args(hint)):
         return f"{'one of ' * (len(get_args(hint)) > 1)}{', '.join(get_args(hint))}"
     if hint is bool and not isinstance(value, bool):
         return "true or false"

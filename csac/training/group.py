@@ -65,7 +65,7 @@ def train_group(settings: Settings, seeds: Sequence[int], should_stop: Callable[
 class Group:
     """Seeds that are trained side by side. At a `Boundary` of `run` it can be saved, after `settle`.
 
-    Strict order: each action comes from the policy after the update that followed the step before it.
+    Strict order: whatever updates the step before an action has brought are made before it.
 
     Evaluations may be made by processes beside this one while training goes on. What happens meanwhile is told after
     what they give, so that the order of messages and all that they say is the same as with evaluations in line.

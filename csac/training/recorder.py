@@ -43,7 +43,7 @@ OVER = np.iinfo(np.int64).max  # the step of a group that is over: it holds nobo
 
 
 class Recorder:
-    """The only writer of a run directory. Rows wait until every group has passed their step, then go out in order.
+    """Writes what a run has to tell: tables, policies, manifest, log. Rows wait until every group has passed their step.
 
     Args:
         run: the run directory.

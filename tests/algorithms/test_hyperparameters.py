@@ -87,6 +87,7 @@ def test_numbers_of_numpy_are_numbers():
         ("batch_size", np.float64(8), "a whole number, not 8.0"),
         ("actor_hidden_sizes", (np.int64(0),), "at least 1"),
         ("actor_hidden_sizes", np.array([8, 8]), "a tuple"),
+        ("temperature", np.array([0.1, 0.2]), "one of automatic, fixed"),
     ],
 )
 def test_bad_values_of_numpy_are_refused(name, value, words):
