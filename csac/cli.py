@@ -55,8 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     _open_standard_streams()
-    if not faulthandler.is_enabled():
-        faulthandler.enable()  # a fault in a simulator's native code ends one seed's process, which is this one
+    with suppress(OSError, ValueError):  # where a caller's stderr is no file
+        if not faulthandler.is_enabled():
+            faulthandler.enable()  # a fault in a simulator's native code ends one seed's process, which is this one
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -290,6 +291,8 @@ def _export(arguments: list[str]) -> int:
         return _complain(error, 1)
     if (sizes := size_table(exported)) is not None:
         console.print(sizes)
+    for line in dict.fromkeys(line for one in exported for line in one.notes):  # most are of every format's
+        _say(f"note: {line}")
     _tell_of_warmup(RunDirectory.open(options.run).manifest)
     return 0
 

@@ -63,12 +63,21 @@ class Artefact:
             noise: standard normal, float32 [action], of a policy that samples; it draws its own where not given.
 
         Raises:
-            InputError: an observation of another shape.
+            InputError: an observation or noise of another shape, or noise for a policy that does not sample.
         """
         observation = np.ascontiguousarray(observation, np.float32)
         if observation.shape != (self._size,):
             raise InputError(f"the observation has shape {observation.shape}; the artefact takes ({self._size},)")
-        return self._runner.act(observation, noise)
+        return self._runner.act(observation, None if noise is None else self._checked(noise))
+
+    def _checked(self, noise: np.ndarray) -> np.ndarray:
+        """Return noise as every runner can take it: one in C reads as many numbers as there are actions."""
+        if self.contract.noise_seed is None:
+            raise InputError("the artefact was exported without --stochastic: it takes no noise")
+        noise, size = np.ascontiguousarray(noise, np.float32), self.contract.policy.spec.action_size
+        if noise.shape != (size,):
+            raise InputError(f"the noise has shape {noise.shape}; the artefact takes ({size},)")
+        return noise
 
     def reset(self) -> None:
         """Have the guards forget what was before: an episode begins."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from csac.deploy.contract import FLOAT32_MAX, Contract, read_json
+from csac.deploy.contract import FLOAT32_MAX, Contract, read_file, read_json
 from csac.deploy.guards import NO_GUARDS, Guards
 from csac.record.manifest import SEED_LIMIT
 from csac.types import InputError
@@ -81,7 +81,8 @@ class ArtefactContract:
         """Read the contract of the artefact in a folder.
 
         Raises:
-            InputError: no contract there, or a damaged one; a policy file that is not the one it was written for.
+            InputError: no contract there, or a damaged one; a policy file that cannot be read, or is not the one it was
+                written for.
         """
         path = folder / CONTRACT
         if not path.exists():
@@ -114,8 +115,8 @@ def _as_json(value: Any) -> Any:
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal digits."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    """Return the SHA-256 of a file, in hexadecimal digits. Raises InputError where it cannot be read."""
+    return hashlib.sha256(read_file(path)).hexdigest()
 
 
 def _artefact_contract(fields: Any, policy: Contract) -> ArtefactContract:

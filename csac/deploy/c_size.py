@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from csac.deploy.artefact import C_STANDARD, compile_c, header_alone
 from csac.deploy.artefact_contract import ArtefactContract
+from csac.types import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 TARGETS = {
@@ -44,31 +46,45 @@ class Size(NamedTuple):
     """At most, of one step."""
 
 
-def sizes(folder: Path) -> list[Size]:
+def sizes(folder: Path, on_skip: Callable[[str], object] = lambda line: None) -> list[Size]:
     """Return the sizes of the C artefact in a folder, compiled with -O2 for each target whose compiler is here.
 
+    A target whose tools do not work here is left out, and `on_skip` called with a line that says why.
+
     Raises:
-        InputError: no artefact there, a header that is not csac's own, or a compiler that does not take it.
+        InputError: no artefact there, a header that is not csac's own, or `cc` does not take it.
     """
-    contract = ArtefactContract.load(folder)
-    return [
-        _size(folder, contract, target, compiler, lister, options)
-        for target, (compiler, lister, options) in TARGETS.items()
-        if shutil.which(compiler) and shutil.which(lister)
-    ]
-
-
-def _size(
-    folder: Path, contract: ArtefactContract, target: str, compiler: str, lister: str, options: tuple[str, ...]
-) -> Size:
+    contract, measured = ArtefactContract.load(folder), []
     with header_alone(folder, contract) as place:
-        source, made = place / "probe.c", place / "probe.o"
-        source.write_text(_PROBE)
+        for target, (compiler, lister, options) in TARGETS.items():
+            if not (shutil.which(compiler) and shutil.which(lister)):
+                continue
+            try:
+                measured.append(_size(place, target, compiler, lister, options))
+            except _ToolFailure as error:
+                on_skip(f"no size for {target}: {error}")
+    return measured
+
+
+class _ToolFailure(Exception):
+    """A tool of a target does not work here, which says nothing of the artefact."""
+
+
+def _size(place: Path, target: str, compiler: str, lister: str, options: tuple[str, ...]) -> Size:
+    source, made = place / "probe.c", place / "probe.o"
+    source.write_text(_PROBE)
+    try:
         compile_c(*C_STANDARD, *options, "-O2", "-fstack-usage", "-c", source, "-o", made, program=compiler)
-        listed = subprocess.run([lister, "-A", made], capture_output=True, text=True, check=True).stdout
-        stack = sum(int(line.split("\t")[1]) for line in made.with_suffix(".su").read_text().splitlines())
+    except InputError as error:
+        if compiler == "cc":
+            raise
+        raise _ToolFailure(str(error)) from error  # such as one without the headers of a C library
+    listed = subprocess.run([lister, "-A", made], capture_output=True, text=True)
+    if listed.returncode:
+        raise _ToolFailure(f"{lister} fails: {' '.join(listed.stderr.split())}")
+    stack = sum(int(line.split("\t")[1]) for line in made.with_suffix(".su").read_text().splitlines())
     bytes_of = {"text": 0, "rodata": 0, "data": 0, "bss": 0}
-    for line in listed.splitlines():
+    for line in listed.stdout.splitlines():
         words = line.split()
         kind = words[0].split(".")[1] if words and words[0].startswith(".") else ""
         if kind in bytes_of:

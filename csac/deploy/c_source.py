@@ -100,14 +100,14 @@ def is_header(text: str, contract: ArtefactContract) -> bool:
 
     So it can be compiled and run without running anybody else's code, and reads no number beyond an array.
     """
-    sizes = {name: int(size) for name, size in _ARRAY.findall(text)}
-    if sum(sizes.values()) > len(text):  # each number takes a letter at least
-        return False
     try:
+        sizes = {name: int(size) for name, size in _ARRAY.findall(text)}
+        if sum(sizes.values()) > len(text):  # each number takes a letter at least
+            return False
         network = _network_of_zeros(sizes, contract)
         check_network(network, contract.policy)
         expected = c_header(network, contract)
-    except (KeyError, ValueError, ArithmeticError):  # arrays that no network has, or that do not fit each other
+    except (KeyError, ValueError, ArithmeticError):  # sizes or arrays that no network has
         return False
     return _NUMBERS.sub("", text) == _NUMBERS.sub("", expected)
 

@@ -86,7 +86,18 @@ class Guards:
             raise ValueError("fallback and observation bounds disagree")
         if guards.fallback is None and (guards.watchdog or guards.largest_change is not None):
             raise ValueError("there is a watchdog or a limit without a fallback")
+        guards._check_numbers(contract)
         return guards
+
+    def _check_numbers(self, contract: Contract) -> None:
+        """Raise ValueError for numbers that `make_guards` gives for no policy of this contract."""
+        low, high, action = self.observation_low, self.observation_high, self.fallback_action
+        if low is not None and high is not None and not (low <= high).all():
+            raise ValueError("the observation bounds of the guards are not in order")
+        if action is not None and not ((action >= contract.action_low) & (action <= contract.action_high)).all():
+            raise ValueError("fallback_action is outside of the action's bounds")
+        if self.largest_change is not None and not (self.largest_change >= 0).all():
+            raise ValueError("largest_change is negative")
 
 
 NO_GUARDS = Guards()

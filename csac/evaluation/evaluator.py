@@ -20,6 +20,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from csac.deploy.contract import Contract
     from csac.tasks.making import Task
     from csac.tasks.perturbations import Perturbation
     from csac.tasks.spaces import Parts
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
 
 EPISODES_AT_ONCE = 10  # rows of every batch that the policy sees: rounding depends on its shape
+BOUNDS_ROUNDING = 1e-6  # of a bound: a few times what float32 rounds by
 LONGEST_EPISODE = 100_000  # steps; a task that never ends would never let training go on
 
 
@@ -97,10 +99,18 @@ class Evaluator:
         self.watch: Callable[[np.ndarray], object] | None = None
 
     def perturb(self, values: Mapping[str, float]) -> None:
-        """Change the task from the next `run` on, as `Environment.perturb`; what the task cannot be, `run` refuses."""
+        """Change the task from the next `run` on, as `Environment.perturb`; what the task cannot be, `run` refuses.
+
+        Raises:
+            InputError: environments that are there already refuse it; then so does each `run`, until it is changed.
+        """
         self.perturbed = dict(values)
-        for environment in self._environments:
-            environment.perturb(values)
+        try:
+            for environment in self._environments:
+                environment.perturb(values)
+        except InputError:
+            self.close()  # those that are left as they were would be run as if they were perturbed
+            raise
 
     def run(self, policy: Policy, deterministic: bool = True) -> list[EvaluationEpisode]:
         """Return the episodes in order; stochastic actions are drawn by the episode's seed, never as the task draws.
@@ -315,7 +325,10 @@ def _check_episodes(episodes: int, first_seed: int) -> None:
 
 
 def check_contract(policy: Policy, environment: Environment) -> None:
-    """Raise InputError where a policy was trained on other observations or actions than a task has now."""
+    """Raise InputError where a policy was trained on other observations or actions than a task has now.
+
+    A policy whose actions are within the task's bounds is none of another task: it may keep away from them.
+    """
     parts = environment.contract_parts
     known = (policy.contract.observation_parts, policy.contract.action_shape)
     given = (parts.observation_parts, parts.action_shape)
@@ -323,6 +336,21 @@ def check_contract(policy: Policy, environment: Environment) -> None:
         raise InputError(
             f"the policy was trained on observations {_told(known[0])} and actions {known[1]}; "
             f"{environment.task_name} has {_told(given[0])} and {given[1]}: evaluate it on its own task"
+        )
+    _check_bounds(policy.contract, parts.action_low, parts.action_high, environment.task_name)
+
+
+def _check_bounds(contract: Contract, low: np.ndarray, high: np.ndarray, task_name: str) -> None:
+    """Raise InputError where a policy has actions beyond a task's bounds [action] by more than rounding."""
+    low, high = low.astype(np.float64), high.astype(np.float64)  # the widest may not overflow
+    rounding = BOUNDS_ROUNDING * np.maximum(np.abs(low), np.abs(high))
+    is_outside = (contract.action_low < low - rounding) | (contract.action_high > high + rounding)
+    if is_outside.any():
+        place = int(is_outside.argmax())
+        raise InputError(
+            f"the policy's action[{place}] is between {contract.action_low[place]:g} and "
+            f"{contract.action_high[place]:g}; {task_name} takes {low[place]:g} to {high[place]:g}: "
+            "evaluate it on its own task"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -23,6 +24,7 @@ from csac.record.atomic import write_atomically
 from csac.record.run import RunDirectory, Which
 from csac.record.statistics import evaluation_matrix, last_evaluations
 from csac.tasks.environment import Environment
+from csac.tasks.perturbations import perturbations_of
 from csac.tasks.trust import refuse_untrusted
 from csac.types import InputError
 
@@ -69,6 +71,8 @@ class Exported(NamedTuple):
     compared: list[Compared]
     returns: Returns | None
     sizes: list[Size]
+    notes: tuple[str, ...] = ()
+    """What whoever exports should know, a line each, such as that the seed had failed in training."""
 
 
 def export_run(
@@ -113,6 +117,8 @@ def export_run(
         recording = record(policy, task, run.manifest.environment_arguments, options.episodes, deterministic)
         if on_progress:
             on_progress(options.episodes, options.episodes * (1 + len(formats)))
+    guards = _guards(policy.contract, options, told, recording)
+    notes = _notes(run, label, options, guards)
     for number, name in enumerate(formats):
         contract = ArtefactContract(
             policy.contract,
@@ -122,11 +128,12 @@ def export_run(
             observation_high=told.observation_high,
             control_rate=told.control_rate,
             noise_seed=options.noise_seed,
-            guards=_guards(policy.contract, options, told, recording),
+            guards=guards,
             provenance=provenance(run, label, which),
         )
         with placed(places[name]) as folder:
             exported = _exported(folder, places[name], contract, policy, recording, task, run)
+            exported = exported._replace(notes=(*notes, *exported.notes))
             if options.card:
                 _write_card(folder, exported, run)
         if on_progress:
@@ -150,10 +157,28 @@ def _exported(
     returns = None
     if recording is not None and task is not None:
         returns = compare_returns(artefact, recording, task, run.manifest.environment_arguments)
-    measured = sizes(folder) if contract.format == "c" else []
+    not_measured: list[str] = []
+    measured = sizes(folder, not_measured.append) if contract.format == "c" else []
     contract = dataclasses.replace(contract, verification=_verification(compared, returns, measured))
     write_contract(folder, contract)
-    return Exported(place, contract, compared, returns, measured)
+    return Exported(place, contract, compared, returns, measured, tuple(not_measured))
+
+
+def _notes(run: RunDirectory, seed: int, options: ExportOptions, guards: Guards) -> list[str]:
+    """Return what is to be said of every format's artefact."""
+    notes, manifest = [], run.manifest
+    if (reason := manifest.failures.get(seed)) is not None:
+        notes.append(f"seed {seed} failed at {reason}; this is the policy that it has left")
+    trained = perturbations_of(manifest.perturbations)
+    if trained and options.episodes:
+        told = ", ".join(map(str, trained))
+        notes.append(f"not perturbed, unlike its training ({told}): csac evaluate --perturb tests it so")
+    if options.observation_range == "recorded" and guards.observation_high is not None:
+        unbounded = int((guards.observation_high == np.float32(FLOAT32_MAX)).sum())
+        if unbounded:
+            count = f"{unbounded:,} of {len(guards.observation_high):,}"
+            notes.append(f"{count} numbers of the observation did not vary in the episodes and have no range")
+    return notes
 
 
 class _Told(NamedTuple):
@@ -196,8 +221,9 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
     The returns are those of the evaluation that belongs to the policy: the seed's last one, which a run that stopped
     between two has left behind (`step` and `steps` tell), or its best; the interval
     is over that evaluation's episodes. Those of `all_seeds` are of their last evaluations, and the interval over seeds,
-    of which those that failed in training are left out as in every table. `learnt_weights` are those of entropy and
-    relative entropy that the hyperparameters leave to be learnt, as metrics.csv last told of them by then.
+    of which those that failed in training are left out as in every table. `failure` says where and how the policy's own
+    seed failed, and is None where it did not. `learnt_weights` are those of entropy and relative entropy that the
+    hyperparameters leave to be learnt, as metrics.csv last told of them by then.
     """
     manifest, rows = run.manifest, run.evaluations
     own = rows[rows["seed"] == seed] if len(rows) else rows
@@ -221,6 +247,7 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
         "seed": seed,
         "checkpoint": which,
         "steps": at,
+        "failure": manifest.failures.get(seed),
         "learnt_weights": _learnt_weights(run, seed, at),
         "commit": manifest.commit,
         "versions": manifest.versions,
@@ -287,6 +314,14 @@ def _check(formats: Sequence[Format], options: ExportOptions, policy: Policy) ->
     make_guards(policy.contract, options.fallback, None, None, options.watchdog, options.rate_limit)
     if "c" in formats:
         compiler()
+    if "onnx" in formats:
+        _check_onnx()
+
+
+def _check_onnx() -> None:
+    for name in ("onnx", "onnxruntime"):  # the one writes the graph, the other runs it to verify it
+        if importlib.util.find_spec(name) is None:
+            raise InputError(f"an ONNX artefact needs the package {name}: pip install '.[onnx]' in a clone of csac")
 
 
 def _task(run: RunDirectory, task: Task | None, trust_task: bool) -> Task:
@@ -312,7 +347,9 @@ def _guards(contract: Contract, options: ExportOptions, told: _Told, recording: 
         least, most = recording.observations.min(axis=0), recording.observations.max(axis=0)
         share = USUAL_MARGIN if options.range_margin is None else options.range_margin
         margin = np.float32(share) * (most - least)
-        low, high = least - margin, most + margin
+        # What stood still may do so on this machine alone: a width of zero would have the last bit make a step bad.
+        varies = most > least
+        low, high = np.where(varies, least - margin, -np.inf), np.where(varies, most + margin, np.inf)
     return make_guards(contract, options.fallback, low, high, options.watchdog, options.rate_limit)
 
 

@@ -79,7 +79,7 @@ class Environment:
         self._seed: int | None = None  # of the last reset
 
     def perturb(self, values: Mapping[str, float]) -> None:
-        """Change the task from its next step on, for good: a value for each kind of `perturb.KINDS`, 1 or 0 for none.
+        """Change the task from its next step on, for good: a value for each of `perturbations.KINDS`, 1 or 0 for none.
 
         Raises:
             InputError: the task has no such physics.

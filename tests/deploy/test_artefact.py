@@ -325,6 +325,42 @@ def test_a_contract_that_is_none_is_refused(tmp_path, change, message):
         open_artefact(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fallback_action": [0.0, 0.0, 2.5]}, "fallback_action is outside of the action's bounds"),
+        ({"largest_change": [0.1, 0.1, -0.1]}, "largest_change is negative"),
+        ({"observation_low": [0.0, 2.0, 0.0, 0.0, 0.0]}, "observation bounds of the guards are not in order"),
+    ],
+)
+def test_guards_that_no_export_writes_are_refused(tmp_path, change, message):
+    policy = algorithm_policy("csac")
+    leave(tmp_path, policy, "numpy", guards=make_guards(policy.contract, **GUARDED))
+    path = tmp_path / "contract.json"
+    fields = json.loads(path.read_text())
+    path.write_text(json.dumps(fields | {"guards": fields["guards"] | change}))
+    with pytest.raises(InputError, match=message):
+        open_artefact(tmp_path)
+
+
+def test_a_policy_file_that_cannot_be_read_is_refused_in_one_line(tmp_path, format):
+    path = tmp_path / leave(tmp_path, algorithm_policy("csac"), format).contract.file
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(InputError, match=f"{path.name} cannot be read"):
+        open_artefact(tmp_path)
+
+
+@needs_compiler
+def test_a_header_with_a_size_that_python_does_not_read_is_refused(tmp_path):
+    leave(tmp_path, algorithm_policy("csac"), "c")
+    path = tmp_path / "policy.h"
+    path.write_text(f"static const float csac_low[{'9' * 5000}] = {{\n" + path.read_text())
+    sign(tmp_path)
+    with pytest.raises(InputError, match="is not a header of this csac"):
+        open_artefact(tmp_path)
+
+
 def sign(folder: Path) -> None:
     """Have a folder's contract name the hash of the file that is there now, as somebody else would."""
     path = folder / "contract.json"
@@ -490,6 +526,22 @@ def test_an_observation_of_another_size_is_refused(tmp_path, format):
     artefact = leave(tmp_path, algorithm_policy("csac"), format)
     with pytest.raises(InputError, match=r"shape \(4,\); the artefact takes \(5,\)"):
         artefact.act(np.zeros(4))
+
+
+def test_noise_of_another_shape_is_refused(tmp_path, format):
+    policy = algorithm_policy("csac")
+    artefact, zeros = leave(tmp_path, policy, format, noise_seed=0), np.zeros(5)
+    for noise in (np.zeros(1), np.zeros((1, 3)), np.zeros(4)):
+        with pytest.raises(InputError, match=r"the noise has shape \(.*\); the artefact takes \(3,\)"):
+            artefact.act(zeros, noise)
+    expected = policy.contract.to_environment(policy.act(np.zeros((1, 5), np.float32))[0])
+    np.testing.assert_allclose(artefact.act(zeros, np.zeros(3, np.float64)), expected, atol=1e-5)
+
+
+def test_noise_for_a_policy_that_does_not_sample_is_refused(tmp_path, format):
+    artefact = leave(tmp_path, algorithm_policy("csac"), format)
+    with pytest.raises(InputError, match="exported without --stochastic: it takes no noise"):
+        artefact.act(np.zeros(5), np.zeros(3, np.float32))
 
 
 def test_opening_leaves_nothing_in_the_folder(tmp_path, format):

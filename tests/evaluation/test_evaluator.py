@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import gymnasium
@@ -12,7 +13,7 @@ from gymnasium import spaces
 
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy, noise_generator
-from csac.evaluation import evaluator
+from csac.evaluation import evaluator, pool
 from csac.evaluation.evaluator import (
     EPISODES_AT_ONCE,
     EvaluationEpisode,
@@ -285,6 +286,40 @@ def test_a_policy_of_another_task_is_refused():
         evaluate(policy_for(probes.Endless), Lottery)
     with pytest.raises(InputError, match=r"Goal has at \(\), goal \(2,\) and \(2, 1\)"):
         evaluate(policy_for(Lottery), Goal)
+
+
+@pytest.mark.parametrize(("low", "high", "is_taken"), [(-1.0, 3.0, True), (0.0, 1.0, True), (-1.0, 3.1, False)])
+def test_a_policy_is_refused_where_its_actions_leave_the_tasks_bounds(low, high, is_taken):
+    policy = policy_for(Lottery)
+    for rounding in (0.0, 1e-7):
+        ends = (np.full(2, (1.0 + rounding) * end, np.float32) for end in (low, high))
+        names = ("action_low", "action_high")
+        other = Policy(policy.network, dataclasses.replace(policy.contract, **dict(zip(names, ends, strict=True))))
+        if is_taken:
+            assert evaluate(other, Lottery, episodes=1).shape == (1,)
+        else:
+            with pytest.raises(InputError, match=r"action\[0\] is between -1 and 3.1; Lottery takes -1 to 3"):
+                evaluate(other, Lottery, episodes=1)
+
+
+def test_after_a_perturbation_that_was_refused_no_run_is_unperturbed():
+    policy, evaluator = policy_for(Lottery), Evaluator(Lottery, episodes=2)
+    plain = evaluator.run(policy)
+    for _ in range(2):
+        with pytest.raises(InputError, match="no MuJoCo task"):
+            evaluator.perturb({"friction": 2.0})
+        for _ in range(2):
+            with pytest.raises(InputError, match="no MuJoCo task"):
+                evaluator.run(policy)
+        evaluator.perturb({})
+        assert evaluator.run(policy) == plain
+
+
+def test_a_worker_goes_on_refusing_a_perturbation():
+    policy, evaluator = policy_for(Lottery), Evaluator(Lottery, episodes=2)
+    assert not isinstance(pool._answer(evaluator, policy, 0, True, {}), Exception)
+    for _ in range(2):
+        assert isinstance(pool._answer(evaluator, policy, 0, True, {"friction": 2.0}), InputError)
 
 
 @pytest.mark.parametrize(

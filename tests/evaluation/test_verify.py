@@ -7,6 +7,7 @@ import importlib.util
 import json
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import gymnasium
@@ -206,8 +207,20 @@ def test_observations_that_are_all_zero_are_observations(tmp_path):
     np.testing.assert_array_equal(recording.observations, np.zeros((int(recording.returns.sum()), 5)))
     make_run(tmp_path / "run", task="Still-v0")
     options = dataclasses.replace(QUICK, fallback="zero", observation_range="recorded")
-    guards = export(tmp_path / "run", options=options).contract.guards
-    np.testing.assert_array_equal(guards.observation_high, np.zeros(5))
+    assert export(tmp_path / "run", options=options).returns is not None
+
+
+def test_numbers_that_did_not_vary_have_no_recorded_range(tmp_path):
+    make_run(tmp_path / "run", task="Still-v0")
+    options = dataclasses.replace(QUICK, fallback="zero", observation_range="recorded", range_margin=0.0)
+    exported = export(tmp_path / "run", options=options)
+    # A range of zero and nothing else would have the last bit of a sensor make every step bad.
+    largest = np.full(5, np.finfo(np.float32).max)
+    np.testing.assert_array_equal(exported.contract.guards.observation_low, -largest)
+    np.testing.assert_array_equal(exported.contract.guards.observation_high, largest)
+    assert exported.notes == ("5 of 5 numbers of the observation did not vary in the episodes and have no range",)
+    make_run(tmp_path / "varied")
+    assert export(tmp_path / "varied", options=options).notes == ()
 
 
 def test_infinite_arguments_of_a_task_stand_in_its_contract_as_text(tmp_path):
@@ -290,7 +303,9 @@ def test_seeds_that_failed_count_in_no_mean_and_end_where_they_failed(tmp_path):
     assert origin["all_seeds"]["seeds"] == 1
     assert origin["all_seeds"]["mean_return"] == 4.0  # that of seed 1 alone: 3, 4 and 5
     assert origin["steps"] == 200
-    assert provenance(RunDirectory.open(run.path), 0, "last")["steps"] == 120
+    assert origin["failure"] is None
+    failed = provenance(RunDirectory.open(run.path), 0, "last")
+    assert (failed["steps"], failed["failure"]) == (120, "step 120: its reward is nan")
     run.update_manifest(failures={0: "step 120: its reward is nan", 1: "lost"})
     origin = provenance(RunDirectory.open(run.path), 1, "last")
     assert origin["all_seeds"] == {}
@@ -399,6 +414,16 @@ def test_options_that_cannot_be_are_refused_before_anything_is_done(tmp_path, ch
     assert not (tmp_path / "run" / "export").exists()
 
 
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+def test_a_package_that_is_not_installed_is_missed_before_anything_is_done(tmp_path, monkeypatch, package):
+    pytest.importorskip("onnxruntime")
+    make_run(tmp_path / "run")
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=f"needs the package {package}: pip install"):
+        export(tmp_path / "run", ("numpy", "onnx"), options=QUICK)
+    assert not (tmp_path / "run" / "export").exists()
+
+
 @pytest.mark.parametrize("algorithm", ["td3", "sd3"])
 def test_what_has_no_spread_cannot_be_sampled(tmp_path, algorithm):
     make_run(tmp_path / "run", algorithm)
@@ -460,6 +485,38 @@ def test_the_card_has_the_header_of_the_hub_and_the_numbers_of_the_run(tmp_path)
     assert result["metrics"][0]["value"].startswith(f"{mean:.2f} +/- ")
     for words in ("csac train Follow-v0", "| batch_size | `8` |", "20 times a second", "fallback zero, limited change"):
         assert words in text
+
+
+def test_an_export_says_that_its_seed_failed_and_was_trained_otherwise(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    run = make_run(Path("run"))
+    run.update_manifest(failures={0: "step 120: its reward is nan"}, perturbations=["action_noise=0.1@100"])
+    failed = "note: seed 0 failed at step 120: its reward is nan; this is the policy that it has left\n"
+    perturbed = "note: not perturbed, unlike its training (action_noise=0.1@100): csac evaluate --perturb tests it so\n"
+    assert csac("export run --seed 0 --episodes 1") == 0
+    assert capsys.readouterr().out.endswith(failed + perturbed)
+    assert csac("export run --seed 1 --no-rollouts") == 0  # sound, and not tested on the task at all
+    assert "note:" not in capsys.readouterr().out
+
+
+@needs_compiler
+@pytest.mark.parametrize("broken", ["arm-none-eabi-gcc", "arm-none-eabi-size"])
+def test_an_export_does_without_the_size_of_a_target_whose_tools_do_not_work(tmp_path, monkeypatch, broken):
+    make_run(tmp_path / "run")
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    # A compiler without the headers of a C library, or this machine's, and a lister that fails.
+    compiler = '#!/bin/sh\nfor last; do :; done\n: > "$last"; : > "${last%.o}.su"\n'
+    failing = "#!/bin/sh\necho 'fatal error: no newlib here' >&2\nexit 1\n"
+    for name, script in (("arm-none-eabi-gcc", compiler), ("arm-none-eabi-size", "#!/bin/sh\n")):
+        (tools / name).write_text(failing if name == broken else script)
+        (tools / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tools), prepend=":")
+    exported = export(tmp_path / "run", ("c",), options=QUICK)
+    (note,) = exported.notes
+    assert note.startswith(f"no size for Cortex-M4: {broken} ")
+    assert note.endswith("fatal error: no newlib here")
+    assert "Cortex-M4" not in {size.target for size in exported.sizes}
 
 
 @pytest.mark.parametrize(
