@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 class Replay(NamedTuple):
     """A ring of transitions, each packed into one row, so that a step is one write and a batch is one gather.
 
-    The number of transitions added so far is not kept here: it follows from the environment steps, which the caller counts.
+    The number of transitions added so far is not kept here: it follows from the environment steps, which the
+    caller counts.
     """
 
     rows: Float[Array, "capacity 2*observation+action+3"]

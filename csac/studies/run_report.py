@@ -380,5 +380,5 @@ def _times(path: Path, manifest: Manifest) -> list[Time]:
     with suppress(OSError, ValueError, IndexError):
         last = (path / "log.txt").read_text(encoding="utf-8").splitlines()[-1]
         took = datetime.fromisoformat(last.split(" ")[0]) - datetime.fromisoformat(manifest.created)
-        return [Time(took.total_seconds(), manifest.steps, tuple(manifest.seeds), interrupted=False)]
+        return [Time(took.total_seconds(), manifest.steps_done, tuple(manifest.seeds), interrupted=False)]
     return []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import tomllib
 from dataclasses import dataclass, field, replace
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.presets import hyperparameters as preset_of
+from csac.record.manifest import SEED_LIMIT, STEPS_LIMIT
 from csac.studies import paper
 from csac.studies.cells import Cell, complete, similar
 from csac.tasks.known import adapter_of, check_events
@@ -203,6 +205,14 @@ def _study(name: str, told: dict[str, Any]) -> Study:
     for key in ("first_seed", "rollouts"):
         if values.get(key, 0) < 0:
             raise InputError(f"{key} must be 0 or more, not {values[key]}")
+    for key, steps in [("steps", values.get("steps", 0)), *_named("steps_on", values.get("steps_on", {}))]:
+        if steps > STEPS_LIMIT:
+            raise InputError(f"{key} must be at most {STEPS_LIMIT:,}, not {steps:,}")
+    if (last := values.get("first_seed", 0) + values.get("seeds", Study.seeds) - 1) >= SEED_LIMIT:
+        raise InputError(f"the last seed would be {last:,}: seeds are below {SEED_LIMIT:,}")
+    for key in ("tasks", "conditions"):
+        if twice := _twice(values.get(key, ())):
+            raise InputError(f"{key} has {twice} twice: its runs would count twice")
     check_events(values.get("events", ()))
     for task in values["tasks"]:
         if ":" not in task and adapter_of(task) is None:  # others may be known to the machines that train alone
@@ -213,9 +223,18 @@ def _study(name: str, told: dict[str, Any]) -> Study:
             raise InputError(f"steps_on.{task} must be at least 1, not {steps}")
     _some(values.get("analyses", ()), ANALYSES, "analyses: there is no")
     labels = [method.label for method in values["methods"]]
-    if twice := next((label for label in labels if labels.count(label) > 1), None):
-        raise InputError(f"two methods are called {twice!r}: give each a label of its own")
+    if twice := _twice(labels):
+        raise InputError(f"two methods are called {twice}: give each a label of its own")
     return Study(**{"name": name, "title": name, **values})
+
+
+def _twice(items: Sequence[Any]) -> str | None:
+    """Return the first of the items that is there again, as Python writes it."""
+    return next((repr(item) for item in items if items.count(item) > 1), None)
+
+
+def _named(key: str, table: Mapping[str, int]) -> list[tuple[str, int]]:
+    return [(f"{key}.{name}", value) for name, value in table.items()]
 
 
 def _methods(key: str, told: Any) -> tuple[Method, ...]:
@@ -280,6 +299,15 @@ def _conditions(key: str, value: Any) -> tuple[tuple[str, ...], ...]:
     return tuple(_texts(key, item) for item in value)
 
 
+def _arguments(key: str, value: Any) -> dict[str, Any]:
+    table = _of(dict, "a table")(key, value)
+    try:
+        json.dumps(table)
+    except TypeError:  # TOML has dates and times
+        raise InputError(f"{key} holds numbers, texts, lists and tables alone, not {value!r}") from None
+    return table
+
+
 def _common(key: str, value: Any) -> dict[str, dict[str, Any]]:
     tables = _of(dict, "a table of algorithms")(key, value)
     return {name: _of(dict, "a table of hyperparameters")(f"{key}.{name}", given) for name, given in tables.items()}
@@ -302,7 +330,7 @@ _KEYS: Mapping[str, Callable[[str, Any], Any]] = {
     "evaluation_interval": _of(int, "a whole number"),
     "evaluation_episodes": _of(int, "a whole number"),
     "conditions": _conditions,
-    "environment_arguments": _of(dict, "a table"),
+    "environment_arguments": _arguments,
     "events": _texts,
     "rollouts": _of(int, "a whole number"),
     "analyses": _texts,

@@ -84,7 +84,8 @@ def _run(study: SharedStudy, attempt: Attempt, watcher: Watcher, options: dict[s
             points[step] = dict(returns)
             attempt.trial.report(_objective(points, step), step)
         watcher.advanced(step, _objective(points, step))
-        is_pruned = step < question.steps and attempt.trial.should_prune()
+        # Once is enough: groups that are ahead may tell of later evaluations before the run stops.
+        is_pruned = is_pruned or (step < question.steps and attempt.trial.should_prune())
         return is_pruned or len(returns) < question.seeds  # a seed has failed
 
     try:

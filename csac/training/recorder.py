@@ -43,7 +43,7 @@ OVER = np.iinfo(np.int64).max  # the step of a group that is over: it holds nobo
 
 
 class Recorder:
-    """Writes what a run has to tell: tables, policies, manifest, log. Rows wait until every group has passed their step.
+    """Writes what a run has to tell: tables, policies, manifest, log. Rows wait until every group has passed them.
 
     Args:
         run: the run directory.

@@ -10,6 +10,7 @@ from made import make_run_of
 
 from csac.cli import main
 from csac.record.manifest import EvaluationPlan
+from csac.studies.run_report import _times
 
 ROWS = "seed,step,episode,return,length,success"
 
@@ -228,6 +229,13 @@ def test_equal_runs_with_equal_seeds_stand_side_by_side():
     text = report("runs/a runs/b/evaluations.csv")
     assert "| SAC, runs/a | 10.00 |" in text
     assert "| SAC, runs/b | 10.00 |" in text
+
+
+def test_the_time_of_a_run_that_had_enough_is_of_the_steps_that_it_made():
+    run = make_run_of("run", [[1.0]], steps_done=30, created="2026-01-01T00:00:00+00:00")
+    (run.path / "log.txt").write_text("2026-01-01T00:03:00+00:00 finished\n")
+    (time,) = _times(run.path, run.manifest)
+    assert (time.seconds, time.steps) == (180, 30)
 
 
 def test_a_damaged_run_is_named_and_left_out(capsys):

@@ -189,6 +189,20 @@ def test_a_hopeless_trial_is_pruned_and_counts(search):
     assert best.objective == 5.0
 
 
+def test_a_trial_that_was_pruned_stays_so_whatever_it_is_still_told(search):
+    """A run that was cut off would be the best, with the evaluation that comes after its end."""
+
+    def value(algorithm, seed, step):
+        return 5.0 if algorithm.discount >= 0.98 else -50.0 if step <= 300 else 3_300.0
+
+    study = search(value, trials=25, lead=1)
+    pruned = [result for result in study.results() if result.state == "pruned"]
+    assert {result.step for result in pruned} == {400}
+    best = study.best()
+    assert best is not None
+    assert all(result.step == 1_000 for result in study.results() if result.state == "complete")
+
+
 def test_nothing_is_pruned_before_there_is_something_to_compare_with(search):
     values = iter(range(100, 0, -10))
     table = {}

@@ -35,10 +35,15 @@ def question(search: tuple[str, ...] = ("actor_learning_rate", "discount"), **ch
 
 
 class FakeTrain:
-    """Stands in for `train`. `value` says what a seed reaches; it may be stopped at a step, and a seed may fail."""
+    """Stands in for `train`. `value` says what a seed reaches; it may be stopped at a step, and a seed may fail.
 
-    def __init__(self, value: Value, stop_at: int = 0, failing: Callable[[Any], bool] = lambda _: False) -> None:
-        self.value, self.stop_at, self.failing = value, stop_at, failing
+    `lead` is how many evaluations it still tells of when it has been told to stop, as groups that are ahead do.
+    """
+
+    def __init__(
+        self, value: Value, stop_at: int = 0, failing: Callable[[Any], bool] = lambda _: False, lead: int = 0
+    ) -> None:
+        self.value, self.stop_at, self.failing, self.lead = value, stop_at, failing, lead
         self.calls: list[dict[str, Any]] = []
 
     def __call__(self, algorithm: Any, task: str, *, directory: Path, stop_when: Any, **options: Any) -> RunDirectory:
@@ -48,7 +53,10 @@ class FakeTrain:
         if self.failing(algorithm):
             run.update_manifest(failures={seeds[0]: "step 7: learning has diverged"}, state="failed")
             seeds = seeds[1:]
+        end = options["steps"]
         for step in range(run.manifest.last_checkpoint + interval, options["steps"] + 1, interval):
+            if step > end:
+                break
             returns = {seed: self.value(algorithm, seed, step) for seed in seeds}
             row = {"step": step, "length": 1, "success": None}
             run.append(
@@ -60,7 +68,7 @@ class FakeTrain:
                 ],
             )
             if stop_when(step, returns):
-                break
+                end = min(end, step + self.lead * interval)
             if step == self.stop_at:
                 run.update_manifest(last_checkpoint=step, state="interrupted")
                 raise Interrupted(run, signal.SIGINT, True)
