@@ -66,13 +66,17 @@ def take_hyperparameters(algorithm: Any, not_together: Iterable[tuple[Mapping[st
         )
 
 
+def _is_one_of(value: Any, choices: tuple[str, ...]) -> bool:
+    return isinstance(value, str) and value in choices  # an array's comparison has no truth value
+
+
 def _what_it_must_be(value: Any, hint: Any) -> str | None:
     """Say what a value of this type and these limits must be, or return None where it is."""
     if get_origin(hint) in (Union, UnionType) and NoneType not in get_args(hint):
         found = [_what_it_must_be(value, kind) for kind in get_args(hint)]
         return None if None in found else ", or ".join(filter(None, found))
     hint, *limits = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    if get_origin(hint) is Literal and not (isinstance(value, str) and value in get_args(hint)):
+    if get_origin(hint) is Literal and not _is_one_of(value, get_args(hint)):
         return f"{'one of ' * (len(get_args(hint)) > 1)}{', '.join(get_args(hint))}"
     if hint is bool and not isinstance(value, bool):
         return "true or false"

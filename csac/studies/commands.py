@@ -297,10 +297,14 @@ def run(options: Run) -> int:
             raise InputError(f"--cell counts from 0 to {len(cells) - 1}, not {options.cell}")
         cells = [cells[options.cell]]
     if options.results:
+        _refuse_as_results(options.results, store)
         results = Results(options.results, may_be_empty=True)
         for cell in cells:
             if not results.has(cell):  # what another machine may have run stays as it is
-                collect(store, cell, options.results)
+                try:
+                    collect(store, cell, options.results)
+                except OSError as error:
+                    raise InputError(f"cannot copy {labels[cell.key]} to {options.results}: {error.strerror}") from None
     collected = _collected(studies, cells, options.results)
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     _say(console, _intention(studies, cells, statuses.values()), "bold")
@@ -309,10 +313,15 @@ def run(options: Run) -> int:
     done = {key: status.steps for key, status in statuses.items()}
     progress = StudyProgress([job.cell for job in jobs], labels, done, console)
 
+    not_collected: dict[str, str] = {}
+
     def tell(message: Message) -> None:
         progress.tell(message)
         if options.results and isinstance(message, Ended):
-            collect(store, by_key[message.key], options.results)
+            try:
+                collect(store, by_key[message.key], options.results)
+            except OSError as error:  # which ends no other cell
+                not_collected[message.key] = error.strerror or str(error)
 
     try:
         if jobs:
@@ -325,7 +334,21 @@ def run(options: Run) -> int:
         return 128 + stopped.signal_number
     finally:
         progress.close()
-    return _conclude({cell.key: store.status(cell) for cell in cells} | collected, labels, console)
+    for key, reason in not_collected.items():
+        _say(console, f"not copied to {options.results}: {labels[key]}: {reason}; the same line copies it", "red")
+    code = _conclude({cell.key: store.status(cell) for cell in cells} | collected, labels, console)
+    return 3 if not_collected else code
+
+
+def _refuse_as_results(directory: Path, store: Store) -> None:
+    """Raise InputError where results cannot lie, before hours are spent on them."""
+    cells = directory / "cells"
+    if cells.resolve() == store.root.resolve():
+        raise InputError(f"--results {directory} is where the runs themselves lie: choose another directory")
+    try:
+        cells.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write to {directory}: {error.strerror}; choose another directory") from None
 
 
 def report(options: Report) -> int:

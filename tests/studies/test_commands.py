@@ -1,3 +1,4 @@
+import errno
 import io
 import re
 import shlex
@@ -158,6 +159,31 @@ def test_on_a_terminal_where_nothing_is_left_to_run_it_is_said(engine, monkeypat
 def test_what_a_folder_has_not_collected_is_run(engine):
     assert csac("study run tiny.toml --engine local --results empty") == 0
     assert len(engine) == 2
+
+
+@pytest.mark.parametrize(
+    ("place", "complaint"),
+    [("tiny.toml", "cannot write to tiny.toml: "), (HOME.parent, f"--results {HOME.parent} is where the runs")],
+)
+def test_results_that_cannot_lie_there_are_refused_before_anything_runs(engine, capsys, place, complaint):
+    assert csac(f"study run tiny.toml --results {place}") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"csac: {complaint}")
+    assert error.count("\n") == 1
+    assert not engine
+
+
+def test_a_copy_that_fails_ends_no_other_cell(engine, capsys, monkeypatch):
+    def full(*_):
+        if engine:  # else nothing has been run that could be copied
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(commands, "collect", full)
+    assert csac("study run tiny.toml --engine local --results empty") == 3
+    assert len(engine) == 2
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("not copied to empty: ")]
+    assert len(told) == 2
+    assert all(line.endswith("No space left on device; the same line copies it") for line in told)
 
 
 def test_what_another_machine_has_collected_stays_as_it_is(engine):
