@@ -147,6 +147,14 @@ class Store:
         path = self.root / cell.name
         return path if path.exists() else self._known.get(cell.key, path)
 
+    def first_step(self, cell: Cell) -> int:
+        """Return the step that it goes on from: its end, or its newest checkpoint, which a killed run is ahead of."""
+        with suppress(InputError):
+            if is_run(self.path(cell)):
+                manifest = RunDirectory.open(self.path(cell)).manifest
+                return manifest.steps_done if manifest.state == "finished" else manifest.last_checkpoint
+        return 0
+
     @functools.cached_property
     def _known(self) -> dict[str, Path]:
         known = {}

@@ -210,7 +210,7 @@ def _is_of_the_paper(arm: Arm) -> bool:
 
 
 def _cases(arms: Sequence[Arm]) -> Iterator[Comparison]:
-    for arm, other in (pair for own in tasks_of(arms).values() for pair in _pairs(own)):
+    for arm, other in _pairs([arm for arm in arms if arm.task == paper.CASES_TASK]):
         for name, published in paper.CASES.items():
             told = published.get(other.published or "")
             if told is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shlex
 import signal
 import sys
@@ -21,7 +23,7 @@ from csac.console.tables import duration, make_console, program, short
 from csac.processes import usable_cores
 from csac.record.wandb import import_wandb
 from csac.studies.calibration import Calibration, Prediction, predict
-from csac.studies.cells import HOME, Cell, Store, is_final, similar
+from csac.studies.cells import HOME, Cell, Store, similar
 from csac.studies.engines import run_here, run_in_processes
 from csac.studies.job import Ended, Job, Message, Stopped, is_over
 from csac.studies.named import NAMED, find
@@ -222,7 +224,9 @@ def show(options: Show) -> int:
     cells, labels = cells_of(studies), labels_of(studies)
     collected = _collected(studies, cells, options.results)
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
-    rest = [cell for cell in cells if cell.key not in collected and not is_final(store.path(cell))]
+    rollouts = _rollouts(studies)
+    jobs = [Job(cell, store.path(cell), rollouts=rollouts[cell.key]) for cell in cells if cell.key not in collected]
+    rest = [job.cell for job in jobs if not is_over(job)]
     predictions = _predictions(rest, statuses, not options.no_measure, console)
     table = _table("cell", "what", "steps", "state", "time", "directory")
     table.columns[5].overflow = "fold"
@@ -296,21 +300,16 @@ def run(options: Run) -> int:
         if not 0 <= options.cell < len(cells):
             raise InputError(f"--cell counts from 0 to {len(cells) - 1}, not {options.cell}")
         cells = [cells[options.cell]]
+    every = _jobs(studies, cells, store, options)
     if options.results:
         _refuse_as_results(options.results, store)
-        results = Results(options.results, may_be_empty=True)
-        for cell in cells:
-            if not results.has(cell):  # what another machine may have run stays as it is
-                try:
-                    collect(store, cell, options.results)
-                except OSError as error:
-                    raise InputError(f"cannot copy {labels[cell.key]} to {options.results}: {error.strerror}") from None
+        _collect_over(every, store, options.results, labels)
     collected = _collected(studies, cells, options.results)
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     _say(console, _intention(studies, cells, statuses.values()), "bold")
-    jobs = [job for job in _jobs(studies, cells, store, options) if job.cell.key not in collected and not is_over(job)]
+    jobs = [job for job in every if job.cell.key not in collected and not is_over(job)]
     by_key = {cell.key: cell for cell in cells}
-    done = {key: status.steps for key, status in statuses.items()}
+    done = {job.cell.key: store.first_step(job.cell) for job in jobs}
     progress = StudyProgress([job.cell for job in jobs], labels, done, console)
 
     not_collected: dict[str, str] = {}
@@ -320,8 +319,8 @@ def run(options: Run) -> int:
         if options.results and isinstance(message, Ended):
             try:
                 collect(store, by_key[message.key], options.results)
-            except OSError as error:  # which ends no other cell
-                not_collected[message.key] = error.strerror or str(error)
+            except (OSError, InputError) as error:  # which ends no other cell
+                not_collected[message.key] = getattr(error, "strerror", None) or str(error)
 
     try:
         if jobs:
@@ -349,6 +348,23 @@ def _refuse_as_results(directory: Path, store: Store) -> None:
         cells.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot write to {directory}: {error.strerror}; choose another directory") from None
+    if not os.access(cells, os.W_OK | os.X_OK):  # it was there already
+        raise InputError(f"cannot write to {directory}: {os.strerror(errno.EACCES)}; choose another directory")
+
+
+def _collect_over(jobs: Iterable[Job], store: Store, directory: Path, labels: Mapping[str, str]) -> None:
+    """Collect the cells that are over and were not collected with all that is wanted of them.
+
+    What another machine may have run stays as it is. Raises InputError for what cannot be copied.
+    """
+    results = Results(directory, may_be_empty=True)
+    for job in jobs:
+        is_there = results.has(job.cell) and results.status(job.cell, job.rollouts) is not None
+        if not is_there and is_over(job):
+            try:
+                collect(store, job.cell, directory)
+            except OSError as error:
+                raise InputError(f"cannot copy {labels[job.cell.key]} to {directory}: {error.strerror}") from None
 
 
 def report(options: Report) -> int:

@@ -85,6 +85,7 @@ FRICTION_FACTORS = (1.5, 2.0, 2.5)
 FRICTION_STEP = 300_000
 
 # Table "Case analysis in QuadX-Waypoints-v1": counts in 1,000 rollouts of each of five trials.
+CASES_TASK = "PyFlyt/QuadX-Waypoints-v1"
 ROLLOUTS = 1_000
 CASES: Mapping[str, Mapping[str, Published]] = MappingProxyType(
     {

@@ -144,17 +144,21 @@ def read_runs(
     labels: Sequence[tuple[str, Sequence[Path]]] = (),
     on_damaged: Callable[[InputError], None] | None = None,
 ) -> tuple[Given, ...]:
-    """Return the runs at these paths and below them, and those that have a label.
+    """Return the runs at these paths and below them, each once, and those that have a label.
 
     `on_damaged` is told why a run below a path is left out.
 
     Raises:
         InputError: there is no run, or one that a path names, or rows of any, cannot be read.
     """
-    runs = [run for label, some in ((None, paths), *labels) for path in some for run in _read(path, label, on_damaged)]
+    plain_ones: dict[Path, Given] = {}
+    for run in (run for path in paths for run in _read(path, None, on_damaged)):
+        plain_ones.setdefault(run.path.resolve(), run)  # a path may lie below another
+    labelled = [run for label, some in labels for path in some for run in _read(path, label, on_damaged)]
+    runs = (*plain_ones.values(), *labelled)
     if not runs:
         raise InputError("there is nothing to report on: give run directories ('csac runs' lists them)")
-    return tuple(runs)
+    return runs
 
 
 def default_page() -> Path:

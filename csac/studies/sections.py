@@ -196,14 +196,15 @@ def cases(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
         table = case_comparison_table([(arm.label, rows) for arm, rows in told]) if told else None
         if not table:
             continue
-        where, panels = described(task, condition), _case_panels(told, scope.scale == 1 and not condition)
+        is_of_the_paper = task == paper.CASES_TASK and not condition
+        where, panels = described(task, condition), _case_panels(told, scope.scale == 1 and is_of_the_paper)
         for start in range(0, len(panels), MOST_PANELS):
             some = panels[start : start + MOST_PANELS]
             title = ", ".join(filter(None, (where, *(panel.title for panel in some))))
             note = seeds_note(TO_EITHER_SIDE, [len(np.unique(rows["seed"])) for _, rows in told])
             yield scope.figure("cases", title, Bars(tuple(some), f"per {ROLLOUTS:,} rollouts", note=note))
         yield table._replace(title=scope.titled(where))
-    if any(arm.published and not arm.condition for arm in arms):
+    if any(arm.published and arm.task == paper.CASES_TASK and not arm.condition for arm in arms):
         rows = [
             Row((Cell(name), *(Cell(f"{one.mean:g} ± {one.std:g}", one.mean) for one in published.values())))
             for name, published in paper.CASES.items()
@@ -217,7 +218,7 @@ def success(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
     for (task, condition), own in by_condition([arm for arm in arms if tells_of_success(arm.rows)]).items():
         title = f"{described(task, condition)}, success"
         yield scope.figure("success", title, success_curves(_runs(own), marks_of(condition)))
-    if any(arm.published for arm in arms):
+    if any(arm.published and arm.task == paper.SUCCESS_TASK for arm in arms):
         told = ", ".join(f"{name} by {short(steps)} steps" for name, steps in paper.SUCCESS_STEPS.items())
         yield Paragraph(f"In the paper success is near 100 % for {told}.")
 

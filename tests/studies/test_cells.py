@@ -110,6 +110,15 @@ def test_states(tmp_path):
     assert store.status(busy).state == "partial"
 
 
+def test_a_killed_run_goes_on_from_its_newest_checkpoint(tmp_path):
+    store = Store(tmp_path)
+    waiting, early, killed, done = (cell(seed) for seed in range(4))
+    make_run(store, early, steps_done=120)
+    make_run(store, killed, steps_done=250, last_checkpoint=200)
+    make_run(store, done, steps_done=300, last_checkpoint=200, state="finished")
+    assert [store.first_step(one) for one in (waiting, early, killed, done)] == [0, 0, 200, 300]
+
+
 def test_a_broken_manifest_is_a_failure_that_is_told(tmp_path):
     store = Store(tmp_path)
     (make_run(store, cell()).path / "manifest.json").write_text("{")

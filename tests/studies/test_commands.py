@@ -13,8 +13,8 @@ from studying import TINY, cell, make_run, write
 from csac.cli import main
 from csac.studies import commands
 from csac.studies.calibration import Calibration, Cost, predict
-from csac.studies.cells import HOME, Cell, Store
-from csac.studies.job import Ended, Started, Stopped
+from csac.studies.cells import HOME, Cell, Store, write_history
+from csac.studies.job import ROLLOUTS, Ended, Started, Stopped
 from csac.studies.results import Results, Runs, collect
 from csac.studies.study import cells_of, read_study
 
@@ -173,6 +173,14 @@ def test_results_that_cannot_lie_there_are_refused_before_anything_runs(engine, 
     assert not engine
 
 
+def test_results_that_nobody_may_write_are_refused_before_anything_runs(engine, capsys, monkeypatch):
+    Path("out/cells").mkdir(parents=True)
+    monkeypatch.setattr("os.access", lambda *_: False)  # root may write anywhere
+    assert csac("study run tiny.toml --results out") == 2
+    assert capsys.readouterr().err.startswith("csac: cannot write to out: Permission denied; ")
+    assert not engine
+
+
 def test_a_copy_that_fails_ends_no_other_cell(engine, capsys, monkeypatch):
     def full(*_):
         if engine:  # else nothing has been run that could be copied
@@ -184,6 +192,63 @@ def test_a_copy_that_fails_ends_no_other_cell(engine, capsys, monkeypatch):
     told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("not copied to empty: ")]
     assert len(told) == 2
     assert all(line.endswith("No space left on device; the same line copies it") for line in told)
+
+
+def finished(store, one, rollouts=""):
+    """A run that is over, with the rows of its rollouts."""
+    run = make_run(store, one, steps_done=300, state="finished")
+    run.append("evaluations", [{"seed": one.seed, "step": 300, "episode": 0, "return": 1.0, "length": 9}])
+    if rollouts:
+        (run.path / ROLLOUTS).write_text(f"seed,step,episode,return,length,success\n{rollouts}")
+    return run
+
+
+def test_rollouts_that_were_made_since_a_cell_was_collected_are_collected(engine, tmp_path):
+    write(tmp_path / "tested.toml", TINY.replace("steps = 300", "steps = 300\nrollouts = 1"))
+    (one,) = cells_of([read_study("tested.toml")])[:1]
+    run = finished(Store(), one)
+    collect(Store(), one, "out")
+    (run.path / ROLLOUTS).write_text("seed,step,episode,return,length,success\n0,300,0,1,9,\n")
+    assert Results("out").status(one, rollouts=1) is None
+    assert csac("study run tested.toml --seeds 1 --results out") == 0
+    assert Results("out").status(one, rollouts=1) == ("complete", 300, "", 0.0)
+    assert not engine
+
+
+def test_a_damaged_table_of_rollouts_is_made_again_and_ends_no_other_cell(monkeypatch, tmp_path, capsys):
+    write(tmp_path / "tested.toml", TINY.replace("steps = 300", "steps = 300\nrollouts = 1"))
+    first, second = cells_of([read_study("tested.toml")])
+    finished(Store(), first, "0,30\n")
+    finished(Store(), second, "1,300,0,1,9,\n")
+    given = []
+
+    def fail(jobs, tell, **_):
+        given.extend(job.cell.seed for job in jobs)
+        tell(Ended(first.key, "failed", "the task is not installed"))
+
+    monkeypatch.setattr(commands, "run_here", fail)
+    assert csac("study run tested.toml --engine local --results out") == 3
+    assert given == [0]
+    assert Results("out").has(second)
+    assert "not copied to out: SAC on Hopper-v4, seed 0: " in capsys.readouterr().out
+
+
+def test_show_counts_as_run_does(engine, capsys):
+    one, other = cells_of([read_study("tiny.toml")])
+    for each in (one, other):
+        finished(Store(), each)
+    write_history(Store().path(other), {"failure": "its process was killed by SIGKILL"})
+    assert csac("study show tiny.toml --no-measure") == 0
+    assert "1 to run, 1 of them not measured" in capsys.readouterr().out
+    assert csac("study run tiny.toml") == 3  # the engine here clears nothing
+    assert [job.cell for job in engine] == [other]
+
+
+def test_a_killed_cell_is_told_from_where_it_goes_on(engine, capsys):
+    (one,) = cells_of([read_study("tiny.toml")])[:1]
+    make_run(Store(), one, steps_done=290, last_checkpoint=200)
+    csac("study run tiny.toml --seeds 1")
+    assert "begins: SAC on Hopper-v4, seed 0, from step 200\n" in capsys.readouterr().out
 
 
 def test_what_another_machine_has_collected_stays_as_it_is(engine):

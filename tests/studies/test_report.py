@@ -196,6 +196,13 @@ def test_the_arm_succeeds_sooner():
     assert claims[f"CSAC (periodic): {claim}"] == "not yet decidable"
 
 
+def test_how_rollouts_end_is_claimed_of_the_papers_task_alone():
+    study = NAMED["quadx"][0].narrowed(algorithms=["csac", "sac"], seeds=2)
+    assert any("rollouts with" in claim for claim in claims_of(study))
+    elsewhere = replace(study, tasks=("Hopper-v4",), events=())
+    assert not any("rollouts with" in claim for claim in claims_of(elsewhere))
+
+
 def of_ones_own(tmp_path, text, methods=""):
     path = tmp_path / "mine.toml"
     path.write_text(

@@ -231,6 +231,14 @@ def test_equal_runs_with_equal_seeds_stand_side_by_side():
     assert "| SAC, runs/b | 10.00 |" in text
 
 
+def test_a_run_that_is_named_again_counts_once():
+    make_run_of("runs/a", [[10.0]])
+    write_rows("b", [[30.0]])
+    text = report("runs/a runs runs/../runs/a runs/a/evaluations.csv b.csv ./b.csv b.csv")
+    assert "| SAC | 10.00 | 10 | 1 |" in text
+    assert [text.count(f"\n| {name} |") for name in ("runs/a", "b.csv", "./b.csv")] == [1, 1, 0]
+
+
 def test_the_time_of_a_run_that_had_enough_is_of_the_steps_that_it_made():
     run = make_run_of("run", [[1.0]], steps_done=30, created="2026-01-01T00:00:00+00:00")
     (run.path / "log.txt").write_text("2026-01-01T00:03:00+00:00 finished\n")

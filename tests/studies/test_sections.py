@@ -10,8 +10,8 @@ from csac.record.rendering import Table
 from csac.studies.arms import Arm, gather
 from csac.studies.figures import Bars, Curves, Trend
 from csac.studies.named import NAMED
-from csac.studies.parts import Figure
-from csac.studies.sections import Scope, cases, curves, efficiency, report_looks, returns
+from csac.studies.parts import Figure, Paragraph
+from csac.studies.sections import Scope, cases, curves, efficiency, report_looks, returns, success
 from csac.studies.study import Method
 
 
@@ -136,6 +136,15 @@ def test_rollouts_end_in_each_condition_for_itself():
         "The paper",
     ]
     assert [len(set(table.headings)) for table in tables] == [len(table.headings) for table in tables]
+
+
+def test_the_papers_numbers_stand_beside_its_own_task_alone():
+    elsewhere = [replace(arm, task="Hopper-v4") for arm in perturbed("quadx", seeds=2)]
+    parts = list(cases(elsewhere, Scope("it")))
+    assert not any(np.isfinite(bar.published) for some in bars_of(parts) for bar in some)
+    assert "The paper" not in [part.title for part in parts if isinstance(part, Table)]
+    assert not any(isinstance(part, Paragraph) for part in success(elsewhere, Scope("it")))
+    assert any(isinstance(part, Paragraph) for part in success(study_of("panda"), Scope("it")))
 
 
 def test_the_paper_s_returns_do_not_stand_beside_perturbed_ones():
