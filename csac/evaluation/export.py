@@ -24,7 +24,7 @@ from csac.record.atomic import write_atomically
 from csac.record.run import RunDirectory, Which
 from csac.record.statistics import evaluation_matrix, last_evaluations
 from csac.tasks.environment import Environment
-from csac.tasks.perturbations import perturbations_of
+from csac.tasks.perturbations import unlike_training
 from csac.tasks.trust import refuse_untrusted
 from csac.types import InputError
 
@@ -169,10 +169,8 @@ def _notes(run: RunDirectory, seed: int, options: ExportOptions, guards: Guards)
     notes, manifest = [], run.manifest
     if (reason := manifest.failures.get(seed)) is not None:
         notes.append(f"seed {seed} failed at {reason}; this is the policy that it has left")
-    trained = perturbations_of(manifest.perturbations)
-    if trained and options.episodes:
-        told = ", ".join(map(str, trained))
-        notes.append(f"not perturbed, unlike its training ({told}): csac evaluate --perturb tests it so")
+    if options.episodes:
+        notes += [f"{line}: csac evaluate --perturb tests it so" for line in unlike_training(manifest.perturbations)]
     if options.observation_range == "recorded" and guards.observation_high is not None:
         unbounded = int((guards.observation_high == np.float32(FLOAT32_MAX)).sum())
         if unbounded:

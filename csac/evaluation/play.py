@@ -17,7 +17,7 @@ from csac.record.atomic import check_name
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
 from csac.tasks.known import adapter_of
-from csac.tasks.perturbations import constant_perturbations, perturbations_of, values_at
+from csac.tasks.perturbations import constant_perturbations, unlike_training, values_at
 from csac.tasks.seeds import FRESH_EVALUATION_SEED
 from csac.tasks.trust import refuse_untrusted
 from csac.types import InputError
@@ -83,10 +83,10 @@ def perturbation_notes(
 ) -> list[str]:
     """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
     given = constant_perturbations(perturbations)
-    trained = perturbations_of(RunDirectory.open(directory).manifest.perturbations)
+    manifest = RunDirectory.open(directory).manifest
     if given:
         return [f"perturbed: {', '.join(item.label for item in given)}"]
-    return [f"not perturbed, unlike its training ({', '.join(map(str, trained))}): see --perturb"] if trained else []
+    return [f"{line}: see --perturb" for line in unlike_training(manifest.perturbations)]
 
 
 def play(

@@ -227,7 +227,7 @@ def show(options: Show) -> int:
     rollouts = _rollouts(studies)
     jobs = [Job(cell, store.path(cell), rollouts=rollouts[cell.key]) for cell in cells if cell.key not in collected]
     rest = [job.cell for job in jobs if not is_over(job)]
-    predictions = _predictions(rest, statuses, not options.no_measure, console)
+    predictions = _predictions(rest, store, not options.no_measure, console)
     table = _table("cell", "what", "steps", "state", "time", "directory")
     table.columns[5].overflow = "fold"
     for index, cell in enumerate(cells):
@@ -253,9 +253,7 @@ def show(options: Show) -> int:
     return 0
 
 
-def _predictions(
-    cells: Sequence[Cell], statuses: Mapping[str, Status], measure: bool, console: Console
-) -> dict[str, Prediction]:
+def _predictions(cells: Sequence[Cell], store: Store, measure: bool, console: Console) -> dict[str, Prediction]:
     """Return what each cell will take, of those whose kind was measured or can be."""
     calibration, predictions, refused = Calibration(), {}, set()
     for cell in cells:
@@ -268,7 +266,7 @@ def _predictions(
                 refused.add(kind)
                 _say(console, f"{kind} cannot be measured: {error}", "red")
         if cost:
-            predictions[cell.key] = predict(cell, cost, statuses[cell.key].steps)
+            predictions[cell.key] = predict(cell, cost, store.first_step(cell))
     if calibration.is_busy:
         _say(console, "other processes keep this machine busy: what was measured now is too slow, and not remembered")
     return predictions
@@ -333,8 +331,8 @@ def run(options: Run) -> int:
         return 128 + stopped.signal_number
     finally:
         progress.close()
-    for key, reason in not_collected.items():
-        _say(console, f"not copied to {options.results}: {labels[key]}: {reason}; the same line copies it", "red")
+        for key, reason in not_collected.items():
+            _say(console, f"not copied to {options.results}: {labels[key]}: {reason}; the same line copies it", "red")
     code = _conclude({cell.key: store.status(cell) for cell in cells} | collected, labels, console)
     return 3 if not_collected else code
 

@@ -121,13 +121,13 @@ class Results:
 def collect(store: Store, cell: Cell, directory: str | Path) -> None:
     """Copy what a cell that is over has given to files that are small enough to be kept with the code.
 
-    One that failed before its first evaluation has a table without rows.
+    One that failed before its first evaluation has a table without rows. A failure replaces nothing.
     """
     record, source = Runs(store).record(cell), store.path(cell)
     table = source / "evaluations.csv"
-    if record is None or not (record.failure or table.exists()):
-        return
     path = Path(directory) / "cells" / cell.name.with_suffix(".json")
+    if record is None or not (record.failure or table.exists()) or (record.failure and path.exists()):
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     header = (",".join(COLUMNS["evaluations"]) + "\n").encode()
     write_atomically(path.with_suffix(".csv"), table.read_bytes() if table.exists() else header)

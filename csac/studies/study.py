@@ -199,15 +199,13 @@ def _study(name: str, told: dict[str, Any]) -> Study:
     for algorithm, hyperparameters in common.items():
         complete(algorithm, hyperparameters)
     values["methods"] = tuple(replace(one, common=common.get(one.algorithm, {})) for one in values["methods"])
-    for key in ("seeds", "steps", "evaluation_interval", "evaluation_episodes"):
+    for key in ("seeds", "evaluation_interval", "evaluation_episodes"):
         if key in values and values[key] < 1:
             raise InputError(f"{key} must be at least 1, not {values[key]}")
     for key in ("first_seed", "rollouts"):
         if values.get(key, 0) < 0:
             raise InputError(f"{key} must be 0 or more, not {values[key]}")
-    for key, steps in [("steps", values.get("steps", 0)), *_named("steps_on", values.get("steps_on", {}))]:
-        if steps > STEPS_LIMIT:
-            raise InputError(f"{key} must be at most {STEPS_LIMIT:,}, not {steps:,}")
+    _check_steps("steps", values.get("steps", Study.steps))
     if (last := values.get("first_seed", 0) + values.get("seeds", Study.seeds) - 1) >= SEED_LIMIT:
         raise InputError(f"the last seed would be {last:,}: seeds are below {SEED_LIMIT:,}")
     for key in ("tasks", "conditions"):
@@ -219,8 +217,7 @@ def _study(name: str, told: dict[str, Any]) -> Study:
             registered(task)
     for task, steps in values.get("steps_on", {}).items():
         _some([task], values["tasks"], "steps_on: the study has no task")
-        if steps < 1:
-            raise InputError(f"steps_on.{task} must be at least 1, not {steps}")
+        _check_steps(f"steps_on.{task}", steps)
     _some(values.get("analyses", ()), ANALYSES, "analyses: there is no")
     labels = [method.label for method in values["methods"]]
     if twice := _twice(labels):
@@ -233,8 +230,11 @@ def _twice(items: Sequence[Any]) -> str | None:
     return next((repr(item) for item in items if items.count(item) > 1), None)
 
 
-def _named(key: str, table: Mapping[str, int]) -> list[tuple[str, int]]:
-    return [(f"{key}.{name}", value) for name, value in table.items()]
+def _check_steps(key: str, steps: int) -> None:
+    if steps < 1:
+        raise InputError(f"{key} must be at least 1, not {steps}")
+    if steps > STEPS_LIMIT:
+        raise InputError(f"{key} must be at most {STEPS_LIMIT:,}, not {steps:,}")
 
 
 def _methods(key: str, told: Any) -> tuple[Method, ...]:

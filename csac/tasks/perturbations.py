@@ -83,6 +83,12 @@ class Perturbation:
         )
 
 
+def unlike_training(trained: Iterable[str | Perturbation]) -> list[str]:
+    """Return the line that says of an unperturbed test that the training was perturbed; none where it was not."""
+    told = ", ".join(map(str, perturbations_of(trained)))
+    return [f"not perturbed, unlike its training ({told})"] if told else []
+
+
 def perturbations_of(given: str | Perturbation | Iterable[str | Perturbation]) -> tuple[Perturbation, ...]:
     """Return perturbations, written out or not, in the order of their steps.
 

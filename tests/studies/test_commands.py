@@ -215,6 +215,19 @@ def test_rollouts_that_were_made_since_a_cell_was_collected_are_collected(engine
     assert not engine
 
 
+def test_a_failure_here_replaces_nothing_that_another_machine_has_collected(engine, tmp_path):
+    write(tmp_path / "tested.toml", TINY.replace("steps = 300", "steps = 300\nrollouts = 1"))
+    (one,) = cells_of([read_study("tested.toml")])[:1]
+    finished(Store("there"), one)
+    collect(Store("there"), one, "out")
+    make_run(Store(), one, steps_done=20, state="failed", failures={0: "step 20: the actor is not finite"})
+    csac("study run tested.toml --seeds 1 --results out")
+    record = Results("out").record(one)
+    assert record is not None
+    assert not record.failure
+    assert len(record.evaluations)
+
+
 def test_a_damaged_table_of_rollouts_is_made_again_and_ends_no_other_cell(monkeypatch, tmp_path, capsys):
     write(tmp_path / "tested.toml", TINY.replace("steps = 300", "steps = 300\nrollouts = 1"))
     first, second = cells_of([read_study("tested.toml")])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
-import multiprocessing
 import os
 import resource
 import shutil
@@ -16,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plans
 import pytest
 import safetensors.numpy
 import trainer  # noqa: F401  (its cache of compiled programs)
@@ -32,7 +30,6 @@ from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.record.tensorboard import TensorBoardLog
 from csac.tasks.seeds import SeedEnvironments
-from csac.training import scheduler as scheduler_module
 from csac.training.checkpoint import (
     SCHEMA_VERSION,
     Checkpoint,
@@ -42,9 +39,6 @@ from csac.training.checkpoint import (
     remove_unfinished,
     steps_in,
 )
-from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Refused, Rows, Saved
-from csac.training.recorder import Recorder
-from csac.training.scheduler import _Scheduler
 from csac.training.seed_files import SeedFiles
 from csac.training.train import resume, train
 from csac.types import InputError, Ring, Snapshot
@@ -477,162 +471,6 @@ def test_a_hidden_folder_of_somebody_else_s_stays(tmp_path):
     Checkpoints(tmp_path, 2).discard_after(10)
     assert (tmp_path / ".ipynb_checkpoints" / "notes.txt").exists()
     assert not (tmp_path / ".step_20.json.4711").exists()
-
-
-# Groups that fail, and what the recorder makes of it.
-
-
-@pytest.fixture
-def recorder(tmp_path):
-    manifest = Manifest(task="t", algorithm="a", seeds=(0, 1), steps=900)
-    run = RunDirectory.create(tmp_path / "run", manifest)
-    return Recorder(run, [[0], [1]], None, (), Checkpoints(tmp_path / "run" / "checkpoint", 2))
-
-
-def saves(recorder: Recorder, group: int, step: int) -> None:
-    """Let a group make an episode 10 steps before `step`, reach it and save there."""
-    episode = {"seed": group, "step": step - 10, "return": 1.0, "length": 5}
-    recorder.handle(group, Rows("episodes", [episode]))
-    place = recorder.run.path / "checkpoint"
-    recorder.handle(group, Saved(step, SeedFiles(place, group, {}).write(step, Snapshot({}, {}), ring(9, step)), {}))
-
-
-def rows_in(recorder: Recorder, step: int) -> list[int]:
-    """The steps of the episodes that a checkpoint counts on."""
-    content = Checkpoint.open(recorder.run.path / "checkpoint", step).read(f"step_{step}.episodes.csv")
-    lines = content.decode().splitlines()[1:]
-    return [int(line.split(",")[1]) for line in lines]
-
-
-def test_a_checkpoint_counts_on_no_later_row_though_a_group_was_started_again(recorder):
-    for group in (0, 1):
-        saves(recorder, group, 300)
-    saves(recorder, 1, 600)
-    recorder.handle(1, Progress(750))
-    recorder.handle(1, GroupRestarted("killed", 300))
-    saves(recorder, 0, 600)
-    assert steps_in(recorder.run.path / "checkpoint") == [300]  # else the one that group 1 begins with could go
-    saves(recorder, 0, 900)
-    saves(recorder, 1, 600)
-    assert rows_in(recorder, 600) == [290, 290, 590, 590]
-    saves(recorder, 1, 900)
-    assert rows_in(recorder, 900) == [290, 290, 590, 590, 890, 890]
-
-
-def test_the_last_checkpoint_comes_though_the_slower_group_crashed(recorder):
-    for group in (0, 1):
-        saves(recorder, group, 300)
-    for step in (600, 900):
-        saves(recorder, 0, step)
-    recorder.handle(0, Ended(900, {}))
-    recorder.handle(1, Progress(450))
-    recorder.handle(1, GroupCrashed("killed", ""))
-    place = recorder.run.path / "checkpoint"
-    assert steps_in(place) == [300, 600, 900]  # 300 is pinned: seed 1 was still sound
-    assert rows_in(recorder, 600) == [290, 290, 590]
-    assert list(Checkpoint.open(place, 900).values["failures"]) == ["1"]
-
-
-def test_the_last_checkpoint_comes_though_every_seed_of_the_slower_group_failed(recorder):
-    for group in (0, 1):
-        saves(recorder, group, 300)
-    saves(recorder, 0, 600)
-    recorder.handle(1, Failed(1, 450, "a reward is NaN", "", None))
-    recorder.handle(1, Ended(450, {}))
-    assert steps_in(recorder.run.path / "checkpoint") == [300, 600]
-
-
-def test_a_step_by_which_every_seed_had_failed_is_no_checkpoint(recorder):
-    for group in (0, 1):
-        saves(recorder, group, 300)
-    saves(recorder, 0, 600)
-    recorder.handle(0, GroupCrashed("killed", ""))
-    recorder.handle(1, Progress(450))
-    recorder.handle(1, GroupCrashed("killed", ""))
-    assert steps_in(recorder.run.path / "checkpoint") == [300]
-
-
-def test_a_crash_leaves_a_seed_that_had_failed_before_its_reason(recorder):
-    recorder.handle(0, Failed(0, 130, "a reward is NaN", "", None))
-    recorder.handle(0, Progress(450))
-    recorder.handle(0, GroupCrashed("killed", ""))
-    assert recorder.failures == {0: "step 130: a reward is NaN"}
-
-
-def test_a_user_s_mistake_in_a_group_is_no_failure_of_its_seeds(recorder):
-    with pytest.raises(InputError, match="made for another csac"):
-        recorder.handle(0, Refused(InputError("made for another csac")))
-    assert not recorder.failures
-
-
-def test_a_worker_that_meets_a_user_s_mistake_says_so(tmp_path, monkeypatch):
-    def refuse(*_: Any) -> None:
-        raise Damaged("the checkpoint does not fit")
-
-    monkeypatch.setattr(scheduler_module, "Group", refuse)
-    for of_a_process_of_its_own in ("die_with_parent", "move_to"):
-        monkeypatch.setattr(scheduler_module, of_a_process_of_its_own, lambda *_: None)
-    settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
-    ours, theirs = multiprocessing.Pipe()
-    with ours, theirs:
-        ours.send([0])  # the cores of its first turn
-        scheduler_module._work(theirs, settings, [0])
-        message = ours.recv()
-    assert isinstance(message, Refused)
-    assert isinstance(message.error, Damaged)
-    assert str(message.error) == "the checkpoint does not fit"
-
-
-class DeadWorker:
-    """A worker that was killed in the middle of a message."""
-
-    def __init__(self) -> None:
-        self.connection = self.process = self
-        self.exitcode, self.pid, self.step, self.cores, self.over = -9, 4711, 250, None, False
-
-    def recv(self) -> None:
-        raise OSError("got end of file during message")
-
-    def cause_of_death(self) -> str:
-        return "its process was killed by SIGKILL"
-
-
-@pytest.mark.parametrize(("stopping", "before", "kind"), [(True, set(), Ended), (True, {0}, GroupCrashed)])
-def test_a_worker_that_dies_while_a_run_stops_is_no_failure_unless_it_died_before(tmp_path, stopping, before, kind):
-    scheduler: Any = object.__new__(_Scheduler)
-    scheduler.stopping, scheduler.restarted, scheduler.checkpoints = stopping, before, Checkpoints(tmp_path, 2)
-    scheduler.settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
-    worker: Any = DeadWorker()
-    scheduler.waiting = [worker]
-    assert type(scheduler._receive(0, worker)) is kind
-    assert worker.over
-    assert not scheduler.waiting
-
-
-def test_a_worker_that_dies_while_it_waits_for_its_turn_gives_its_place_to_the_next(tmp_path, monkeypatch):
-    """With more groups than cores most of them wait; whoever is dead is handed no cores."""
-    told: list[Any] = []
-    monkeypatch.setattr(scheduler_module, "_Worker", lambda settings, seeds: told.append((settings, seeds)) or "next")
-    scheduler: Any = object.__new__(_Scheduler)
-    scheduler.stopping, scheduler.restarted, scheduler.checkpoints = False, set(), Checkpoints(tmp_path, 2)
-    scheduler.settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
-    scheduler.settings = scheduler.settings._replace(begin=0, has_other_task=True)
-    other: Any = object()
-    worker: Any = DeadWorker()
-    scheduler.workers, scheduler.waiting, worker.seeds = [other, worker], [worker, other], (1,)
-    scheduler.checkpoints.commit(300, {}, {"failures": {}})
-    assert scheduler._receive(1, worker) == GroupRestarted("its process was killed by SIGKILL", 300)
-    assert scheduler.waiting == [other, "next"]
-    assert scheduler.workers == [other, "next"]
-    # What it goes on from was made on the task of this run, whatever the run began with.
-    ((settings, seeds),) = told
-    assert (settings.begin, settings.has_other_task, seeds) == (300, False, (1,))
-
-
-def test_a_group_that_merely_stopped_makes_no_checkpoint_whole(recorder):
-    saves(recorder, 0, 300)
-    recorder.handle(1, Ended(0, {}))
-    assert not steps_in(recorder.run.path / "checkpoint")
 
 
 # What the documentation shows.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections import deque
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,9 +13,11 @@ import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
 from resuming import SMALL, run
 
-from csac.algorithms import SAC
+from csac.algorithms import CSAC, SAC
 from csac.training import scheduler as scheduler_module
-from csac.training.messages import Boundary, Ended, Saved
+from csac.training.checkpoint import Checkpoints, Damaged
+from csac.training.messages import Boundary, Ended, GroupCrashed, GroupRestarted, Refused, Saved
+from csac.training.scheduler import _Scheduler
 
 
 @pytest.mark.parametrize(("quota", "groups", "processes"), [(None, 20, 3), (1, 4, 0), (4, 16, 1)])
@@ -98,3 +101,70 @@ def test_what_is_left_of_several_groups_keeps_its_number_of_cores(tmp_path, monk
     settings = settings._replace(plan=replace(settings.plan, groups=((0,), (1,))))
     told = [message for _, message in scheduler_module.run_groups(settings, [[0]], lambda: False)]
     assert (told[-1], workers.cores) == (Ended(250, {}), [[0]])
+
+
+# Workers that cannot go on.
+
+
+def test_a_worker_that_meets_a_user_s_mistake_says_so(tmp_path, monkeypatch):
+    def refuse(*_: Any) -> None:
+        raise Damaged("the checkpoint does not fit")
+
+    monkeypatch.setattr(scheduler_module, "Group", refuse)
+    for of_a_process_of_its_own in ("die_with_parent", "move_to"):
+        monkeypatch.setattr(scheduler_module, of_a_process_of_its_own, lambda *_: None)
+    settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
+    ours, theirs = multiprocessing.Pipe()
+    with ours, theirs:
+        ours.send([0])  # the cores of its first turn
+        scheduler_module._work(theirs, settings, [0])
+        message = ours.recv()
+    assert isinstance(message, Refused)
+    assert isinstance(message.error, Damaged)
+    assert str(message.error) == "the checkpoint does not fit"
+
+
+class DeadWorker:
+    """A worker that was killed in the middle of a message."""
+
+    def __init__(self) -> None:
+        self.connection = self.process = self
+        self.exitcode, self.pid, self.step, self.cores, self.over = -9, 4711, 250, None, False
+
+    def recv(self) -> None:
+        raise OSError("got end of file during message")
+
+    def cause_of_death(self) -> str:
+        return "its process was killed by SIGKILL"
+
+
+@pytest.mark.parametrize(("stopping", "before", "kind"), [(True, set(), Ended), (True, {0}, GroupCrashed)])
+def test_a_worker_that_dies_while_a_run_stops_is_no_failure_unless_it_died_before(tmp_path, stopping, before, kind):
+    scheduler: Any = object.__new__(_Scheduler)
+    scheduler.stopping, scheduler.restarted, scheduler.checkpoints = stopping, before, Checkpoints(tmp_path, 2)
+    scheduler.settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
+    worker: Any = DeadWorker()
+    scheduler.waiting = [worker]
+    assert type(scheduler._receive(0, worker)) is kind
+    assert worker.over
+    assert not scheduler.waiting
+
+
+def test_a_worker_that_dies_while_it_waits_for_its_turn_gives_its_place_to_the_next(tmp_path, monkeypatch):
+    """With more groups than cores most of them wait; whoever is dead is handed no cores."""
+    told: list[Any] = []
+    monkeypatch.setattr(scheduler_module, "_Worker", lambda settings, seeds: told.append((settings, seeds)) or "next")
+    scheduler: Any = object.__new__(_Scheduler)
+    scheduler.stopping, scheduler.restarted, scheduler.checkpoints = False, set(), Checkpoints(tmp_path, 2)
+    scheduler.settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
+    scheduler.settings = scheduler.settings._replace(begin=0, has_other_task=True)
+    other: Any = object()
+    worker: Any = DeadWorker()
+    scheduler.workers, scheduler.waiting, worker.seeds = [other, worker], [worker, other], (1,)
+    scheduler.checkpoints.commit(300, {}, {"failures": {}})
+    assert scheduler._receive(1, worker) == GroupRestarted("its process was killed by SIGKILL", 300)
+    assert scheduler.waiting == [other, "next"]
+    assert scheduler.workers == [other, "next"]
+    # What it goes on from was made on the task of this run, whatever the run began with.
+    ((settings, seeds),) = told
+    assert (settings.begin, settings.has_other_task, seeds) == (300, False, (1,))

@@ -1,0 +1,103 @@
+"""What the recorder makes of groups that fail: which steps become checkpoints, and what is told of each seed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from csac.record.manifest import Manifest
+from csac.record.run import RunDirectory
+from csac.training.checkpoint import Checkpoint, Checkpoints, steps_in
+from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Refused, Rows, Saved
+from csac.training.recorder import Recorder
+from csac.training.seed_files import SeedFiles
+from csac.types import InputError, Ring, Snapshot
+
+
+@pytest.fixture
+def recorder(tmp_path):
+    manifest = Manifest(task="t", algorithm="a", seeds=(0, 1), steps=900)
+    run = RunDirectory.create(tmp_path / "run", manifest)
+    return Recorder(run, [[0], [1]], None, (), Checkpoints(tmp_path / "run" / "checkpoint", 2))
+
+
+def saves(recorder: Recorder, group: int, step: int) -> None:
+    """Let a group make an episode 10 steps before `step`, reach it and save there."""
+    episode = {"seed": group, "step": step - 10, "return": 1.0, "length": 5}
+    recorder.handle(group, Rows("episodes", [episode]))
+    place, ring = recorder.run.path / "checkpoint", Ring(np.zeros((9, 3), np.float32), step)
+    recorder.handle(group, Saved(step, SeedFiles(place, group, {}).write(step, Snapshot({}, {}), ring), {}))
+
+
+def rows_in(recorder: Recorder, step: int) -> list[int]:
+    """The steps of the episodes that a checkpoint counts on."""
+    content = Checkpoint.open(recorder.run.path / "checkpoint", step).read(f"step_{step}.episodes.csv")
+    lines = content.decode().splitlines()[1:]
+    return [int(line.split(",")[1]) for line in lines]
+
+
+def test_a_checkpoint_counts_on_no_later_row_though_a_group_was_started_again(recorder):
+    for group in (0, 1):
+        saves(recorder, group, 300)
+    saves(recorder, 1, 600)
+    recorder.handle(1, Progress(750))
+    recorder.handle(1, GroupRestarted("killed", 300))
+    saves(recorder, 0, 600)
+    assert steps_in(recorder.run.path / "checkpoint") == [300]  # else the one that group 1 begins with could go
+    saves(recorder, 0, 900)
+    saves(recorder, 1, 600)
+    assert rows_in(recorder, 600) == [290, 290, 590, 590]
+    saves(recorder, 1, 900)
+    assert rows_in(recorder, 900) == [290, 290, 590, 590, 890, 890]
+
+
+def test_the_last_checkpoint_comes_though_the_slower_group_crashed(recorder):
+    for group in (0, 1):
+        saves(recorder, group, 300)
+    for step in (600, 900):
+        saves(recorder, 0, step)
+    recorder.handle(0, Ended(900, {}))
+    recorder.handle(1, Progress(450))
+    recorder.handle(1, GroupCrashed("killed", ""))
+    place = recorder.run.path / "checkpoint"
+    assert steps_in(place) == [300, 600, 900]  # 300 is pinned: seed 1 was still sound
+    assert rows_in(recorder, 600) == [290, 290, 590]
+    assert list(Checkpoint.open(place, 900).values["failures"]) == ["1"]
+
+
+def test_the_last_checkpoint_comes_though_every_seed_of_the_slower_group_failed(recorder):
+    for group in (0, 1):
+        saves(recorder, group, 300)
+    saves(recorder, 0, 600)
+    recorder.handle(1, Failed(1, 450, "a reward is NaN", "", None))
+    recorder.handle(1, Ended(450, {}))
+    assert steps_in(recorder.run.path / "checkpoint") == [300, 600]
+
+
+def test_a_step_by_which_every_seed_had_failed_is_no_checkpoint(recorder):
+    for group in (0, 1):
+        saves(recorder, group, 300)
+    saves(recorder, 0, 600)
+    recorder.handle(0, GroupCrashed("killed", ""))
+    recorder.handle(1, Progress(450))
+    recorder.handle(1, GroupCrashed("killed", ""))
+    assert steps_in(recorder.run.path / "checkpoint") == [300]
+
+
+def test_a_crash_leaves_a_seed_that_had_failed_before_its_reason(recorder):
+    recorder.handle(0, Failed(0, 130, "a reward is NaN", "", None))
+    recorder.handle(0, Progress(450))
+    recorder.handle(0, GroupCrashed("killed", ""))
+    assert recorder.failures == {0: "step 130: a reward is NaN"}
+
+
+def test_a_user_s_mistake_in_a_group_is_no_failure_of_its_seeds(recorder):
+    with pytest.raises(InputError, match="made for another csac"):
+        recorder.handle(0, Refused(InputError("made for another csac")))
+    assert not recorder.failures
+
+
+def test_a_group_that_merely_stopped_makes_no_checkpoint_whole(recorder):
+    saves(recorder, 0, 300)
+    recorder.handle(1, Ended(0, {}))
+    assert not steps_in(recorder.run.path / "checkpoint")
