@@ -27,7 +27,7 @@ def commands(page: Path) -> list[list[str]]:
 
 
 # The tables that evidence.py writes, by the folders of their pages.
-EVIDENCE = {"reference": ["stage-0", "stage-0-fresh"], "strong": ["primary", "whose"]}
+EVIDENCE = {"reference": ["stage-0", "stage-0-fresh"], "strong": ["primary", "whose", "stage-1"]}
 WITH_COMMANDS = [page for page in PAGES if commands(page)]
 
 
@@ -134,3 +134,12 @@ def test_the_table_of_kills_follows_from_its_rows():
 
 def _value(text: str) -> Any:
     return int(text) if text.lstrip("-").isdecimal() else text or None
+
+
+@pytest.mark.parametrize("document", ["README.md", "results/reference/README.md", "results/strong/README.md"])
+def test_what_documents_tell_of_the_default_on_fresh_seeds_stands_in_its_table(document):
+    table = (ROOT / "results" / "strong" / "README.md").read_text().partition("<!-- stage-1: begin -->")[2]
+    probability = re.search(r"^\| CSAC, paper \| SAC, automatic \| (.*?) \|", table, re.MULTILINE)
+    assert probability is not None
+    told = re.sub(r"<!-- (\S+): begin -->.*?<!-- \1: end -->", "", (ROOT / document).read_text(), flags=re.DOTALL)
+    assert probability[1] in told
