@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
+import shutil
+import time
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -32,6 +34,10 @@ Which = Literal["last", "best"]
 
 LOCK = ".lock"
 MANIFEST = "manifest.json"
+
+# Whoever looks whether a lock is held (`is_locked`) holds it for an instant: that is waited for.
+_LOOKS = 20
+_SECONDS_OF_A_LOOK = 0.01
 
 
 class StorageFailure(RuntimeError):
@@ -93,6 +99,10 @@ class RunDirectory:
             raise InputError(f"cannot read {path / MANIFEST}: {error.strerror}; check its permissions") from None
         except InputError as error:
             raise InputError(f"{path / MANIFEST} is broken: {error}; restore it or train again") from None
+
+    def discard(self) -> None:
+        """Remove the directory with all that is in it."""
+        shutil.rmtree(self.path)
 
     def read_again(self) -> None:
         """Take the manifest as it is on disk now. Raises InputError where it is gone or broken."""
@@ -176,7 +186,7 @@ class RunDirectory:
         with self._open_lock() as file:
             if fcntl:
                 try:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    _take(file)
                 except BlockingIOError:
                     file.seek(0)
                     holder = file.read().strip() or "unknown"
@@ -198,6 +208,16 @@ class RunDirectory:
 
     def _table(self, name: Table) -> Path:
         return self.path / f"{name}.csv"
+
+
+def _take(file: TextIO) -> None:
+    """Take a file's lock. Raises BlockingIOError where another process has it, and keeps it."""
+    assert fcntl
+    for _ in range(_LOOKS):
+        with suppress(BlockingIOError):
+            return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        time.sleep(_SECONDS_OF_A_LOOK)
+    return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def now() -> str:

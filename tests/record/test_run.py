@@ -252,6 +252,17 @@ def test_a_file_system_without_locks_is_refused_in_a_line(run, monkeypatch):
         pass
 
 
+@pytest.mark.skipif(record.fcntl is None, reason="a system with locks")
+def test_a_look_whether_a_run_is_locked_keeps_nobody_from_locking_it(run, monkeypatch):
+    """It holds the lock for an instant, as `is_locked` does; training was refused then."""
+    (run.path / record.LOCK).touch()
+    with open(run.path / record.LOCK) as look:
+        record.fcntl.flock(look, record.fcntl.LOCK_SH)
+        monkeypatch.setattr(record.time, "sleep", lambda _: look.close())
+        with run.locked():
+            assert record.is_locked(run.path / record.LOCK)
+
+
 @pytest.fixture
 def noon(tmp_path, monkeypatch):
     """One and the same second, in an empty folder."""
