@@ -60,6 +60,7 @@ def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
     lines = result.stderr.strip().splitlines()
     assert "InputError: this script starts processes that import it" in lines[-1]
     assert sum(line.startswith("Traceback") for line in lines) == 1
+    assert not (tmp_path / "run").exists()  # once mended, the script begins there
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux moves threads")

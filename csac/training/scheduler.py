@@ -76,17 +76,19 @@ def run_groups(
     groups: Sequence[Sequence[int]],
     should_stop: Callable[[], bool],
     checkpoints: Checkpoints | None = None,
+    is_urgent: Callable[[], bool] = lambda: True,
 ) -> Generator[tuple[int, Message], None, None]:
     """Train every group and yield (group, what happened) as it comes. A single group is trained in this process.
 
     One that is left of several, since the others had failed, has its own as before: the last bits depend on its cores.
 
     All groups are saved at the same steps. Whoever takes the messages commits to `checkpoints`; here it is only read.
+    `is_urgent` says whether a stop is a signal's, after which a process that dies is not replaced.
     """
     if len(groups) == 1 and len(settings.plan.groups) <= 1:
         yield from ((0, message) for message in _run_here(settings, groups[0], should_stop))
         return
-    scheduler = _Scheduler(settings, groups, should_stop, checkpoints)
+    scheduler = _Scheduler(settings, groups, should_stop, checkpoints, is_urgent)
     try:
         yield from scheduler.run()
     finally:
@@ -156,8 +158,10 @@ class _Scheduler:
         groups: Sequence[Sequence[int]],
         should_stop: Callable[[], bool],
         checkpoints: Checkpoints | None,
+        is_urgent: Callable[[], bool],
     ) -> None:
         self.settings, self.should_stop, self.checkpoints = settings, should_stop, checkpoints
+        self.is_urgent = is_urgent
         self.workers: list[_Worker] = []
         try:
             for seeds in groups:
@@ -220,7 +224,7 @@ class _Scheduler:
         self.waiting = [other for other in self.waiting if other is not worker]
         if self.settings.checkpoints:
             remove_unfinished(self.settings.checkpoints, worker.process.pid)
-        if self.stopping and self.checkpoints and index not in self.restarted:
+        if self.stopping and self.is_urgent() and self.checkpoints and index not in self.restarted:
             worker.over = True  # and no failure: the run goes on from the last step at which all were saved
             return Ended(worker.step, {})
         if index in self.restarted or not self.checkpoints:

@@ -16,7 +16,7 @@ from csac.record.run import RunDirectory
 from csac.record.wandb import WandbLog, import_wandb, logs_to_wandb
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.tasks.trust import refuse_untrusted
-from csac.training.checkpoint import Checkpoints
+from csac.training.checkpoint import Checkpoints, steps_in
 from csac.training.compilation import tidy_programs
 from csac.training.footprint import memory_needed
 from csac.training.interruptions import Interrupted, callers_own, caught_signals, storage_failures_told
@@ -135,7 +135,12 @@ def train(
             return _go_on(run, plan, made, wanted, notes, watchers)
         if before.existing:
             return _go_on(run, plan, run.manifest, wanted, notes, watchers)
-        return _run(run, plan, notes, watchers, BEGINNING)
+        try:
+            return _run(run, plan, notes, watchers, BEGINNING)
+        except InputError:  # such as a script without a guard: once mended, it begins in the same directory
+            if not len(run.evaluations) and not steps_in(run.checkpoints):
+                run.discard()
+            raise
 
 
 def resume(
@@ -271,7 +276,7 @@ def _follow(
     for log in logs:
         recorder.tell(log.write({}))
     try:
-        with closing(run_groups(settings, groups, stop.is_set, checkpoints)) as told:
+        with closing(run_groups(settings, groups, stop.is_set, checkpoints, lambda: bool(received))) as told:
             for group, message in told:
                 recorder.handle(group, message)
                 if watchers.tell(recorder.evaluated):

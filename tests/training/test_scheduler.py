@@ -87,7 +87,7 @@ def test_a_slow_run_stops_where_all_groups_were_saved(tmp_path, monkeypatch):
     """The clock asked for a checkpoint while the run stopped, at a step that the faster group had left behind."""
     SlowWorkers(monkeypatch, seconds=700.0)
     settings = plans.settings(SAC(), "Hopper-v4", 100_000, tmp_path, checkpoint_interval=50_000)
-    scheduler: Any = scheduler_module._Scheduler(settings, [[0], [1]], lambda: True, None)
+    scheduler: Any = scheduler_module._Scheduler(settings, [[0], [1]], lambda: True, None, lambda: True)
     scheduler.workers[0].step = scheduler.workers[0].made = 1_250  # as far ahead as a group may be
     told = [(group, message) for group, message in scheduler.run()]
     assert {(group, message.step) for group, message in told if isinstance(message, Saved)} == {(0, 1_250), (1, 1_250)}
@@ -142,12 +142,31 @@ class DeadWorker:
 def test_a_worker_that_dies_while_a_run_stops_is_no_failure_unless_it_died_before(tmp_path, stopping, before, kind):
     scheduler: Any = object.__new__(_Scheduler)
     scheduler.stopping, scheduler.restarted, scheduler.checkpoints = stopping, before, Checkpoints(tmp_path, 2)
+    scheduler.is_urgent = lambda: True
     scheduler.settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
     worker: Any = DeadWorker()
     scheduler.waiting = [worker]
     assert type(scheduler._receive(0, worker)) is kind
     assert worker.over
     assert not scheduler.waiting
+
+
+def test_a_worker_that_dies_while_a_run_ends_that_has_enough_is_replaced(tmp_path):
+    """It ended as finished with one seed behind the other, and without a checkpoint of its last step."""
+
+    def enough(step: int, _: Any) -> bool:
+        if step == 200:
+            multiprocessing.active_children()[0].kill()
+        return step == 200
+
+    settings: dict[str, Any] = {"seeds": 2, "groups": 2, "evaluation_interval": 100, "checkpoint_interval": 100}
+    finished = run(tmp_path / "run", SAC(**SMALL), 2_000, "Pendulum-v1", stop_when=enough, **settings)
+    manifest, rows = finished.manifest, finished.evaluations
+    assert (manifest.state, manifest.failures) == ("finished", {})
+    assert 200 <= manifest.steps_done < 2_000
+    assert Checkpoints(finished.checkpoints, 2).newest == manifest.steps_done
+    last = [rows["step"][rows["seed"] == seed].max() for seed in (0, 1)]
+    assert last[0] == last[1] == manifest.steps_done // 100 * 100
 
 
 def test_a_worker_that_dies_while_it_waits_for_its_turn_gives_its_place_to_the_next(tmp_path, monkeypatch):
