@@ -311,7 +311,8 @@ def _refuse_occupied(directory: Path) -> None:
     if directory.exists() and not directory.is_dir():
         raise InputError(f"{directory} is a file; choose another directory")
     found = {path.name for path in directory.iterdir()} if directory.exists() else set()
-    if JOURNAL not in found and found - {".lock", "trials"}:  # which a process leaves that dies at once
+    # What a process leaves that dies at once, or has only just begun; Optuna locks its journal by a file beside it.
+    if JOURNAL not in found and found - {".lock", "trials", f"{JOURNAL}.lock"}:
         raise InputError(f"{directory} is not empty and holds no study; choose a new or an empty directory")
 
 

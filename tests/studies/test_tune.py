@@ -281,6 +281,17 @@ def test_a_trial_whose_process_died_is_taken_up_and_one_that_is_run_is_not(tmp_p
         attempt.lock.close()
 
 
+def test_a_study_that_another_process_begins_at_this_moment_is_no_stranger_s(tmp_path):
+    """Its lock of the journal is there before the journal."""
+    begun = tmp_path / "study"
+    (begun / "trials").mkdir(parents=True)
+    (begun / ".lock").touch()
+    (begun / "journal.log.lock").touch()
+    attempt = SharedStudy(begun, question()).next(1)
+    assert attempt is not None
+    attempt.lock.close()
+
+
 def test_a_trial_that_could_not_begin_leaves_the_configuration_that_the_search_begins_with(tmp_path):
     study = SharedStudy(tmp_path / "study", question())
     for _ in range(2):
