@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import io
 import json
 import os
@@ -16,6 +15,7 @@ import tyro
 from tyro.conf import DisallowNone, FlagCreatePairsOff, Positional
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from csac.checks import did_you_mean
 from csac.synonyms import called_here
 from csac.types import InputError
 
@@ -114,9 +114,8 @@ def json_object(option: str, text: str) -> dict[str, Any]:
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return "; did you mean ...?" with what resembles `word` most, or nothing."""
-    names = list(known)
-    matches = [word.lower()] if word.lower() in names else difflib.get_close_matches(word, names, n=2)
-    return f"; did you mean {' or '.join(matches)}?" if matches else ""
+    hint = did_you_mean(word, known, most=2)
+    return f"; {hint}" if hint else ""
 
 
 def _numbers() -> ConstructorRegistry:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -29,6 +30,14 @@ def check_arguments(name: str, value: object) -> None:
     """Raise InputError for what is neither None nor keyword arguments."""
     if value is not None and not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
         raise InputError(f"{name} are keyword arguments such as {{'g': 9.0}}, not {value!r:.40}")
+
+
+def did_you_mean(word: str, known: Iterable[str], most: int = 1) -> str:
+    """Return "did you mean ...?" with what resembles `word` most, in whatever case, or nothing."""
+    names = {name.lower(): name for name in known}
+    exact = [word.lower()] if word.lower() in names else []
+    matches = exact or difflib.get_close_matches(word.lower(), names, n=most)
+    return f"did you mean {' or '.join(names[match] for match in matches)}?" if matches else ""
 
 
 def _least(least: int) -> str:

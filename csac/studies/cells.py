@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import hashlib
 import json
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_type_hints
 
 from csac.algorithms import ALGORITHMS
+from csac.checks import did_you_mean
 from csac.console.tables import short
 from csac.record.atomic import write_atomically
 from csac.record.run import LOCK, MANIFEST, RunDirectory, is_locked, is_run
@@ -215,8 +215,8 @@ def complete(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
 def similar(word: str, known: Iterable[str]) -> str:
     """Return what resembles `word` most, or else all there is, as the end of a sentence."""
     known = list(known)
-    matches = difflib.get_close_matches(word, known, n=1)
-    return f"; did you mean {matches[0]}?" if matches else f": there is {', '.join(known)}"
+    hint = did_you_mean(word, known)
+    return f"; {hint}" if hint else f": there is {', '.join(known)}"
 
 
 def is_in_use(path: Path) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import logging
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 
 import gymnasium
 
+from csac.checks import did_you_mean
 from csac.tasks import known
 from csac.tasks.silence import quietly
 from csac.tasks.spaces import RAISED, message, one_line
@@ -73,10 +73,8 @@ def registered(task: str) -> str:
     ids = sorted({*known.ADAPTERS, *(id for id, spec in gymnasium.registry.items() if not _is_gone(spec))})
     family = name.rpartition("-v")[0] or name
     versions = [id for id in ids if id.rpartition("-v")[0] == family]
-    lower = {id.lower(): id for id in ids}
-    nearest = versions or [lower[match] for match in difflib.get_close_matches(name.lower(), lower)]
-    hint = f"did you mean {' or '.join(nearest)}?" if nearest else "write module:Id for one that a module registers"
-    raise InputError(f"no task is called {task}: {hint}")
+    others = f"did you mean {' or '.join(versions)}?" if versions else did_you_mean(name, ids, most=3)
+    raise InputError(f"no task is called {task}: {others or 'write module:Id for one that a module registers'}")
 
 
 def _is_gone(spec: Any) -> bool:

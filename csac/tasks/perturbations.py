@@ -6,7 +6,6 @@ first that differs, and an evaluation at step S still shows the task as it was.
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import math
 from collections.abc import Iterable
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from csac.checks import did_you_mean
 from csac.record.manifest import STEPS_LIMIT
 from csac.tasks.physics import NOISES, PHYSICS
 from csac.types import InputError
@@ -45,9 +45,8 @@ class Perturbation:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            similar = difflib.get_close_matches(str(self.kind), KINDS, n=1)
-            hint = f"did you mean {similar[0]}? " if similar else ""
-            raise InputError(f"no perturbation is called {self.kind!r}: {hint}there are {', '.join(KINDS)}")
+            hint = " ".join(filter(None, [did_you_mean(str(self.kind), KINDS), f"there are {', '.join(KINDS)}"]))
+            raise InputError(f"no perturbation is called {self.kind!r}: {hint}")
         is_number = isinstance(self.value, int | float | np.number) and not isinstance(self.value, bool)
         value = _as_float(self.value) if is_number else math.nan
         shown = str(value) if math.isinf(value) else repr(self.value)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
-from csac.checks import check_whole
+from csac.checks import check_whole, did_you_mean
 from csac.record.manifest import SEED_LIMIT, STEPS_LIMIT
 from csac.synonyms import called_here
 from csac.types import InputError
@@ -109,5 +108,5 @@ def _hint(name: str) -> str:
     flag, *known = ("--" + option.replace("_", "-") for option in (name, *PlanOptions.__annotations__))
     if words := called_here(flag, known):
         return ": " + re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), words)
-    similar = difflib.get_close_matches(name, PlanOptions.__annotations__, n=1)
-    return f": did you mean {similar[0]}?" if similar else ""
+    similar = did_you_mean(name, PlanOptions.__annotations__)
+    return f": {similar}" if similar else ""
