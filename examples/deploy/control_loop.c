@@ -63,6 +63,7 @@ int main(void)
         } else
             clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
     }
+    /* Actuators keep the last action until somebody tells them another: on a robot, command here what is safe for it. */
     fprintf(stderr, "%ld steps at %g Hz, %ld of them too late\n", steps, (double)CSAC_CONTROL_RATE_HZ, missed);
     return 0;
 }

@@ -57,6 +57,7 @@ def main() -> None:
         else:
             missed += 1
             due -= wait  # go on from here: steps that are late are not made up for by steps that are early
+    # Actuators keep the last action until somebody tells them another: on a robot, command here what is safe for it.
     print(f"{steps} steps at {rate:g} Hz, {missed} of them too late", file=sys.stderr)
 
 
