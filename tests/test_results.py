@@ -136,10 +136,23 @@ def _value(text: str) -> Any:
     return int(text) if text.lstrip("-").isdecimal() else text or None
 
 
-@pytest.mark.parametrize("document", ["README.md", "results/reference/README.md", "results/strong/README.md"])
-def test_what_documents_tell_of_the_default_on_fresh_seeds_stands_in_its_table(document):
-    table = (ROOT / "results" / "strong" / "README.md").read_text().partition("<!-- stage-1: begin -->")[2]
-    probability = re.search(r"^\| CSAC, paper \| SAC, automatic \| (.*?) \|", table, re.MULTILINE)
+@pytest.mark.parametrize(
+    ("mark", "pair", "documents"),
+    [
+        ("stage-1", "CSAC, paper | SAC, automatic", ["README.md", "results/reference/README.md"]),
+        ("aims", "CSAC, candidate | SAC, automatic", ["README.md", "docs/algorithms/critics.md"]),
+        ("aims", "CSAC, candidate | **SAC, candidate**", ["README.md", "docs/algorithms/critics.md"]),
+        ("aims", "SAC, candidate | SAC, automatic", ["docs/algorithms/critics.md"]),
+    ],
+)
+def test_what_documents_tell_of_a_comparison_stands_in_its_table(mark, pair, documents):
+    table = (ROOT / "results" / "strong" / "README.md").read_text().partition(f"<!-- {mark}: begin -->")[2]
+    probability = re.search(rf"^\| {re.escape(pair)} \| (.*?) \|", table, re.MULTILINE)
     assert probability is not None
-    told = re.sub(r"<!-- (\S+): begin -->.*?<!-- \1: end -->", "", (ROOT / document).read_text(), flags=re.DOTALL)
-    assert probability[1] in told
+    for document in [*documents, "results/strong/README.md"]:
+        assert probability[1] in _prose(document)
+
+
+def _prose(document: str) -> str:
+    """Return a document without what commands have written into it."""
+    return re.sub(r"<!-- (\S+): begin -->.*?<!-- \1: end -->", "", (ROOT / document).read_text(), flags=re.DOTALL)

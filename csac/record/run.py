@@ -101,8 +101,8 @@ class RunDirectory:
             raise InputError(f"{path / MANIFEST} is broken: {error}; restore it or train again") from None
 
     def discard(self) -> None:
-        """Remove the directory with all that is in it."""
-        shutil.rmtree(self.path)
+        """Remove the directory with all that is in it, as far as that can be."""
+        shutil.rmtree(self.path, ignore_errors=True)
 
     def read_again(self) -> None:
         """Take the manifest as it is on disk now. Raises InputError where it is gone or broken."""

@@ -255,13 +255,17 @@ class _Scheduler:
         living = [worker for worker in self.workers if not worker.over]
         if any(worker.step == self.settings.plan.steps for worker in self.workers):
             self.target = self.settings.plan.steps  # one has made all its steps, and the others are close behind
-        elif not self.settings.saves or any(worker.is_starting for worker in living):
+        elif not self.settings.saves or (self._is_in_haste() and any(worker.is_starting for worker in living)):
             self.target = -1  # a group that is still starting would keep the others waiting
         else:
             self.target = max(self._end_of_turn(worker) for worker in living)
         waiting, self.waiting = self.waiting, []
         for worker in waiting:
             self._next(worker)
+
+    def _is_in_haste(self) -> bool:
+        """Whether nobody waits for one that is behind: not where a run ends that has enough, and is to end whole."""
+        return not self.stopping or self.is_urgent()
 
     def _is_awaited(self) -> bool:
         """Whether a group has saved at the target and another has not: moved, that checkpoint would never be whole."""

@@ -169,6 +169,24 @@ def test_a_worker_that_dies_while_a_run_ends_that_has_enough_is_replaced(tmp_pat
     assert last[0] == last[1] == manifest.steps_done // 100 * 100
 
 
+@pytest.mark.parametrize(("urgent", "target"), [(True, -1), (False, 250)])
+def test_a_run_that_has_enough_waits_for_a_group_that_is_starting_and_a_signal_does_not(tmp_path, urgent, target):
+    """It died and began anew just before the run had enough: not waited for, it ended behind the others, unsaved."""
+    scheduler: Any = object.__new__(_Scheduler)
+    scheduler.settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
+    ahead, starting = (
+        SimpleNamespace(step=step, saved=100, is_starting=step == 100, cores=None, over=False, told=[])
+        for step in (250, 100)
+    )
+    ahead.tell, starting.tell = ahead.told.append, starting.told.append
+    scheduler.workers, scheduler.waiting = [ahead, starting], [ahead, starting]
+    scheduler.stopping, scheduler.is_urgent, scheduler.timer = True, lambda: urgent, scheduler_module._Timer()
+    scheduler._set_target()
+    assert scheduler.target == target
+    assert ahead.told == (["stop"] if urgent else ["save"])
+    assert scheduler.waiting == ([] if urgent else [starting])
+
+
 def test_a_worker_that_dies_while_it_waits_for_its_turn_gives_its_place_to_the_next(tmp_path, monkeypatch):
     """With more groups than cores most of them wait; whoever is dead is handed no cores."""
     told: list[Any] = []
