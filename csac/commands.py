@@ -282,11 +282,12 @@ class Runs:
 class Report:
     """Put runs side by side: curves, returns, intervals, what perturbations cost, cases, hyperparameters, commands.
 
-    Runs that differ in their seeds alone are one arm. A file of rows, as evaluations.csv has them, counts as a run.
+    Runs that differ in their seeds alone are one arm. What counts as a run too: each cell that csac study run --results
+    has collected, and a file of rows as evaluations.csv has them.
     """
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="(or --label)")] = ()
-    """Run directories, or directories that hold some."""
+    """Run directories, or directories that hold some, or the collected cells of a study."""
     label: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=DIR,...")] = ()
     """More runs, which together are an arm of this name on each task."""
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE@STEP")] = ()

@@ -92,7 +92,7 @@ class Results:
     def record(self, cell: Cell) -> Record | None:
         """Return what a cell has given, or None where it was not collected."""
         path = self._files.get(cell.key)
-        return self._of_longer(cell) if path is None else _read(path)
+        return self._of_longer(cell) if path is None else read_collected(path)
 
     def _of_longer(self, cell: Cell) -> Record | None:
         """Return the beginning of a longer run, which has no policy of that time to test, and not how long it took."""
@@ -100,7 +100,7 @@ class Results:
             return None
         for steps, path in sorted(self._of_any_length.get(_whatever_its_length(cell), {}).items()):
             if steps > cell.steps and cell.steps % cell.evaluation_interval == 0:
-                whole = _read(path)
+                whole = read_collected(path)
                 begun = dataclasses.replace(whole.manifest, steps=cell.steps, steps_done=cell.steps)
                 rows = whole.evaluations[whole.evaluations["step"] <= cell.steps]
                 if not whole.failure:
@@ -132,25 +132,40 @@ def collect(store: Store, cell: Cell, directory: str | Path) -> None:
     header = (",".join(COLUMNS["evaluations"]) + "\n").encode()
     write_atomically(path.with_suffix(".csv"), table.read_bytes() if table.exists() else header)
     if (source / ROLLOUTS).exists():
-        write_atomically(_rollouts(path), (source / ROLLOUTS).read_bytes())
+        write_atomically(rollouts_of(path), (source / ROLLOUTS).read_bytes())
     manifest = dataclasses.replace(record.manifest, machine=dataclasses.replace(record.manifest.machine, host=""))
     fields = json.loads(manifests.written(dataclasses.replace(manifest, process=None, history=())))
     fields |= {"seconds": record.seconds, "interrupted": record.interrupted}
     write_atomically(path, (json.dumps(fields, indent=1) + "\n").encode())
 
 
-def _read(path: Path) -> Record:
-    content = path.read_bytes()
-    tables, told = (read_rows(path.with_suffix(".csv")), _rows(_rollouts(path))), json.loads(content)
-    return Record(manifests.read(content), told.get("seconds", 0.0), *tables, told.get("interrupted"))
+def find_collected(directory: str | Path) -> list[Path]:
+    """Return the manifests of the cells that were collected in this directory and below it."""
+    return sorted(Path(directory).rglob("seed-*.json"))
+
+
+def read_collected(path: Path) -> Record:
+    """Return what a cell has given whose manifest was collected at this path.
+
+    Raises:
+        InputError: it is no cell's, or its tables are missing or damaged.
+    """
+    try:
+        content = path.read_bytes()
+        manifest, told = manifests.read(content), json.loads(content)
+    except (InputError, OSError) as error:
+        raise InputError(f"{path} is not a cell's: {error}") from None
+    tables = read_rows(path.with_suffix(".csv")), _rows(rollouts_of(path))
+    return Record(manifest, told.get("seconds", 0.0), *tables, told.get("interrupted"))
+
+
+def rollouts_of(path: Path) -> Path:
+    """Return where the fresh episodes of the cell are whose manifest was collected at this path, if there are any."""
+    return path.with_name(f"{path.stem}.{ROLLOUTS}")
 
 
 def _whatever_its_length(cell: Cell) -> str:
     return dataclasses.replace(cell, steps=0).key
-
-
-def _rollouts(path: Path) -> Path:
-    return path.with_name(f"{path.stem}.{ROLLOUTS}")
 
 
 def _rows(path: Path) -> np.ndarray | None:

@@ -1,6 +1,7 @@
 """`csac report`: any runs side by side, as a page and in Markdown, or as one table of a page that is there already.
 
-A run is a run directory, or a file of rows as evaluations.csv has them, of which nothing else is known.
+A run is a run directory, a cell that a study has collected (`seed-<k>.json` and its tables), or a file of rows as
+evaluations.csv has them, of which nothing else is known.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from csac.studies.aggregates import over_tasks
 from csac.studies.arms import Arm, Time, by_condition, with_rows
 from csac.studies.figures import tells_of_success
 from csac.studies.parts import Heading, Items, Paragraph, write
+from csac.studies.results import find_collected, read_collected, rollouts_of
 from csac.studies.sections import Scope, described, marks_of, plain, report_looks
 from csac.studies.standing import wall_times
 from csac.tasks.perturbations import perturbations_of
@@ -48,6 +50,10 @@ class Given(NamedTuple):
     path: Path
     rows: np.ndarray
     manifest: Manifest | None
+    rollouts: Path | None = None
+    """Where its fresh episodes are, if there are any."""
+    times: tuple[Time, ...] = ()
+    """How long it took, as far as that is known."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +112,7 @@ class Comparison:
             arm.tests += self._tests(run, rows, failed)
             if run.manifest:
                 arm.manifests.append(run.manifest)
-                arm.times += _times(run.path, run.manifest)
+                arm.times += run.times
         if manifests:
             arm.algorithm, arm.hyperparameters = manifests[0].algorithm, _merged([_settings(one) for one in manifests])
         return arm
@@ -118,8 +124,8 @@ class Comparison:
         """
         one = run.manifest
         is_beyond = one is not None and self.until is not None and one.steps_done > self.until
-        if one and not is_beyond and (run.path / ROLLOUTS).exists():
-            rows = read_rows(run.path / ROLLOUTS)
+        if run.rollouts and not is_beyond and run.rollouts.exists():
+            rows = read_rows(run.rollouts)
             rows = rows[~np.isin(rows["seed"], list(failed))]
         return [last_rows(rows)] if case_names([rows]) else []
 
@@ -303,7 +309,7 @@ def _hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def _read(path: Path, label: str | None, on_damaged: Callable[[InputError], None] | None) -> list[Given]:
-    """Return the run at this path, or those below it. Raises InputError where there is none."""
+    """Return the run at this path, or those below it, or else the collected cells. Raises InputError without any."""
     if path.name == "evaluations.csv" and is_run(path.parent):
         path = path.parent
     if path.suffix == ".csv":
@@ -311,8 +317,20 @@ def _read(path: Path, label: str | None, on_damaged: Callable[[InputError], None
         check_ends(path)
         return [Given(label, path, rows, None)]
     runs = [] if is_run(path) or not path.is_dir() else find_runs(path, on_damaged)
-    found = runs or [RunDirectory.open(path)]
-    return [Given(label, run.path, run.evaluations, run.manifest) for run in found]
+    if not runs and not is_run(path) and (collected := find_collected(path)):
+        return [_given_cell(label, manifest) for manifest in collected]
+    return [_given_run(label, run) for run in runs or [RunDirectory.open(path)]]
+
+
+def _given_run(label: str | None, run: RunDirectory) -> Given:
+    return Given(label, run.path, run.evaluations, run.manifest, run.path / ROLLOUTS, _times(run.path, run.manifest))
+
+
+def _given_cell(label: str | None, path: Path) -> Given:
+    cell = read_collected(path)
+    one = cell.manifest
+    took = (Time(cell.seconds, one.steps, tuple(one.seeds), cell.interrupted),) if cell.seconds else ()
+    return Given(label, path.with_suffix(".csv"), cell.evaluations, one, rollouts_of(path), took)
 
 
 def _key(run: Given) -> str:
@@ -377,12 +395,12 @@ def _seeds(runs: Sequence[Given]) -> set[int]:
     return {int(seed) for run in runs for seed in np.unique(run.rows["seed"])}
 
 
-def _times(path: Path, manifest: Manifest) -> list[Time]:
+def _times(path: Path, manifest: Manifest) -> tuple[Time, ...]:
     """Return how long a run took that was never interrupted, by its manifest and the last line of its log."""
     if manifest.history or manifest.state != "finished":
-        return []
+        return ()
     with suppress(OSError, ValueError, IndexError):
         last = (path / "log.txt").read_text(encoding="utf-8").splitlines()[-1]
         took = datetime.fromisoformat(last.split(" ")[0]) - datetime.fromisoformat(manifest.created)
-        return [Time(took.total_seconds(), manifest.steps_done, tuple(manifest.seeds), interrupted=False)]
-    return []
+        return (Time(took.total_seconds(), manifest.steps_done, tuple(manifest.seeds), interrupted=False),)
+    return ()

@@ -9,6 +9,7 @@ import pytest
 from made import make_run_of
 
 from csac.cli import main
+from csac.record import manifest as manifests
 from csac.record.manifest import EvaluationPlan
 from csac.studies.run_report import _times
 
@@ -120,6 +121,54 @@ def test_the_curves_of_one_task_are_a_picture():
     assert csac("report --curve curve.png --title T --label a=a.csv --perturb friction=2@10") == 0
     assert Path("curve.png").stat().st_size > 10_000
     assert sorted(path.name for path in Path().iterdir()) == ["a.csv", "curve.png"]
+
+
+def collected(place, returns, rollouts="", **changes):
+    """Cells as `csac study run --results` collects them: `returns` [seed][point]."""
+    for seed, line in enumerate(returns):
+        run = make_run_of(f"made/{place}/{seed}", [line], seeds=(seed,), **changes)
+        path = Path(place, f"seed-{seed}.json")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(manifests.written(run.manifest))
+        path.with_suffix(".csv").write_bytes((run.path / "evaluations.csv").read_bytes())
+        if rollouts:
+            path.with_name(f"seed-{seed}.rollouts.csv").write_text(f"{ROWS},crash\n" + rollouts.format(seed=seed))
+    shutil.rmtree("made")
+
+
+def test_collected_cells_are_the_runs_that_they_were():
+    collected("cells/Hopper-v4/sac", [[10.0, 20.0], [30.0, 40.0]])
+    collected("cells/Ant-v4/sac", [[5.0, 5.0]], task="Ant-v4")
+    # (10 + 20) / 2 = 15 and (30 + 40) / 2 = 35
+    assert table_of("--label it=cells/Hopper-v4/sac")[2].startswith("| it | 2 | 20 | 25 ± 14 |")
+    text = report("cells")
+    assert "| cells/Hopper-v4/sac/seed-1.csv | Hopper-v4 | sac | 1 | 100 | finished |" in text
+    assert "| cells/Ant-v4/sac/seed-0.csv | Ant-v4 | sac | 0 | 100 | finished |" in text
+    assert "| SAC | 2 | 20 | 25 ± 14 |" in text
+
+
+def test_the_rollouts_of_collected_cells_are_counted():
+    collected("cells", [[10.0], [20.0]], rollouts="{seed},10,0,50,5,,1\n{seed},10,1,50,5,,0\n")
+    assert table_of("--table cases --label it=cells")[-1] == "| crash | 500.0 ± 0.0 |"
+
+
+def test_a_run_directory_goes_before_what_lies_beside_it(capsys):
+    collected("both/cells", [[10.0]])
+    make_run_of("both/run", [[99.0]])
+    assert table_of("--label it=both")[2].startswith("| it | 1 | 10 | 99 |")
+    Path("empty").mkdir()
+    assert csac("report empty") == 2
+    assert "empty holds no run" in capsys.readouterr().err
+
+
+def test_damaged_cells_are_told_by_their_file(capsys):
+    collected("cells", [[10.0]])
+    Path("cells/seed-0.csv").unlink()
+    assert csac("report cells") == 2
+    assert "cannot read cells/seed-0.csv" in capsys.readouterr().err
+    Path("cells/seed-0.json").write_text("{}")
+    assert csac("report cells") == 2
+    assert "cells/seed-0.json is not a cell's" in capsys.readouterr().err
 
 
 # A report of runs.
