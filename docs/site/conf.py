@@ -36,6 +36,7 @@ autodoc_default_options = {"members": True}
 NAVIGATION = {
     "Use": [
         "docs/python",
+        "docs/from-stable-baselines3",
         "docs/tasks",
         "docs/perturbations",
         "docs/studies",
