@@ -30,13 +30,13 @@ usage: csac COMMAND ...
 Train controllers for continuous-control tasks with Conservative Soft Actor-Critic.
 
   csac train TASK      train controllers for a Gymnasium task, several seeds at once
-  csac resume DIR      go on with a run that was stopped or killed
+  csac resume DIR      resume a run that was stopped or killed
   csac evaluate DIR    test the policies of a run on fresh episodes
-  csac play DIR        watch the policy of a run, or write a video of it
-  csac export DIR      take a policy out of a run: NumPy, ONNX or C, verified
-  csac latency PATH    measure how long an exported policy takes for an action
+  csac play DIR        watch the policy of a run, or record a video
+  csac export DIR      export a policy as NumPy, ONNX or C, and verify it
+  csac latency PATH    measure how long an exported policy takes per action
   csac runs [DIR]      list the runs below a directory
-  csac report DIR...   put runs side by side: a page of curves, tables and commands
+  csac report DIR...   compare runs: a page of curves, tables and commands
   csac study COMMAND   run the paper's experiments, or your own
   csac tune TASK       search for good hyperparameters
 

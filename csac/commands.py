@@ -23,44 +23,44 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Train(Options):
-    """Train controllers for a task: independent seeds, each evaluated as it learns.
+    """Train controllers for a task: independent seeds, each evaluated at regular intervals.
 
-    Exit codes: 0 done, 2 wrong arguments, 3 a seed failed, 130 or 143 stopped by a signal (what was learnt is saved).
+    Exit codes: 0 done, 2 wrong arguments, 3 a seed failed, 130 or 143 stopped by a signal (the run is saved).
     """
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """A Gymnasium id such as HalfCheetah-v4, or module:Id for an environment that a module registers."""
     algorithm: str = "csac"
-    """What learns; its own options are listed below."""
+    """The algorithm; its own options are listed below."""
     preset: str | None = None
-    """Start from: paper (its tables), strong (critics that learn faster; CSAC, SAC). Options given here win over it."""
+    """paper: the paper's hyperparameters. strong: critics that learn faster (CSAC, SAC). Options given here win."""
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/TASK/ALGORITHM/DATE-TIME)")] = None
-    """The run's own directory, new or empty."""
+    """The run directory; it must be new or empty."""
     resume: FlagCreatePairsOff[bool] = False
-    """Go on with the run in --directory, if there is one already."""
+    """Resume the run in --directory if there is one, else start it."""
     start_from: Annotated[str | None, arg(name="from", metavar="DIR[@STEP]", help_behavior_hint="(default: none)")] = (
         None
     )
-    """Begin with a copy of that run's checkpoint; what is learnt and how it is evaluated are as there, if not given."""
+    """Start from a copy of another run's checkpoint; whatever is not given here stays as it was there."""
     events: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: the task's own)")] = None
-    """More names in the info of an evaluation episode's last step: each becomes a column and a curve of its own."""
+    """Names to record from the info of an evaluation episode's last step: each becomes a column and a curve."""
     env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
     """Keyword arguments for the environment, as a JSON object."""
     perturb: Annotated[
         UseAppendAction[tuple[str, ...]],
         arg(
             metavar="KIND=VALUE[@STEP]",
-            help="Change the task after STEP environment steps, as friction=1.5@300000 does: factors on friction, "
-            "gravity, mass or gain of a MuJoCo task, standard deviations of observation_noise or action_noise. With "
-            "--from, none leaves out what that run had planned.",
+            help="Change the task after STEP environment steps, for example friction=1.5@300000. Kinds: factors on "
+            "friction, gravity, mass or gain of a MuJoCo task; standard deviations of observation_noise or "
+            "action_noise. With --from, none drops what that run had planned.",
         ),
     ] = ()
-    groups: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
+    groups: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
     """Processes to split the seeds over."""
-    evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
-    """Processes in which each group evaluates while it trains on; 0 evaluates in line. The results are the same."""
+    evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
+    """Processes that evaluate while their group trains on; 0 evaluates in between. The results are the same."""
     wandb: FlagCreatePairsOff[bool] = False
-    """Log to Weights & Biases too: a run for each seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
+    """Also log to Weights & Biases: one run per seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
 
     def plan_options(self) -> PlanOptions:
         """Return the options of `train` that are given here."""
@@ -78,12 +78,12 @@ class Train(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class Tune(Options):
-    """Search for good hyperparameters: trials of short runs, chosen by TPE, hopeless ones stopped early (Optuna).
+    """Search for good hyperparameters with Optuna: short trials chosen by TPE, hopeless ones pruned.
 
-    A trial is judged by the mean over its seeds of each seed's mean return in its last three evaluations, on episodes
-    that no other run and no report uses. Hyperparameters that are given below stay as given; the others of the search
-    space are searched (docs/tuning.md). Any number of processes and machines that type the same line share the trials;
-    after Ctrl-C or a crash the same line goes on.
+    A trial's score is the mean over its seeds of their last three evaluations, on episodes that no other run and no
+    report uses. Hyperparameters given below are fixed; the rest of the search space is searched (docs/tuning.md). Any
+    number of processes and machines that run the same command share the trials; after Ctrl-C or a crash the same
+    command continues.
 
     Exit codes: 0 done, 2 wrong arguments, 3 no trial is complete, 130 or 143 stopped by a signal.
     """
@@ -91,11 +91,11 @@ class Tune(Options):
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """A Gymnasium id such as HalfCheetah-v4, or module:Id for an environment that a module registers."""
     algorithm: str = "csac"
-    """What learns; its own options are listed below: each that is given is not searched."""
+    """The algorithm; its own options are listed below, and those given are not searched."""
     preset: str | None = None
-    """Begin the search with: paper, the paper's tables; strong, critics that learn faster (CSAC, SAC)."""
+    """Start the search from: paper, the paper's hyperparameters; strong, critics that learn faster (CSAC, SAC)."""
     trials: int = 50
-    """How many trials the study is to have, those of other processes and of earlier calls included."""
+    """Number of trials in total, including those of other processes and earlier calls."""
     search: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: the whole search space)")] = (
         None
     )
@@ -103,14 +103,14 @@ class Tune(Options):
     steps: int = 100_000
     """Environment steps per seed of each trial, warm-up included."""
     seeds: int = 2
-    """How many independent seeds each trial has, the same for all."""
+    """Number of independent seeds in each trial, the same for all trials."""
     first_seed: int = 1_000
-    """Label of the first seed; the others follow. Report the result on other seeds."""
+    """Label of the first seed; the others are numbered from it. Report results on other seeds."""
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/tune/TASK/ALGORITHM)")] = None
-    """The study's own directory: new, empty, or that of the same search."""
+    """The directory of the search: new, empty, or of the same search."""
     env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
     """Keyword arguments for the environment, as a JSON object."""
-    groups: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
+    groups: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
     """Processes to split the seeds of a trial over."""
 
     def home(self) -> Path:
@@ -120,19 +120,19 @@ class Tune(Options):
 
 @dataclass(frozen=True)
 class Resume:
-    """Go on with a run from its newest checkpoint, as if it had never stopped."""
+    """Resume a run from its newest checkpoint, as if it had never stopped."""
 
     run: Annotated[Positional[Path], arg(metavar="DIR")]
     """The directory of a run."""
-    steps: Annotated[int | None, arg(help_behavior_hint="(default: as many as it was started for)")] = None
-    """Environment steps per seed in all, counted from the run's beginning; may be more than it was started for."""
+    steps: Annotated[int | None, arg(help_behavior_hint="(default: as the run was started)")] = None
+    """Total environment steps per seed, counted from the run's beginning; more than before extends the run."""
     trust_task: FlagCreatePairsOff[bool] = False
-    """Run the code of the module that the task names, though you have never named it here; look at it first."""
+    """Allow the task to import its module although you have never named it on this machine; read it first."""
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Test the last policies of a run on fresh episodes, which neither training nor its evaluations have seen."""
+    """Test the last policies of a run on fresh episodes that neither training nor its evaluations have used."""
 
     run: Annotated[Positional[Path], arg(metavar="DIR")]
     """The directory of a run."""
@@ -140,41 +140,41 @@ class Evaluate:
     """Label of the seed to test."""
     episodes: int = 10
     """Episodes per seed, the same for each."""
-    processes: Annotated[int | None, arg(help_behavior_hint="(default: as many as pay here)")] = None
-    """Processes that share the episodes; the numbers are the same with any number of them."""
+    processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
+    """Processes that share the episodes; the results do not depend on it."""
     stochastic: FlagCreatePairsOff[bool] = False
-    """Draw actions from the policy instead of taking its most likely one."""
+    """Sample actions from the policy instead of taking the deterministic one."""
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
-    """Change the task, as friction=2 does; the kinds are those of csac train."""
+    """Change the task, for example friction=2; the kinds are those of csac train."""
     csv: Annotated[Path | None, arg(metavar="FILE.csv")] = None
-    """Write a row for each episode there as well, as in evaluations.csv."""
+    """Also write one row per episode to this file, as in evaluations.csv."""
     trust_task: FlagCreatePairsOff[bool] = False
-    """Run the code of the module that the task names, though you have never named it here; look at it first."""
+    """Allow the task to import its module although you have never named it on this machine; read it first."""
 
 
 @dataclass(frozen=True)
 class Play:
-    """Watch the policy of a run in a window, or write a video of it."""
+    """Watch the policy of a run in a window, or record a video of it."""
 
     run: Annotated[Positional[Path], arg(metavar="DIR")]
     """The directory of a run."""
     seed: Annotated[int | None, arg(help_behavior_hint="(default: the one with the best last evaluations)")] = None
     """Label of the seed to watch."""
     episodes: int = 1
-    """How many episodes."""
+    """Number of episodes."""
     video: Annotated[Path | None, arg(metavar="OUT.mp4", help_behavior_hint="(default: a window)")] = None
-    """Write this file instead of opening a window; needs no display."""
+    """Record to this file instead of opening a window; no display is needed."""
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE")] = ()
-    """Change the task, as friction=2 does; the kinds are those of csac train."""
+    """Change the task, for example friction=2; the kinds are those of csac train."""
     trust_task: FlagCreatePairsOff[bool] = False
-    """Run the code of the module that the task names, though you have never named it here; look at it first."""
+    """Allow the task to import its module although you have never named it on this machine; read it first."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """Take a policy out of a run: from the raw observation to the environment's action, verified.
+    """Export a policy that maps the raw observation to the environment's action, and verify it.
 
-    Each artefact is a folder with the policy and contract.json, which says what goes in and what comes out.
+    Each artefact is a folder with the policy and contract.json, which describes its inputs and outputs.
     """
 
     run: Annotated[Positional[Path], arg(metavar="DIR")]
@@ -184,43 +184,43 @@ class Export:
     checkpoint: Literal["last", "best"] = "last"
     """The seed's last policy, or the one of its best evaluation."""
     format: Annotated[str, arg(metavar="numpy|onnx|c,...")] = "numpy"
-    """numpy: NumPy alone, with a loader beside it. onnx: a graph. c: a header in C99. Several with commas between."""
+    """numpy: needs only NumPy, with a loader beside it. onnx: a graph. c: one C99 header. Several: with commas."""
     out: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="(default: DIR/export/FORMAT)")] = None
-    """The artefact's folder; with several formats, the folder of their folders."""
+    """The artefact's folder; with several formats, their parent folder."""
     weights: Literal["float32", "float16", "int8"] = "float32"
-    """Numbers that the weights of a C artefact are kept in; the error that smaller ones make is stated."""
+    """Number format of the weights in C; the error of the smaller formats is reported."""
     stochastic: FlagCreatePairsOff[bool] = False
-    """Sample actions as in training. In ONNX the noise becomes a second input: a graph cannot be seeded."""
+    """Sample actions as in training. In ONNX the noise is a second input, because a graph cannot be seeded."""
     noise_seed: Annotated[int | None, arg(help_behavior_hint="(default: 0)")] = None
-    """Seed of the noise that --stochastic samples actions with."""
+    """Seed of the noise of --stochastic."""
     fallback: Annotated[str | None, arg(metavar="zero|middle|last|X,...", help_behavior_hint="(default: no guard)")] = (
         None
     )
-    """Guard against NaN and infinity in observations: the action to take instead."""
+    """Guard against NaN and infinity in observations: the action to take then."""
     observation_range: Annotated[
-        Literal["bounds", "recorded"] | None, arg(help_behavior_hint="(default: anything finite is good)")
+        Literal["bounds", "recorded"] | None, arg(help_behavior_hint="(default: any finite number is good)")
     ] = None
-    """Guard as well against what is out of the task's bounds, or of what the episodes of the export have shown."""
+    """Also guard against observations outside the task's bounds, or outside the range seen in the export's episodes."""
     range_margin: Annotated[float | None, arg(help_behavior_hint="(default: 0.5)")] = None
-    """How far beyond what was recorded is still good, as a share of its width."""
+    """How far beyond the recorded range is still good, as a share of its width."""
     watchdog: Annotated[int | None, arg(help_behavior_hint="(default: never)")] = None
-    """Keep to the fallback after so many bad observations in a row, until a reset."""
+    """After this many bad observations in a row, stay with the fallback until a reset."""
     rate_limit: Annotated[
         float | None,
         arg(
-            help="The most that an action may change from one step to the next, as a share of its range; the fallback "
-            "is then the last action, unless another is given.",
+            help="Largest change of an action from one step to the next, as a share of its range; the fallback is "
+            "then the last action, unless another is given.",
             help_behavior_hint="(default: no limit)",
         ),
     ] = None
     episodes: int = 10
-    """Episodes to verify with, those of csac evaluate."""
+    """Episodes to verify with, the same as those of csac evaluate."""
     no_rollouts: FlagCreatePairsOff[bool] = False
-    """Play no episodes, where the task cannot be made here."""
+    """Run no episodes, for example if the task cannot be made on this machine."""
     card: FlagCreatePairsOff[bool] = False
-    """Write a model card beside it, README.md."""
+    """Also write a model card, README.md."""
     trust_task: FlagCreatePairsOff[bool] = False
-    """Run the code of the module that the task names, though you have never named it here; look at it first."""
+    """Allow the task to import its module although you have never named it on this machine; read it first."""
 
     def options(self) -> ExportOptions:
         """Return how the policy is to leave its run."""
@@ -253,21 +253,21 @@ class Export:
 
 @dataclass(frozen=True)
 class Latency:
-    """Measure how long artefacts take for one action, flat out and at a fixed rate, call by call.
+    """Measure how long artefacts take per action, call by call: as fast as possible and at a fixed rate.
 
-    An artefact in C is timed inside of a compiled program, the others around their call in Python.
+    A C artefact is timed inside a compiled program, the others around their call in Python.
     """
 
     artefacts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ARTEFACT...", help_behavior_hint="(required)")]
-    """Folders that csac export has written."""
+    """Folders written by csac export."""
     calls: int = 100_000
-    """Calls one after the other."""
+    """Number of calls made one after the other."""
     rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: the task's, or 100)")] = None
-    """Calls a second, when they are made at a rate."""
+    """Calls per second of the measurement at a fixed rate."""
     seconds: float = 10.0
-    """How long they are made at the rate; 0 leaves that out."""
+    """Length of the measurement at a fixed rate; 0 skips it."""
     plot: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="(default: none)")] = None
-    """Draw how many calls take how long, and how late they begin."""
+    """Draw the distributions of call times and of lateness."""
 
 
 @dataclass(frozen=True)
@@ -280,32 +280,32 @@ class Runs:
 
 @dataclass(frozen=True)
 class Report:
-    """Put runs side by side: curves, returns, intervals, what perturbations cost, cases, hyperparameters, commands.
+    """Compare runs: curves, returns, intervals, effects of perturbations, cases, hyperparameters, commands.
 
-    Runs that differ in their seeds alone are one arm. What counts as a run too: each cell that csac study run --results
-    has collected, and a file of rows as evaluations.csv has them.
+    Runs that differ only in their seeds are merged into one arm. A cell collected by csac study run --results counts as
+    a run, and so does a CSV file with the rows of an evaluations.csv.
     """
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="(or --label)")] = ()
-    """Run directories, or directories that hold some, or the collected cells of a study."""
+    """Run directories, directories that contain some, or the collected cells of a study."""
     label: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=DIR,...")] = ()
-    """More runs, which together are an arm of this name on each task."""
+    """More runs, merged into an arm of this name on each task."""
     perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE@STEP")] = ()
-    """What changed in these runs, where files of rows do not tell it."""
+    """The perturbation of these runs, which a CSV file alone does not record."""
     until: Annotated[int | None, arg(help_behavior_hint="(default: the end)")] = None
-    """Leave out evaluations after this step, and fresh rollouts of policies that have learnt for longer."""
+    """Ignore evaluations after this step, and rollouts of policies trained for longer."""
     title: Annotated[str | None, arg(help_behavior_hint="(default: the task)")] = None
-    """Of the report, or of the picture."""
+    """Title of the report, or of the figure."""
     out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="(default: runs/reports/DATE-TIME/)")] = (
         None
     )
-    """Where the report goes (in a directory: report.html); the same in Markdown and its figures go beside it."""
+    """Where to write the report (in a directory: report.html); a Markdown version and the figures go beside it."""
     into: Annotated[str | None, arg(metavar="FILE.md#NAME", help_behavior_hint="(default: none)")] = None
-    """In place of a report, write one table into a page, between <!-- NAME: begin --> and <!-- NAME: end -->."""
+    """Instead of a report, write one table into a page, between <!-- NAME: begin --> and <!-- NAME: end -->."""
     table: Literal["returns", "recovery", "cases"] = "returns"
     """The table for --into."""
     curve: Annotated[Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")] = None
-    """In place of a report, draw the learning curves there."""
+    """Instead of a report, draw the learning curves to this file."""
 
     def labels(self) -> list[tuple[str, list[Path]]]:
         """Return the labels, each with its runs. Raises InputError for one that is not written NAME=DIR,..."""

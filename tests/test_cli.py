@@ -463,10 +463,10 @@ def test_the_help_of_train_explains_every_hyperparameter(capsys, monkeypatch, na
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        ("train", "gravity, mass or gain of a MuJoCo task, standard deviations of observation_noise or action_noise."),
+        ("train", "mass or gain of a MuJoCo task; standard deviations of observation_noise or action_noise."),
         ("export", "as a share of its range; the fallback is then the last action, unless another is given."),
-        ("study run", "as there are workers. ray: as many as a Ray cluster has room for (docs/cluster.md)."),
-        ("study run", "a small manifest of each cell that is over there: what a report needs. What was copied there"),
+        ("study run", "one cell per worker at a time. ray: as many as a Ray cluster has room for (docs/cluster.md)."),
+        ("study run", "each finished cell to this directory: all that a report needs. Cells copied there"),
     ],
 )
 def test_a_long_explanation_breaks_off_nowhere(capsys, monkeypatch, command, words):

@@ -62,29 +62,29 @@ class CSAC:
     """Conservative Soft Actor-Critic (the paper's Algorithm 1)."""
 
     entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.2
-    """Weight of the entropy (the paper's sigma); `auto` holds the policy's entropy at its target, as SAC does."""
+    """Weight of the entropy (the paper's sigma); `auto` learns it, to keep the entropy at its target as SAC does."""
     relative_entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.5
     """Weight of the relative entropy towards the reference (the paper's tau); 0 is SAC, `auto` learns it."""
     reference_policy: ReferencePolicy = "algorithm1"
-    """The reference: the actor before the gradients or before the last update, a periodic copy, or an average."""
+    """The actor before this update's gradients, the actor one update ago, a periodic copy, or a running average."""
     reference_period: Annotated[int, COUNT] = 1000
-    """Updates between two copies of the actor, with `periodic`."""
+    """Updates between copies of the actor, with `periodic`."""
     reference_rate: Annotated[float, RATE] = 0.005
-    """Step of the running average towards the actor, with `average`."""
+    """Step size of the running average towards the actor, with `average`."""
     critic_reference: Literal["same", "earlier"] = "same"
-    """In the critic's target: the actor and its reference, or (CVI) that reference pi_k and the pi_{k-1} before it."""
+    """Policies in the critic's target: the actor and its reference, or (CVI) the reference pi_k and its predecessor."""
     relative_entropy_estimator: Literal["closed_form", "sampled"] = "sampled"
-    """The paper's log-ratio at the sampled action, or the exact KL of the two policies: 0 with `algorithm1`."""
+    """The paper's log-ratio at the sampled action, or the exact KL of the two policies (0 with `algorithm1`)."""
     relative_entropy_form: Literal["explicit", "actor_only", "implicit"] = "explicit"
-    """In the critic's target and the actor's loss; in the latter alone; or as tau log pi in the reward (Munchausen)."""
+    """In target and actor's loss, in the actor's loss alone, or as tau log pi in the reward (Munchausen)."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on each log-density and log-ratio of a whole action in the critic's target, in nats; 0 is none."""
+    """Bound on log-densities and log-ratios of an action in the critic's target, in nats; 0 is no bound."""
     target_entropy: float | None = None
     """Entropy that `auto` aims at, in nats; by default minus the number of action dimensions."""
     target_relative_entropy: Annotated[float, POSITIVE] = 0.01
-    """Relative entropy that `auto` lets a refresh of the reference come to, in nats per action dimension."""
+    """Relative entropy per refresh of the reference that `auto` aims at, in nats per action dimension."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
-    """Learning rate of the weights that are `auto`."""
+    """Learning rate of weights that are `auto`."""
     discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
     target_rate: Annotated[float, RATE] = 0.005
@@ -100,7 +100,7 @@ class CSAC:
     critic_normalisation: Normalisation = "none"
     """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
-    """Whether observations are brought to mean 0 and standard deviation 1 by running statistics."""
+    """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
     batch_size: Annotated[int, COUNT] = 256
     """Transitions in one update (the paper's M)."""
     replay_size: Annotated[int, COUNT] = 1_000_000
@@ -108,15 +108,15 @@ class CSAC:
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts (the paper's T_initial)."""
     policy_delay: Annotated[int, COUNT] = 1
-    """Updates of the critics for each update of the actor and of weights that are learnt (TD3's d)."""
+    """Critic updates per update of the actor and of learnt weights (TD3's d)."""
     updates_per_step: Annotated[int, COUNT] = 1
-    """Updates for each environment step."""
+    """Updates per environment step."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
+    """Environment steps between rounds of updates; 1 is strict order, larger is faster."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
-    """Share of its average gradient that the networks' Adam keeps at each update (its beta1)."""
+    """Decay of the average gradient in the networks' Adam (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on the global norm of each network's gradient, both critics counting as one; 0 leaves gradients alone."""
+    """Bound on the global norm of each network's gradient (both critics count as one); 0 is no bound."""
 
     name: ClassVar[str] = "csac"
 

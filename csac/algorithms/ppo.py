@@ -55,39 +55,39 @@ class PPO:
     """Proximal Policy Optimisation."""
 
     learning_rate: Annotated[float, POSITIVE] = 3e-4
-    """Learning rate of the one optimiser, at the start or throughout."""
+    """Learning rate, initial or constant."""
     learning_rate_schedule: Literal["linear", "constant"] = "linear"
-    """Whether the learning rate falls linearly to zero over the run or stays as it starts."""
+    """Whether the learning rate falls linearly to zero over the run or stays constant."""
     discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
     trace_decay: Annotated[float, SHARE] = 0.95
     """How far an advantage looks past the critic: 0 one step, 1 to the end of the episode (GAE's lambda)."""
     clip_range: Annotated[float, POSITIVE] = 0.2
-    """How far the probability ratio may leave 1 before its gradient stops (epsilon)."""
+    """Distance of the probability ratio from 1 beyond which its gradient stops (epsilon)."""
     clip_value_loss: bool = True
-    """Whether a value earns nothing by moving further than `clip_range` from what it was: little for raw rewards."""
+    """Whether to clip the value loss where a value moves by more than `clip_range`, which is little for raw rewards."""
     value_loss_weight: Annotated[float, NOT_NEGATIVE] = 0.5
     """Weight of the value loss beside the policy's."""
     entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.0
     """Weight of the policy's entropy."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.5
-    """Bound on the norm of the gradient of all parameters together; 0 leaves gradients alone."""
+    """Bound on the norm of the gradient of all parameters together; 0 is no bound."""
     adam_epsilon: Annotated[float, POSITIVE] = 1e-5
     """Added to the root of Adam's second moment (its epsilon)."""
     rollout_steps: Annotated[int, COUNT] = 2048
-    """Environment steps from one update to the next, all of which it learns from."""
+    """Environment steps between updates, all of which are learnt from."""
     minibatches: Annotated[int, COUNT] = 32
-    """Parts into which each epoch divides the rollout; they must be equal."""
+    """Number of equal parts into which each epoch divides the rollout."""
     epochs: Annotated[int, COUNT] = 10
     """Passes over the rollout in one update."""
     normalise_advantages: bool = True
-    """Whether the advantages of each minibatch are brought to mean 0 and standard deviation 1."""
+    """Whether to normalise the advantages of each minibatch to mean 0 and standard deviation 1."""
     hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (64, 64)
     """Widths of the hidden layers, with tanh, of the actor and of the critic."""
     normalise_observations: bool = True
-    """Whether observations are brought to mean 0 and standard deviation 1 by running statistics."""
+    """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
     normalise_rewards: bool = True
-    """Whether rewards are divided by the running standard deviation of the discounted return."""
+    """Whether to divide rewards by the running standard deviation of the discounted return."""
     normalisation_limit: Annotated[float, POSITIVE] = 10.0
     """Bound on the magnitude of normalised observations and rewards."""
 

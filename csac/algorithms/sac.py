@@ -44,9 +44,9 @@ class SAC:
     """Soft Actor-Critic."""
 
     temperature: Literal["automatic", "fixed"] = "automatic"
-    """Whether the entropy's weight is learnt, to hold the policy's entropy at its target, or stays as it starts."""
+    """`automatic` learns the weight of the entropy, to keep the entropy at its target; `fixed` keeps it as given."""
     entropy_weight: Annotated[float, NOT_NEGATIVE] = 1.0
-    """Weight of the entropy, to begin with or throughout (SAC's alpha, the paper's sigma)."""
+    """Weight of the entropy, initial or fixed (SAC's alpha, the paper's sigma)."""
     target_entropy: float | None = None
     """Entropy that the automatic temperature aims at, in nats; by default minus the number of action dimensions."""
     discount: Annotated[float, DISCOUNT] = 0.99
@@ -66,7 +66,7 @@ class SAC:
     critic_normalisation: Normalisation = "none"
     """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
-    """Whether observations are brought to mean 0 and standard deviation 1 by running statistics."""
+    """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
     batch_size: Annotated[int, COUNT] = 256
     """Transitions in one update."""
     replay_size: Annotated[int, COUNT] = 1_000_000
@@ -74,15 +74,15 @@ class SAC:
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts."""
     policy_delay: Annotated[int, COUNT] = 1
-    """Updates of the critics for each update of the actor and of weights that are learnt (TD3's d)."""
+    """Critic updates per update of the actor and of learnt weights (TD3's d)."""
     updates_per_step: Annotated[int, COUNT] = 1
-    """Updates for each environment step."""
+    """Updates per environment step."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
+    """Environment steps between rounds of updates; 1 is strict order, larger is faster."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
-    """Share of its average gradient that the networks' Adam keeps at each update (its beta1)."""
+    """Decay of the average gradient in the networks' Adam (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on the global norm of each network's gradient, both critics counting as one; 0 leaves gradients alone."""
+    """Bound on the global norm of each network's gradient (both critics count as one); 0 is no bound."""
 
     name: ClassVar[str] = "sac"
 

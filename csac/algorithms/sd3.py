@@ -46,13 +46,13 @@ class SD3:
     """Softmax Deep Double Deterministic policy gradients (its Algorithm 1)."""
 
     inverse_temperature: Annotated[float, NOT_NEGATIVE] = 0.05
-    """How far the value of a state leans to its best sampled action (the paper's beta): 0 is the mean."""
+    """How strongly the value of a state leans to its best sampled actions (the paper's beta); 0 is the mean."""
     noise_samples: Annotated[int, COUNT] = 50
-    """Actions sampled around the target actor's to value a state (the paper's K)."""
+    """Actions sampled around the target actor's action to value a state (the paper's K)."""
     importance_sampling: bool = False
     """Whether to divide each sample's weight by its density (as the paper derives it); its authors' code does not."""
     exploration_noise: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Standard deviation of the noise on the actions that explore."""
+    """Standard deviation of the exploration noise."""
     target_noise: Annotated[float, NOT_NEGATIVE] = 0.2
     """Standard deviation of the noise on the target actors' actions (the paper's sigma)."""
     target_noise_clip: Annotated[float, NOT_NEGATIVE] = 0.5
@@ -76,11 +76,11 @@ class SD3:
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts."""
     updates_per_step: Annotated[int, COUNT] = 1
-    """Updates for each environment step."""
+    """Updates per environment step."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
+    """Environment steps between rounds of updates; 1 is strict order, larger is faster."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on the global norm of each network's gradient; 0 leaves gradients alone."""
+    """Bound on the global norm of each network's gradient; 0 is no bound."""
 
     name: ClassVar[str] = "sd3"
 

@@ -46,13 +46,13 @@ class TD3:
     """Twin Delayed DDPG (its Algorithm 1)."""
 
     exploration_noise: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Standard deviation of the noise on the actions that explore (the paper's sigma)."""
+    """Standard deviation of the exploration noise (the paper's sigma)."""
     target_noise: Annotated[float, NOT_NEGATIVE] = 0.2
     """Standard deviation of the noise on the target actor's actions (the paper's sigma tilde)."""
     target_noise_clip: Annotated[float, NOT_NEGATIVE] = 0.5
     """Bound on that noise (the paper's c)."""
     policy_delay: Annotated[int, COUNT] = 2
-    """Updates of the critics for each update of the actor and of the targets (the paper's d)."""
+    """Critic updates per update of the actor and of the targets (the paper's d)."""
     discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
     target_rate: Annotated[float, RATE] = 0.005
@@ -68,7 +68,7 @@ class TD3:
     critic_normalisation: Normalisation = "none"
     """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
-    """Whether observations are brought to mean 0 and standard deviation 1 by running statistics."""
+    """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
     batch_size: Annotated[int, COUNT] = 256
     """Transitions in one update."""
     replay_size: Annotated[int, COUNT] = 1_000_000
@@ -76,13 +76,13 @@ class TD3:
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts."""
     updates_per_step: Annotated[int, COUNT] = 1
-    """Updates for each environment step."""
+    """Updates per environment step."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps after which their updates are made, all at once; 1 is strict order, more is faster."""
+    """Environment steps between rounds of updates; 1 is strict order, larger is faster."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
-    """Share of its average gradient that Adam keeps at each update (its beta1)."""
+    """Decay of the average gradient in Adam (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on the global norm of each network's gradient, both critics counting as one; 0 leaves gradients alone."""
+    """Bound on the global norm of each network's gradient (both critics count as one); 0 is no bound."""
 
     name: ClassVar[str] = "td3"
 

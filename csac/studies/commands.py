@@ -45,10 +45,10 @@ usage: csac study COMMAND ...
 
 The paper's experiments, and your own, as studies: tasks x methods x seeds, one run for each, shared among studies.
 
-  csac study list           the studies that there are
-  csac study show NAME      the cells of one, how far they are, and what the rest will take
-  csac study run NAME       run what is not complete yet; Ctrl-C at any time, and run it again
-  csac study report NAME    claims, tables and figures of what is complete
+  csac study list           list the studies
+  csac study show NAME      show a study's cells, their progress, and how long the rest will take
+  csac study run NAME       run what is not complete yet; stop it with Ctrl-C and run it again at any time
+  csac study report NAME    report claims, tables and figures of what is complete
 
   csac study COMMAND --help  explain a command and its options
 
@@ -75,15 +75,15 @@ class Chosen:
     name: Annotated[Positional[str], arg(metavar="NAME")]
     """One of csac study list, or a TOML file."""
     scale: float = 1.0
-    """Shorten every run to this share of its steps; all that comes of it says so."""
+    """Shorten every run to this share of its steps; all output says so."""
     tasks: Annotated[str | None, arg(metavar="ID,...", help_behavior_hint="(default: all)")] = None
     """Only these tasks."""
     algorithms: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: all)")] = None
     """Only these algorithms or methods."""
-    seeds: Annotated[int | None, arg(help_behavior_hint="(default: as the study has)")] = None
-    """How many seeds; more later reuse what is there."""
+    seeds: Annotated[int | None, arg(help_behavior_hint="(default: as in the study)")] = None
+    """Number of seeds; asking for more later reuses what is there."""
     directory: Path = HOME
-    """Where the runs of all cells are."""
+    """Directory of the runs of all cells."""
 
     def studies(self) -> list[Study]:
         """Return the studies that are meant."""
@@ -109,20 +109,20 @@ class List:
 
 @dataclass(frozen=True)
 class Show(Chosen):
-    """Show the cells of a study, how far they are, and what the rest will take on this machine.
+    """Show the cells of a study, their progress, and how long the rest will take on this machine.
 
-    A kind of cell that this machine has not run yet is measured first, for some seconds each, and remembered.
+    A kind of cell that this machine has not run yet is timed first, a few seconds each, and the result is remembered.
     """
 
     no_measure: FlagCreatePairsOff[bool] = False
-    """Do not measure how fast this machine is: tell only what was measured before."""
+    """Do not time anything; use only what was measured before."""
     results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
-    """Count as over what csac study run --results has collected there."""
+    """Count cells that csac study run --results has collected here as complete."""
 
 
 @dataclass(frozen=True)
 class Run(Chosen):
-    """Run every cell of a study that is not complete: partial ones go on, failed ones are listed and stop no other.
+    """Run every incomplete cell of a study: partial ones resume; failed ones are listed and do not stop the others.
 
     Exit codes: 0 done, 2 wrong arguments, 3 a cell failed, 130 or 143 stopped by a signal (every cell is saved).
     """
@@ -130,48 +130,48 @@ class Run(Chosen):
     engine: Annotated[
         Literal["local", "processes", "ray"] | None,
         arg(
-            help="local: one cell after another, in this process. processes: as many at once as there are workers. "
-            "ray: as many as a Ray cluster has room for (docs/cluster.md).",
-            help_behavior_hint="(default: processes, where there are cores)",
+            help="local: one cell after another, in this process. processes: one cell per worker at a time. ray: as "
+            "many as a Ray cluster has room for (docs/cluster.md).",
+            help_behavior_hint="(default: processes, if there are cores)",
         ),
     ] = None
-    workers: Annotated[int | None, arg(help_behavior_hint="(default: one for each core)")] = None
-    """Processes that run a cell each, on their own share of the cores."""
+    workers: Annotated[int | None, arg(help_behavior_hint="(default: one per core)")] = None
+    """Number of worker processes, each with its own share of the cores."""
     cell: Annotated[int | None, arg(help_behavior_hint="(default: all)")] = None
-    """Run the cell of this number alone, as csac study show counts them: one job of an array."""
+    """Run only the cell with this number in csac study show, for example as one job of an array."""
     address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: a new one, here)")] = None
-    """The Ray cluster, with --engine ray; auto is the one that this machine belongs to."""
+    """Address of the Ray cluster, with --engine ray; auto is the one this machine belongs to."""
     cell_cores: int = 1
-    """Cores that each cell asks Ray for."""
+    """Cores that each cell requests from Ray."""
     cell_gpus: float = 0.0
-    """GPUs, or a share of one, that each cell asks Ray for."""
+    """GPUs, or a share of one, that each cell requests from Ray."""
     cell_memory: float = 0.0
-    """GiB of memory that each cell asks Ray for; 0 asks for none in particular."""
+    """GiB of memory that each cell requests from Ray; 0 requests none in particular."""
     device: Literal["cpu", "gpu"] = "cpu"
-    """Where the networks learn."""
+    """Device that the networks are trained on."""
     results: Annotated[
         Path | None,
         arg(
             metavar="DIR",
-            help="Copy the evaluations and a small manifest of each cell that is over there: what a report needs. What "
-            "was copied there before, on this machine or another, is not run again, nor what is the beginning of it.",
+            help="Copy the evaluations and a small manifest of each finished cell to this directory: all that a report "
+            "needs. Cells copied there before, on any machine, are not run again, nor are beginnings of longer ones.",
             help_behavior_hint="(default: none)",
         ),
     ] = None
     wandb: FlagCreatePairsOff[bool] = False
-    """Log to Weights & Biases too: a run for each cell, in the project WANDB_PROJECT or else csac (docs/python.md)."""
+    """Also log to Weights & Biases: one run per cell, in the project WANDB_PROJECT or else csac (docs/python.md)."""
     keep_checkpoints: FlagCreatePairsOff[bool] = False
-    """Keep the checkpoints of finished cells too: they hold the replay, and take most of the room."""
+    """Keep the checkpoints of finished cells too; they contain the replay and take most of the space."""
 
 
 @dataclass(frozen=True)
 class Report(Chosen):
-    """Write a report of a study: the paper's claims, its numbers beside those measured, figures, commands."""
+    """Write a report of a study: the paper's claims, its numbers next to those measured, figures, commands."""
 
     results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the runs themselves)")] = None
-    """Make it from the files that csac study run --results has collected, and from nothing else."""
+    """Use only the files that csac study run --results has collected here."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: below runs/studies/reports)")] = None
-    """Where report.html, report.md and the figures go; with --results beside them by default."""
+    """Directory for report.html, report.md and the figures; with --results, by default in that directory."""
 
 
 def narrowed(

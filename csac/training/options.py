@@ -33,19 +33,19 @@ class Options:
     steps: int = 1_000_000
     """Environment steps per seed, warm-up included."""
     seeds: int = 1
-    """How many independent seeds to train."""
+    """Number of independent seeds to train."""
     first_seed: int = 0
-    """Label of the first seed; the others follow."""
+    """Label of the first seed; the others are numbered from it."""
     device: Literal["cpu", "gpu"] = "cpu"
-    """Where the networks learn."""
+    """Device that the networks are trained on."""
     evaluation_interval: int = 5_000
-    """Environment steps between two evaluations; there is one at the last step as well."""
+    """Environment steps between evaluations; there is always one at the last step."""
     evaluation_episodes: int = 10
-    """Episodes of each evaluation."""
+    """Episodes per evaluation."""
     checkpoint_interval: int = 50_000
-    """Environment steps between checkpoints; there is one every ten minutes and at the end as well. 0 makes none."""
+    """Environment steps between checkpoints; there is also one every ten minutes and at the end. 0: none at all."""
     keep_checkpoints: int = 2
-    """How many of the newest checkpoints to keep; 0 keeps all."""
+    """Number of newest checkpoints to keep; 0 keeps all."""
 
     def __post_init__(self) -> None:
         if self.device not in ("cpu", "gpu"):

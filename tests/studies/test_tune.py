@@ -589,7 +589,7 @@ def test_without_optuna_one_line_says_what_to_install(monkeypatch, capsys, tmp_p
 def test_the_help_says_what_a_trial_is_judged_by(capsys):
     assert csac("tune --help") == 0
     text = " ".join(re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
-    assert "the mean over its seeds of each seed's mean return in its last three evaluations" in text
+    assert "score is the mean over its seeds of their last three evaluations" in text
 
 
 @pytest.mark.slow
