@@ -71,7 +71,7 @@ def parse(
         with suppress(BrokenPipeError, SystemExit):
             run()
         raise HelpShown
-    if mistake := _mistake(arguments, command):
+    if mistake := _mistake(arguments, command) or _stranger(arguments, command, elsewhere):
         raise InputError(f"{mistake} ({program} --help)")
     complaint = io.StringIO()
     try:
@@ -79,7 +79,9 @@ def parse(
         with _wide_terminal(), redirect_stderr(complaint), redirect_stdout(io.StringIO()):
             parsed, unknown = run(return_unknown_args=True)
     except SystemExit:
-        raise InputError(f"{_one_line(complaint.getvalue())} ({program} --help)") from None
+        told = _one_line(complaint.getvalue())
+        told += _swallowed(arguments) if told.endswith(" is missing") else ""
+        raise InputError(f"{told} ({program} --help)") from None
     if unknown:
         raise InputError(f"{_unknown(unknown[0], command, elsewhere)} ({program} --help)")
     return parsed
@@ -187,10 +189,27 @@ def _mistake(arguments: list[str], command: type[Any]) -> str | None:
     return None
 
 
+def _swallowed(arguments: list[str]) -> str:
+    """Return which option took what a command misses, where one that takes several values stands before it."""
+    taken = re.search(r"(--[^\0]*hidden[-_]sizes)((?:\0[\d_]+)+)\0([^-\d\0][^\0]*)", "\0".join(arguments))
+    return f": {taken[1]} took {taken[3]}, so write it before the options" if taken else ""
+
+
+def _stranger(arguments: list[str], command: type[Any], elsewhere: Mapping[str, type[Any]]) -> str | None:
+    """Return what is wrong with the first option that there is not, which tyro tells last of all that is wrong."""
+    known = _options(command)
+    known |= {f"--no-{option[2:]}": "" for option, off in known.items() if off.startswith("--no-")}
+    for word in arguments:
+        option = word.partition("=")[0].replace("_", "-")
+        if re.match(r"--?[A-Za-z]", word) and option not in known and not re.fullmatch(r"-(inf|nan)", option):
+            return _unknown(word, command, elsewhere)
+    return None
+
+
 def _unknown(argument: str, command: type[Any], elsewhere: Mapping[str, type[Any]]) -> str:
     known = _options(command)
     if not argument.startswith("-"):
-        several = ": one task a run; several: csac study" if "--env-kwargs" in known else ""
+        several = "" if "--env-kwargs" not in known else ": one task a run; several: csac study"
         return f"there is no place for {argument!r}{several}"
     option = argument.partition("=")[0].replace("_", "-")
     for name, kind in elsewhere.items():

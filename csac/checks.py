@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -26,6 +27,12 @@ def check_callable(name: str, value: object) -> None:
         raise InputError(f"{name} is a function that is called, not {value!r:.40}")
 
 
+def check_path(name: str, value: object) -> None:
+    """Raise InputError for what names no file or directory."""
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"{name} is a path such as 'runs/first', not {value!r:.40}")
+
+
 def check_arguments(name: str, value: object) -> None:
     """Raise InputError for what is neither None nor keyword arguments."""
     if value is not None and not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
@@ -34,9 +41,11 @@ def check_arguments(name: str, value: object) -> None:
 
 def did_you_mean(word: str, known: Iterable[str], most: int = 1) -> str:
     """Return "did you mean ...?" with what resembles `word` most, in whatever case, or nothing."""
-    names = {name.lower(): name for name in known}
-    exact = [word.lower()] if word.lower() in names else []
-    matches = exact or difflib.get_close_matches(word.lower(), names, n=most)
+    names = {name.lower().lstrip("-"): name for name in known}  # dashes would make all options alike
+    word = word.lower().lstrip("-")
+    begun = [name for name in names if len(word) >= 3 and name.startswith(word)]
+    exact = [word] if word in names else begun if len(begun) == 1 else []
+    matches = exact or difflib.get_close_matches(word, names, n=most)
     return f"did you mean {' or '.join(names[match] for match in matches)}?" if matches else ""
 
 

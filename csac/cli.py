@@ -80,7 +80,7 @@ def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         _say(HELP.rstrip())
         return 0
-    if arguments[0] == "--version":
+    if arguments[0] in ("--version", "-V", "version"):
         from csac import __version__
 
         _say(f"csac {__version__}")
@@ -311,14 +311,14 @@ def _latency(arguments: list[str]) -> int:
     from csac.console.latencies import latency_table
     from csac.console.tables import make_console
     from csac.deploy.artefact import open_artefact
-    from csac.evaluation.latency import measure
+    from csac.evaluation.latency import check_measurement, measure
     from csac.record.csv_tables import check_new
 
     console, measured = make_console(), {}
     if options.plot:
         check_new(options.plot, "picture", ".png")
-    for path in options.artefacts:
-        open_artefact(path)  # or refuse it before any is measured
+    for path in options.artefacts:  # all is refused before any is measured
+        check_measurement(open_artefact(path), options.calls, options.rate, options.seconds)
     for path in options.artefacts:
         console.print(f"measuring {path}", soft_wrap=True)  # once: what moves on a terminal takes time from a core
         measured[str(path)] = measure(path, options.calls, options.rate, options.seconds)
@@ -365,8 +365,9 @@ def _report(arguments: list[str]) -> int:
         command = shlex.join(["csac", "report", *arguments])
         path = reports.write_run_report(comparison, options.out or reports.default_page(), options.title, [command])
         _say(f"{path}\n{path.with_suffix('.md')}")
-    if not any(len(run.rows) for run in runs):
-        _say("note: there is no evaluation yet in these runs, so there is little in it")
+    if not comparison.has_rows:
+        until = "" if options.until is None else f" up to step {options.until:,}"
+        _say(f"note: there is no evaluation{until} in these runs, so there is little in it")
     return 0
 
 

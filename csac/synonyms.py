@@ -10,12 +10,15 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
 _RATES = ("--actor-learning-rate and --critic-learning-rate", "--learning-rate")
+_ENVIRONMENTS = "each seed has one environment, and --seeds says how many"
+_TASK = "the task has no flag: csac train Pendulum-v1"
 _SIZES = ("--actor-hidden-sizes and --critic-hidden-sizes", "--hidden-sizes")
 
 # Of the words for an option, those count whose options the command has. Some are another algorithm's own.
 _CALLED_OTHERWISE = MappingProxyType(
     {
         "--tau": ("--relative-entropy-weight", "--target-rate"),
+        "--rho": ("--target-rate",),
         "--sigma": ("--entropy-weight",),
         "--alpha": ("--entropy-weight",),
         "--ent-coef": ("--temperature", "--entropy-weight"),
@@ -25,13 +28,21 @@ _CALLED_OTHERWISE = MappingProxyType(
         "--buffer-size": ("--replay-size",),
         "--train-freq": ("--update-interval",),
         "--gradient-steps": ("--updates-per-step",),
+        "--policy-frequency": ("--policy-delay",),
+        "--n-steps": ("--rollout-steps",),
         "--total-timesteps": ("--steps",),
         "--eval-freq": ("--evaluation-interval",),
         "--n-eval-episodes": ("--evaluation-episodes",),
         "--track": ("--wandb",),
+        "--exp-name": ("--directory",),
+        "--cuda": ("--device gpu",),
+        "--gpu": ("--device gpu",),
+        "--autotune": ("--temperature automatic",),
         "--out": ("--video",),
         "--env-kwargs": ("--environment-arguments",),  # in Python
         "--lr": _RATES,
+        "--policy-lr": ("--actor-learning-rate",),
+        "--q-lr": ("--critic-learning-rate",),
         "--learning-rate": _RATES,
         "--actor-learning-rate": _RATES,
         "--critic-learning-rate": _RATES,
@@ -44,10 +55,13 @@ _CALLED_OTHERWISE = MappingProxyType(
 )
 _NEEDLESS = MappingProxyType(
     {
-        "--n-envs": "each seed has one environment, and --seeds says how many",
+        "--n-envs": _ENVIRONMENTS,
+        "--num-envs": _ENVIRONMENTS,
+        "--environments": _ENVIRONMENTS,
         "--verbose": "none is needed",
-        "--env": "the task has no flag: csac train Pendulum-v1",
-        "--task": "the task has no flag: csac train Pendulum-v1",
+        "--env": _TASK,
+        "--env-id": _TASK,
+        "--task": _TASK,
     }
 )
 

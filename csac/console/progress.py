@@ -138,10 +138,13 @@ class Reporter:
         directory, csac = shlex.quote(str(run.path)), program()
         lines = [("curve", str(run.path / "curve.png"))] if has_curve else []
         if (run.path / "policy").exists():
-            lines += [
-                ("test it", f"{csac} evaluate {directory}"),
-                ("watch it", f"{csac} play {directory} --video {shlex.quote(str(run.path / 'play.mp4'))}"),
-            ]
+            film = shlex.quote(str(run.path / "play.mp4"))
+            if run.manifest.task_is_callable:  # which no command line can name
+                lines.append(("test it", f"in Python: evaluate(load({str(run.path)!r}), {run.manifest.task})"))
+            else:
+                lines.append(("test it", f"{csac} evaluate {directory}"))
+                is_sound = len(run.manifest.failures) < len(run.manifest.seeds)
+                lines += [("watch it", f"{csac} play {directory} --video {film}")] * is_sound
         for label, line in lines:
             self._print(Text.assemble((f"{label:<9}", "dim"), line))
 

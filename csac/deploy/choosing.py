@@ -8,6 +8,7 @@ from numbers import Integral
 from pathlib import Path
 from typing import get_args
 
+from csac.checks import check_path
 from csac.deploy.artefact_contract import ArtefactContract
 from csac.deploy.contract import Contract, read_json
 from csac.deploy.policy import CONTRACT, SAVED, Policy
@@ -34,6 +35,7 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
     """
     if which not in get_args(Which):
         raise InputError(f"which={which!r}: choose 'last' or 'best'")
+    check_path("a run directory", directory)
     folder = Path(directory)
     if not is_run(folder) and os.path.exists(folder / SAVED):
         return _saved(folder, seed, which)

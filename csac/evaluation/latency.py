@@ -61,24 +61,11 @@ def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, s
         seconds: how long calls are made at the rate, at least one and at most as many; 0 leaves that out.
 
     Raises:
-        InputError: no artefact there, nothing here to run it with, or arguments out of their range.
+        InputError: no artefact there, nothing here to run it with, arguments out of their range, or a rate at which
+            calls are due sooner than one can be made.
     """
-    if calls < 1:
-        raise InputError(f"calls must be at least 1, not {calls}")
-    if calls > MOST_CALLS:
-        raise InputError(f"calls must be at most {MOST_CALLS:,}, not {calls:,}")
-    if rate is not None and not 0 < rate <= NANOSECONDS:
-        raise InputError(f"the rate must be more than 0 Hz and at most 1e9, not {rate:g}")
-    if not 0 <= seconds <= MOST_SECONDS:
-        raise InputError(f"seconds must be 0 or more and at most {MOST_SECONDS:g}, not {seconds:g}")
     artefact = open_artefact(path)
-    rate = rate or artefact.contract.control_rate or USUAL_RATE
-    if seconds > 0 and rate * seconds < 1:
-        raise InputError(
-            f"{seconds:g} seconds at {rate:g} Hz are less than one call: give more seconds or a higher rate"
-        )
-    if rate * seconds > MOST_CALLS:
-        raise InputError(f"{seconds:g} seconds at {rate:g} Hz are more than {MOST_CALLS:,} calls: take fewer seconds")
+    rate = check_measurement(artefact, calls, rate, seconds)
     make_calls = (
         _measure_c(artefact) if artefact.format == "c" else measure_python(artefact.act, _observations(artefact))
     )
@@ -87,8 +74,32 @@ def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, s
     several = [Latency(durations)]
     if seconds:
         part, period = max(1, round(rate * SECONDS_OF_A_PART)), round(NANOSECONDS / rate)
+        if period < (usual := np.median(durations)):
+            raise InputError(
+                f"at {rate:g} Hz a call is due every {period:,} ns, and one takes {usual:,.0f} ns: give a lower --rate"
+            )
         several.append(Latency(*_in_parts(make_calls, round(rate * seconds), part, period), rate))
     return several
+
+
+def check_measurement(artefact: Artefact, calls: int, rate: float | None, seconds: float) -> float:
+    """Return the rate to measure at, in Hz. Raises InputError for what `measure` does not take."""
+    if calls < 1:
+        raise InputError(f"calls must be at least 1, not {calls}")
+    if calls > MOST_CALLS:
+        raise InputError(f"calls must be at most {MOST_CALLS:,}, not {calls:,}")
+    if rate is not None and not 0 < rate <= NANOSECONDS:
+        raise InputError(f"the rate must be more than 0 Hz and at most 1e9, not {rate:g}")
+    if not 0 <= seconds <= MOST_SECONDS:
+        raise InputError(f"seconds must be 0 or more and at most {MOST_SECONDS:g}, not {seconds:g}")
+    rate = rate or artefact.contract.control_rate or USUAL_RATE
+    if seconds > 0 and rate * seconds < 1:
+        raise InputError(
+            f"{seconds:g} seconds at {rate:g} Hz are less than one call: give more seconds or a higher rate"
+        )
+    if rate * seconds > MOST_CALLS:
+        raise InputError(f"{seconds:g} seconds at {rate:g} Hz are more than {MOST_CALLS:,} calls: take fewer seconds")
+    return rate
 
 
 def measure_python(act: Callable[[np.ndarray], object], observations: np.ndarray) -> Measure:

@@ -181,7 +181,8 @@ def _follow(environment: Environment) -> None:
 def _seeds_with_policies(run: RunDirectory) -> list[int]:
     seeds = run.seeds_with_policies()
     if not seeds:
-        raise InputError(f"{run.path} holds no policy yet: its first evaluation writes one")
+        over = len(run.evaluations) > 0
+        raise InputError(f"{run.path} holds no policy {'any more' if over else 'yet: its first evaluation writes one'}")
     return seeds
 
 

@@ -143,6 +143,10 @@ class Manifest:
 _ALWAYS_THERE = ("environment_arguments", "hyperparameters", "evaluation", "state", "steps_done", "failures")
 
 
+class NewerError(InputError):
+    """A manifest of a schema that is not known yet."""
+
+
 def read(content: bytes) -> Manifest:
     """Return the manifest in a file's content. Raises InputError with what is wrong with it."""
     try:
@@ -152,6 +156,8 @@ def read(content: bytes) -> Manifest:
     if not isinstance(fields, dict):
         raise InputError("it is not a JSON object")
     version = fields.pop("schema_version", None)
+    if isinstance(version, int) and version > SCHEMA_VERSION:
+        raise NewerError(f"its schema version is {version}, and this csac reads {SCHEMA_VERSION}")
     if version != SCHEMA_VERSION or isinstance(version, bool):
         raise InputError(f"its schema version is {version!r:.20}, and this csac reads {SCHEMA_VERSION}")
     for name in _ALWAYS_THERE:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import numpy as np
 
+from csac.checks import check_path
 from csac.record import manifest as manifests
 from csac.record.atomic import create_atomically, write_atomically
 from csac.record.csv_tables import COLUMNS, append_rows, read_rows, structured
@@ -88,7 +89,8 @@ class RunDirectory:
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
-        """Open a run that exists. Raises InputError where there is none or its manifest is broken."""
+        """Open a run that exists. Raises InputError where there is none or its manifest cannot be used."""
+        check_path("a run directory", path)
         path = Path(path)
         try:
             return cls(path, manifests.read((path / MANIFEST).read_bytes()))
@@ -97,6 +99,8 @@ class RunDirectory:
             raise InputError(f"{path} {what}; give a run directory ('csac runs' lists them)") from None
         except OSError as error:
             raise InputError(f"cannot read {path / MANIFEST}: {error.strerror}; check its permissions") from None
+        except manifests.NewerError as error:
+            raise InputError(f"{path / MANIFEST} was written by a newer csac: {error}; upgrade csac") from None
         except InputError as error:
             raise InputError(f"{path / MANIFEST} is broken: {error}; restore it or train again") from None
 

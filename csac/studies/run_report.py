@@ -66,6 +66,11 @@ class Comparison:
     until: int | None = None
     """The last step that counts."""
 
+    @property
+    def has_rows(self) -> bool:
+        """Whether any run has an evaluation that counts."""
+        return any(len(arm.rows) for arm in self.arms())
+
     def arms(self) -> list[Arm]:
         """Return the arms: runs of one label on each task, or else runs that differ in their seeds alone.
 
@@ -211,8 +216,10 @@ def write_between(page: Path, name: str, text: str) -> None:
     try:
         new = between_markers(page.read_text(encoding="utf-8"), name, text)
         write_atomically(page, new.encode())
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot write into {page}: {error}") from None
+    except OSError as error:
+        raise InputError(f"cannot write into {page}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"cannot write into {page}: it is not a text file") from None
 
 
 def draw_curves(comparison: Comparison, path: Path, title: str | None) -> None:

@@ -55,7 +55,8 @@ class TuneProgress(Watcher):
         question = study.question
         title = f"tuning {question.algorithm.name} on {question.task}"
         seeds = f"{question.seeds} seed{'s' * (question.seeds > 1)}"
-        rest = f", {self._trials} trials of {short(question.steps)} steps, {seeds} each, {self._over} over"
+        trials = f"{self._trials} trial{'s' * (self._trials != 1)} of {short(question.steps)} steps"
+        rest = f", {trials}, {seeds} each, {self._over} over"
         self._print(Text.assemble((title, "bold"), rest))
         self._print(Text(f"{study.directory}; searched: {', '.join(question.space)}", "dim"))
         if self.console.is_interactive:

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 
+from csac.checks import check_arguments
 from csac.deploy.contract import ActionBounds
 from csac.tasks import known
 from csac.tasks.making import Task, check_render_mode, make, task_name
@@ -53,6 +54,7 @@ class Environment:
     def __init__(
         self, task: Task, environment_arguments: dict[str, Any] | None = None, render_mode: str | None = None
     ) -> None:
+        check_arguments("environment_arguments", environment_arguments)
         arguments = dict(environment_arguments or {})
         if render_mode is not None:
             arguments["render_mode"] = render_mode

@@ -45,7 +45,7 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
             given = f" with the arguments {arguments}" if arguments else ""
             raise InputError(f"{name} could not be made{given}: {one_line(error)}") from error
     if not isinstance(environment, gymnasium.Env):
-        raise InputError(f"{name} gave a {type(environment).__name__}: a task's callable returns a gymnasium.Env")
+        raise InputError(f"{name} returned {environment!r:.40}: a task's callable returns a gymnasium.Env")
     return environment
 
 
@@ -74,7 +74,8 @@ def registered(task: str) -> str:
     family = name.rpartition("-v")[0] or name
     versions = [id for id in ids if id.rpartition("-v")[0] == family]
     others = f"did you mean {' or '.join(versions)}?" if versions else did_you_mean(name, ids, most=3)
-    raise InputError(f"no task is called {task}: {others or 'write module:Id for one that a module registers'}")
+    otherwise = f"{module} registers none of that name" if module else "write module:Id for one that a module registers"
+    raise InputError(f"no task is called {task}: {others or otherwise}")
 
 
 def _is_gone(spec: Any) -> bool:

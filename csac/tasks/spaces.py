@@ -68,8 +68,8 @@ def action_parts(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray, np.n
         raise InputError("the action space is empty: there is nothing to learn")
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise InputError(
-            "the action space has no bounds: give it some, as gymnasium.wrappers.TransformAction(environment, "
-            f"lambda action: action, gymnasium.spaces.Box(-1.0, 1.0, {space.shape})) does"
+            "the action space has infinite bounds: give it finite ones, as gymnasium.wrappers.TransformAction("
+            f"environment, lambda action: action, gymnasium.spaces.Box(-1.0, 1.0, {space.shape})) does"
         )
     return space.low.shape, low, high
 

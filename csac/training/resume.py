@@ -64,8 +64,9 @@ class Restart(NamedTuple):
         if changes := _machine_changes(before, now):
             lines.append(f"note: not the same to the last bit from here on, because {' and '.join(changes)}")
         if before.inexact_seeds:
-            seeds = ", ".join(map(str, before.inexact_seeds))
-            lines.append(f"note: the checkpoint has no episode that can go on: seeds {seeds} begin theirs anew")
+            several = "s" * (len(before.inexact_seeds) > 1)
+            seeds = f"seed{several} {', '.join(map(str, before.inexact_seeds))} restart{'' if several else 's'}"
+            lines.append(f"note: {seeds} the episode in progress, which the checkpoint could not hold")
         return lines
 
     def continuation(self, before: Manifest, wanted: Manifest) -> Continuation:

@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from csac.checks import check_callable
+from csac.checks import check_callable, check_path
 from csac.processes import end_if_unguarded
 from csac.record.manifest import as_kept
 from csac.record.run import RunDirectory
@@ -106,6 +106,10 @@ def train(
     check_algorithm(algorithm)
     check_callable("on_evaluation", on_evaluation)
     check_callable("stop_when", stop_when)
+    if directory is not None:
+        check_path("directory", directory)
+    if reporter is not None and not callable(getattr(reporter, "note", None)):
+        raise InputError(f"reporter is an object such as csac.console.progress.Reporter(), not {reporter!r:.40}")
     if wandb:
         import_wandb()
     watchers = Watchers(reporter, tensorboard, wandb, on_evaluation, stop_when, [])

@@ -168,6 +168,23 @@ def test_the_end_shows_results_and_what_to_type_next(plain, clock, tmp_path):
     assert f"watch it csac play '{run.path}' --video '{run.path}/play.mp4'" in shown
 
 
+def test_what_is_to_be_typed_next_works(plain, clock, tmp_path):
+    failed, of_python = (make_run(tmp_path / name, [[1.0]]) for name in ("failed", "of_python"))
+    for run in (failed, of_python):
+        (run.path / "policy").mkdir()
+    failed.update_manifest(failures={0: "step 5: reward is nan"})  # whose best seed nobody can watch
+    of_python.update_manifest(task="make_task", task_is_callable=True)  # which no command line can name
+    reporter = Reporter(plain, clock)
+    for run in (failed, of_python):
+        reporter.start(run.manifest.task, "csac", [0], 1000, run.path)
+        reporter.finish(run)
+
+    shown = lines(plain)
+    assert f"test it  csac evaluate {failed.path}" in shown
+    assert f"test it  in Python: evaluate(load('{of_python.path}'), make_task)" in shown
+    assert "watch it" not in plain.file.getvalue()
+
+
 @pytest.mark.parametrize(
     ("failures", "state", "outcome"),
     [

@@ -77,6 +77,8 @@ def test_load_says_what_is_missing(tmp_path):
     (tmp_path / "empty").mkdir()
     save_run(tmp_path / "young", seeds=[0])
     (tmp_path / "young" / "policy" / "seed_0.safetensors").unlink()
+    with pytest.raises(InputError, match="a run directory is a path such as 'runs/first', not None"):
+        load(None)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="does not exist"):
         load(tmp_path / "nowhere")
     with pytest.raises(InputError, match="holds no run"):

@@ -93,6 +93,11 @@ def test_the_ends_of_the_action_range_are_the_bounds():
     np.testing.assert_allclose(scaled, [[-0.1, 0.7], [0.3, -0.1]], rtol=1e-6)
 
 
+def test_all_that_reset_returns_is_no_observation():
+    with pytest.raises(InputError, match=r"all that reset\(\) returns: write observation, info = env\.reset"):
+        random_policy(contract(((None, (4,)),), (2,))).predict((np.zeros(4), {}))
+
+
 @pytest.mark.parametrize("action_shape", [(), (1,), (3,), (2, 3)])
 @pytest.mark.parametrize("observation_shape", [(), (1,), (4,), (2, 3)])
 def test_predict_has_the_shapes_of_stable_baselines3(observation_shape, action_shape):

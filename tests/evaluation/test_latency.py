@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shlex
 import shutil
 import time
@@ -147,7 +148,14 @@ def test_mistakes_are_told_in_one_line(tmp_path, monkeypatch, capsys, line, mess
     monkeypatch.chdir(tmp_path)
     leave(tmp_path / "numpy", "numpy")
     assert main(["latency", *shlex.split(line)]) == 2
-    assert capsys.readouterr().err == f"csac: {message}\n"
+    assert capsys.readouterr() == ("", f"csac: {message}\n")
+
+
+def test_a_rate_that_no_call_can_keep_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(latency, "WARM_UP", 10)
+    folder = leave(tmp_path / "numpy", "numpy")
+    assert main(["latency", str(folder), *shlex.split("--calls 20 --rate 1e9 --seconds 0.01")]) == 2
+    assert re.search(r"at 1e\+09 Hz a call is due every 1 ns, and one takes [\d,]+ ns", capsys.readouterr().err)
 
 
 def test_an_observation_lies_between_the_bounds_that_a_task_has(tmp_path):

@@ -198,6 +198,13 @@ def test_opening_where_there_is_no_run(tmp_path):
         RunDirectory.open(tmp_path / "file")
 
 
+def test_a_manifest_of_a_newer_csac_is_not_called_broken(run):
+    fields = json.loads((run.path / "manifest.json").read_bytes())
+    (run.path / "manifest.json").write_text(json.dumps({**fields, "schema_version": 99}))
+    with pytest.raises(InputError, match=r"written by a newer csac: its schema version is 99.*; upgrade csac$"):
+        RunDirectory.open(run.path)
+
+
 @pytest.mark.parametrize("content", [b"", b'{"schema_version": 1, "task": 3}'])
 def test_a_broken_manifest_is_named(run, content):
     (run.path / "manifest.json").write_bytes(content)

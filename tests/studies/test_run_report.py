@@ -312,7 +312,13 @@ def test_a_run_without_evaluations_is_told(capsys):
     text = report("runs/a")
     assert "| runs/a | Hopper-v4 | sac |" in text
     assert "## Learning curves" not in text
-    assert "note: there is no evaluation yet in these runs" in capsys.readouterr().out
+    assert "note: there is no evaluation in these runs" in capsys.readouterr().out
+
+
+def test_a_report_that_leaves_every_evaluation_out_says_so(capsys):
+    make_run_of("runs/a", [[10.0, 20.0]])
+    report("runs/a --until 5")
+    assert "note: there is no evaluation up to step 5 in these runs" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("place", [".", "out", "out.html"])

@@ -69,7 +69,7 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
         ("no_such_module:Task-v0", "the module no_such_module cannot be imported: ModuleNotFoundError"),
         ("probes:ConstantRewards-v0", "did you mean ConstantReward-v0"),
         ("CartPole-v1", r"CartPole-v1: the action space is Discrete\(2\)"),
-        (lambda: 3, "gave a int: a task's callable returns a gymnasium.Env"),
+        (lambda: 3, "returned 3: a task's callable returns a gymnasium.Env"),
         (probes.Endless(), r"already made \(Endless\).*a function that makes one"),
         (gymnasium.wrappers.TimeLimit(probes.Endless(), 3), r"already made \(TimeLimit\)"),
         (5, "a Gymnasium id or a function that makes an environment, not 5"),

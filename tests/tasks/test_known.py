@@ -299,7 +299,7 @@ def test_a_robots_run_is_stopped_and_goes_on(tmp_path, task, inputs):
     reporter = Notes()
     grown = resume(tmp_path / "run", steps=60, reporter=reporter)
 
-    assert "note: the checkpoint has no episode that can go on: seeds 0 begin theirs anew" in reporter.notes
+    assert "note: seed 0 restarts the episode in progress, which the checkpoint could not hold" in reporter.notes
     assert (grown.manifest.state, grown.manifest.steps_done) == ("finished", 60)
     assert grown.manifest.history[0].exact is False
     assert grown.manifest.events == run.manifest.events

@@ -78,6 +78,8 @@ def test_a_name_or_a_class_is_no_algorithm(tmp_path, algorithm: Any, message):
         ({"environment_arguments": 3}, "environment_arguments are keyword arguments such as"),
         ({"perturbations": 3}, r"perturbations are a list such as \['friction=1.5@300000'\], not 3"),
         ({"on_evaluation": 3}, "on_evaluation is a function that is called, not 3"),
+        ({"events": 3}, r"events are a list of names such as \('collision',\), not 3"),
+        ({"reporter": True}, r"reporter is an object such as csac.console.progress.Reporter\(\), not True"),
         ({"stop_when": "never"}, "stop_when is a function that is called, not 'never'"),
     ],
 )

@@ -627,7 +627,7 @@ def test_a_continuation_is_exact_only_if_every_episode_goes_on():
     restart = Restart(100, {}, [], [])
     assert restart.continuation(manifest, manifest).exact
     assert not restart.continuation(inexact, manifest).exact
-    said = "note: the checkpoint has no episode that can go on: seeds 1 begin theirs anew"
+    said = "note: seed 1 restarts the episode in progress, which the checkpoint could not hold"
     assert (said in restart.notes(inexact, manifest), said in restart.notes(manifest, manifest)) == (True, False)
 
 
