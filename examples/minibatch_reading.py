@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac.algorithms.adaptation import weights_now
+from csac.algorithms.adaptation import current_weights
 from csac.algorithms.csac import CSAC
 from csac.algorithms.networks import MLP
 from csac.types import Layer
@@ -35,7 +35,7 @@ def flat_critics() -> tuple[MLP, MLP]:
 def gradients(algorithm: CSAC, std: float) -> np.ndarray:
     """Return dJ/dmean at every quadrature node of the action noise [64], with the actor as its own reference."""
     actor = constant_policy(0.3, std)
-    weights = weights_now((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
+    weights = current_weights((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
 
     def gradient(noise: jax.Array) -> jax.Array:
         def loss(learnt: MLP) -> jax.Array:

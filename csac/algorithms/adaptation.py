@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms.networks import begin_descent, descend
+from csac.algorithms.networks import descend
 from csac.algorithms.shapes import Scalar
 from csac.types import Metrics
 
@@ -51,19 +51,19 @@ def weight_loss(log_weight: Scalar, slack: Scalar) -> tuple[Scalar, Metrics]:
     return log_weight * slack, {}
 
 
-def begin_weights(
+def make_weights(
     given: tuple[Weight, Weight], first: Weights, optimiser: optax.GradientTransformation
 ) -> LearntWeights | None:
     """Return what the weights that are `auto` begin with; None where both are given."""
 
     def begin(weight: Weight, value: Scalar | float) -> LearntWeight | None:
         log_weight = jnp.log(jnp.float32(value))
-        return LearntWeight(log_weight, begin_descent(optimiser, log_weight)) if weight == "auto" else None
+        return LearntWeight(log_weight, optimiser.init(log_weight)) if weight == "auto" else None
 
     return LearntWeights(*map(begin, given, first)) if "auto" in given else None
 
 
-def weights_now(given: tuple[Weight, Weight], learnt: LearntWeights | None) -> Weights:
+def current_weights(given: tuple[Weight, Weight], learnt: LearntWeights | None) -> Weights:
     """Return the weights as they are given or, where they are `auto`, as they are learnt."""
 
     def now(weight: Any, one: LearntWeight | None) -> Any:
@@ -72,7 +72,7 @@ def weights_now(given: tuple[Weight, Weight], learnt: LearntWeights | None) -> W
     return Weights(*map(now, given, learnt or LearntWeights(None, None)))
 
 
-def adapted(
+def adapt_weights(
     learnt: LearntWeights | None, slack: Weights, optimiser: optax.GradientTransformation
 ) -> LearntWeights | None:
     """Return the weights after one step, given by how much each one's constraint holds, negative where it does not.
@@ -91,7 +91,7 @@ def adapted(
     return None if learnt is None else LearntWeights(*map(adapt, learnt, slack))
 
 
-def told(weights: Weights, learnt: LearntWeights | None) -> Metrics:
+def weight_metrics(weights: Weights, learnt: LearntWeights | None) -> Metrics:
     """Return those weights that are learnt, as metrics."""
     if learnt is None:
         return {}

@@ -22,7 +22,7 @@ Critics: TypeAlias = tuple[MLP, MLP]
 Normalisation: TypeAlias = Literal["none", "batch"]
 
 
-class Learnt(NamedTuple):
+class UpdatedCritics(NamedTuple):
     """The critics after a step of theirs."""
 
     critics: Critics
@@ -75,7 +75,7 @@ def squared_errors(values: tuple[Scalar, Scalar], target: Scalar) -> tuple[Scala
     return loss, {"critic_loss": loss, "q_mean": (first + second) / 2.0}
 
 
-def learn_critics(
+def update_critics(
     optimiser: optax.GradientTransformation,
     critics: Critics,
     targets: Critics | None,
@@ -85,7 +85,7 @@ def learn_critics(
     *,
     critic_target: Callable[..., Scalar],
     next_action: Callable[[Observation, Action], Action],
-) -> Learnt:
+) -> UpdatedCritics:
     """Return the critics after one gradient step towards their targets on a batch.
 
     Args:
@@ -101,10 +101,10 @@ def learn_critics(
     if targets is not None:
         goals = jax.vmap(partial(critic_target, target_critics=targets))(batch, noise)
         critics, optimiser_state, metrics = descend(optimiser, critic_loss, critics, optimiser_state, batch, goals)
-        return Learnt(critics, optimiser_state, critics, metrics)
+        return UpdatedCritics(critics, optimiser_state, critics, metrics)
     loss = partial(normalised_critic_loss, critic_target=critic_target, next_action=next_action)
-    critics, optimiser_state, told = descend(optimiser, loss, critics, optimiser_state, batch, noise)
-    return Learnt(critics, optimiser_state, fold_critics(critics, told.pop("moments")), told)
+    critics, optimiser_state, metrics = descend(optimiser, loss, critics, optimiser_state, batch, noise)
+    return UpdatedCritics(critics, optimiser_state, fold_critics(critics, metrics.pop("moments")), metrics)
 
 
 def normalised_critic_loss(

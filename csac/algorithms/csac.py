@@ -11,16 +11,31 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from csac.algorithms.adaptation import LearntWeights, Weights, adapted, begin_weights, told, weights_now
-from csac.algorithms.critics import Critics, Normalisation, learn_critics, least_q_value, make_critics, make_targets
-from csac.algorithms.delay import begin_metrics, improve_delayed
+from csac.algorithms.adaptation import (
+    LearntWeights,
+    Weights,
+    adapt_weights,
+    current_weights,
+    make_weights,
+    weight_metrics,
+)
+from csac.algorithms.critics import Critics, Normalisation, least_q_value, make_critics, make_targets, update_critics
+from csac.algorithms.delay import improve_delayed, make_first_metrics
 from csac.algorithms.distributions import action_at, bounded, kl, log_ratio, policy_at
-from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    WIDTHS,
+    validate_hyperparameters,
+)
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp, make_optimiser, polyak
 from csac.algorithms.references import ReferencePolicy, reference_after, references_before
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
-from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
+from csac.algorithms.statistics import Statistics, make_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
@@ -37,12 +52,12 @@ class State(NamedTuple):
     learnt_weights: LearntWeights | None = None
     relative_entropy_per_refresh: Scalar | None = None  # what a τ that is learnt goes by; 0 before there is any
     observations: Statistics | None = None
-    actor_metrics: Metrics | None = None  # of an actor that waits: what it told when it last moved
+    actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
 
-FIRST_WEIGHTS = Weights(1.0, 0.5)  # of those that adapt: SAC's first temperature, and the paper's τ
+INITIAL_WEIGHTS = Weights(1.0, 0.5)  # of those that adapt: SAC's first temperature, and the paper's τ
 
-NOT_TOGETHER = (
+INCOMPATIBLE = (
     (
         {"relative_entropy_weight": ["auto"], "reference_policy": ["algorithm1"]},
         "the actor is its own reference; reference_policy periodic keeps another",
@@ -121,7 +136,7 @@ class CSAC:
     name: ClassVar[str] = "csac"
 
     def __post_init__(self) -> None:
-        take_hyperparameters(self, NOT_TOGETHER)
+        validate_hyperparameters(self, INCOMPATIBLE)
         self._refuse_idle_references()
 
     def critic_target(
@@ -190,17 +205,17 @@ class CSAC:
         """Take one gradient step on the critics, move their targets, then improve the actor against them."""
         observations, batch = normalise_batch(state.observations, batch)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
-        weights = weights_now((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
+        weights = current_weights((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
         renews, kept = step % self.reference_period == 0, (state.reference, state.earlier_reference)
         references = references_before(self.reference_policy, *kept, state.actor, renews)
 
-        policies = {"actor": references.valued, "reference": references.critic}
-        learnt = learn_critics(
+        policies = {"actor": references.evaluated, "reference": references.critic}
+        learnt = update_critics(
             self._optimiser(self.critic_learning_rate),
             *(state.critics, state.target_critics, state.critic_optimiser),
             *(batch, target_noise),
             critic_target=partial(self.critic_target, weights=weights, **policies),
-            next_action=partial(action_at, references.valued),
+            next_action=partial(action_at, references.evaluated),
         )
 
         state = state._replace(
@@ -213,7 +228,7 @@ class CSAC:
         )
         given = (learnt.folded, batch.observation, actor_noise, step)
         state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
-        return state, {**learnt.metrics, **actor_metrics, **told(weights, state.learnt_weights)}
+        return state, {**learnt.metrics, **actor_metrics, **weight_metrics(weights, state.learnt_weights)}
 
     def improve(
         self,
@@ -224,7 +239,7 @@ class CSAC:
         step: Count,
     ) -> tuple[State, Metrics]:
         """Return the state after one gradient step on the actor, with its reference and the weights that are learnt."""
-        weights = weights_now((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
+        weights = current_weights((self.entropy_weight, self.relative_entropy_weight), state.learnt_weights)
         actor_loss = partial(self.actor_loss, reference=state.reference, critics=critics, weights=weights)
         optimiser = self._optimiser(self.actor_learning_rate)
         actor, actor_optimiser, metrics = descend(
@@ -235,7 +250,7 @@ class CSAC:
             actor=actor,
             reference=reference_after(self.reference_policy, state.reference, state.actor, self.reference_rate),
             actor_optimiser=actor_optimiser,
-            learnt_weights=adapted(
+            learnt_weights=adapt_weights(
                 state.learnt_weights,
                 self.slack(metrics["entropy"], refreshed, noise.shape[-1]),
                 make_optimiser(self.weight_learning_rate),
@@ -287,17 +302,17 @@ class CSAC:
             reference=None if self.relative_entropy_form == "implicit" else copy_tree(actor),
             critics=critics,
             target_critics=make_targets(critics, self.critic_normalisation),
-            actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
-            critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
+            actor_optimiser=self._optimiser(self.actor_learning_rate).init(actor),
+            critic_optimiser=self._optimiser(self.critic_learning_rate).init(critics),
             earlier_reference=copy_tree(actor) if self.critic_reference == "earlier" else None,
-            learnt_weights=begin_weights(
+            learnt_weights=make_weights(
                 (self.entropy_weight, self.relative_entropy_weight),
-                FIRST_WEIGHTS,
+                INITIAL_WEIGHTS,
                 make_optimiser(self.weight_learning_rate),
             ),
             relative_entropy_per_refresh=jnp.zeros(()) if self.relative_entropy_weight == "auto" else None,
-            observations=begin_statistics(spec.observation_size, self.normalise_observations),
-            actor_metrics=begin_metrics(self._actor_metrics(), self.policy_delay),
+            observations=make_statistics(spec.observation_size, self.normalise_observations),
+            actor_metrics=make_first_metrics(self._actor_metrics(), self.policy_delay),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:

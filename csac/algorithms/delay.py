@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 
-def begin_metrics(names: Iterable[str], delay: int) -> Metrics | None:
+def make_first_metrics(names: Iterable[str], delay: int) -> Metrics | None:
     """Return what an actor that waits tells before it first moved, 0 each; None where it moves at every update."""
     return None if delay == 1 else {name: jnp.zeros(()) for name in names}
 
@@ -22,7 +22,7 @@ def begin_metrics(names: Iterable[str], delay: int) -> Metrics | None:
 def improve_delayed(
     delay: int, step: Count, improve: Callable[..., tuple[Any, Metrics]], state: Any, *given: Any
 ) -> tuple[Any, Metrics]:
-    """Return `improve(state, *given)` at every `delay`-th update, else the state and what the last improvement told.
+    """Return `improve(state, *given)` at every `delay`-th update, else the state as it is and its metrics.
 
     Args:
         delay: updates of the critics for each improvement of the actor.

@@ -38,11 +38,13 @@ WIDTHS = Limit(
 LARGEST = 2**31 - 1  # compiled programs count in 32 bits
 
 
-def take_hyperparameters(algorithm: Any, not_together: Iterable[tuple[Mapping[str, Sequence[Any]], str]] = ()) -> None:
+def validate_hyperparameters(
+    algorithm: Any, incompatible: Iterable[tuple[Mapping[str, Sequence[Any]], str]] = ()
+) -> None:
     """Take an algorithm's fields as plain Python values, and refuse one outside its range or its choices.
 
     NumPy's scalars become Python's, and lists tuples, so that what is recorded does not depend on how it was given.
-    `not_together` are values of fields that make no sense together, and why.
+    `incompatible` are values of fields that make no sense together, and why.
 
     Raises:
         InputError: the first such field, its value and what it may be; fields that make no sense together; a replay
@@ -54,7 +56,7 @@ def take_hyperparameters(algorithm: Any, not_together: Iterable[tuple[Mapping[st
         if words := _what_it_must_be(value, hints[field.name]):
             raise InputError(f"{field.name} must be {words}, not {value!r}")
         object.__setattr__(algorithm, field.name, value)
-    for values, why in not_together:
+    for values, why in incompatible:
         if all(getattr(algorithm, name) in refused for name, refused in values.items()):
             told = " with ".join(f"{name} {getattr(algorithm, name)}" for name in values)
             raise InputError(f"{told} makes no sense: {why}")

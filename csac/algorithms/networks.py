@@ -90,11 +90,6 @@ def make_optimiser(
     return adam
 
 
-def begin_descent(optimiser: optax.GradientTransformation, parameters: Any) -> Any:
-    """Return the optimiser's first state."""
-    return optimiser.init(parameters)
-
-
 def descend(
     optimiser: optax.GradientTransformation, loss: Callable, parameters: Any, optimiser_state: Any, *examples: Any
 ) -> tuple[Any, Any, Metrics]:

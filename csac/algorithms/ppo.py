@@ -12,9 +12,17 @@ import optax
 from jaxtyping import Array, Float
 
 from csac.algorithms.distributions import Gaussian
-from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, SHARE, WIDTHS, take_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHARE,
+    WIDTHS,
+    validate_hyperparameters,
+)
 from csac.algorithms.memory import Rollout
-from csac.algorithms.networks import MLP, begin_descent, descend, make_optimiser, make_orthogonal_mlp
+from csac.algorithms.networks import MLP, descend, make_optimiser, make_orthogonal_mlp
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar, Scalars
 from csac.algorithms.statistics import EPSILON, Statistics, normalise
 from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
@@ -94,7 +102,7 @@ class PPO:
     name: ClassVar[str] = "ppo"
 
     def __post_init__(self) -> None:
-        take_hyperparameters(self)
+        validate_hyperparameters(self)
         if self.rollout_steps % self.minibatches:
             raise InputError(
                 f"minibatches must divide rollout_steps into equal parts: {self.rollout_steps} steps make no "
@@ -257,7 +265,7 @@ class PPO:
         )
         return State(
             parameters=parameters,
-            optimiser=begin_descent(self._optimiser(self.learning_rate), parameters),
+            optimiser=self._optimiser(self.learning_rate).init(parameters),
             observations=Statistics.create((spec.observation_size,)),
             returns=Statistics.create(()),
             discounted_return=jnp.zeros(()),

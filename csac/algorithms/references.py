@@ -18,7 +18,7 @@ class References(NamedTuple):
 
     actor: MLP | None  # of the actor's loss: π_k
     critic: MLP | None  # of the critic's target: the same, or π_{k-1}
-    valued: MLP  # the policy that the critic's target takes the value of: the actor as it is, or π_k beside π_{k-1}
+    evaluated: MLP  # the policy that the critic's target takes the value of: the actor as it is, or π_k beside π_{k-1}
 
 
 def references_before(

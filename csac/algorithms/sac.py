@@ -11,14 +11,22 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from csac.algorithms.critics import Critics, Normalisation, learn_critics, least_q_value, make_critics, make_targets
-from csac.algorithms.delay import begin_metrics, improve_delayed
+from csac.algorithms.critics import Critics, Normalisation, least_q_value, make_critics, make_targets, update_critics
+from csac.algorithms.delay import improve_delayed, make_first_metrics
 from csac.algorithms.distributions import action_at, policy_at
-from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    WIDTHS,
+    validate_hyperparameters,
+)
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, begin_descent, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.networks import MLP, descend, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
-from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
+from csac.algorithms.statistics import Statistics, make_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 # From which an automatic temperature can still rise: a run whose temperature was fixed at 0 may go on with one.
@@ -36,7 +44,7 @@ class State(NamedTuple):
     critic_optimiser: Any
     temperature_optimiser: Any
     observations: Statistics | None = None
-    actor_metrics: Metrics | None = None  # of an actor that waits: what it told when it last moved
+    actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
 
 @dataclass(frozen=True)
@@ -87,7 +95,7 @@ class SAC:
     name: ClassVar[str] = "sac"
 
     def __post_init__(self) -> None:
-        take_hyperparameters(self)
+        validate_hyperparameters(self)
         if self.temperature == "automatic" and self.entropy_weight == 0:
             raise InputError("entropy_weight must be more than 0 to begin an automatic temperature")
 
@@ -122,7 +130,7 @@ class SAC:
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.log_temperature)
 
-        learnt = learn_critics(
+        learnt = update_critics(
             self._optimiser(self.critic_learning_rate),
             *(state.critics, state.target_critics, state.critic_optimiser),
             *(batch, target_noise),
@@ -147,7 +155,7 @@ class SAC:
         observations: Float[Array, "batch observation"],
         noise: Float[Array, "batch action"],
     ) -> tuple[State, Metrics]:
-        """Return the state after one gradient step on the actor and the temperature, and what the actor's loss told."""
+        """Return the state after one gradient step on the actor and the temperature, and the actor's metrics."""
         actor_loss = partial(self.actor_loss, critics=critics, temperature=jnp.exp(state.log_temperature))
         optimiser = self._optimiser(self.actor_learning_rate)
         actor, actor_optimiser, metrics = descend(
@@ -193,11 +201,11 @@ class SAC:
             critics=critics,
             target_critics=make_targets(critics, self.critic_normalisation),
             log_temperature=log_temperature,
-            actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
-            critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
-            temperature_optimiser=begin_descent(make_optimiser(self.temperature_learning_rate), log_temperature),
-            observations=begin_statistics(spec.observation_size, self.normalise_observations),
-            actor_metrics=begin_metrics(("actor_loss", "entropy"), self.policy_delay),
+            actor_optimiser=self._optimiser(self.actor_learning_rate).init(actor),
+            critic_optimiser=self._optimiser(self.critic_learning_rate).init(critics),
+            temperature_optimiser=make_optimiser(self.temperature_learning_rate).init(log_temperature),
+            observations=make_statistics(spec.observation_size, self.normalise_observations),
+            actor_metrics=make_first_metrics(("actor_loss", "entropy"), self.policy_delay),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:

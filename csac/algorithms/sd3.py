@@ -12,9 +12,17 @@ import optax
 from jaxtyping import Array, Float
 
 from csac.algorithms.critics import Critics, least_q_value, make_critic, q_value
-from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    WIDTHS,
+    validate_hyperparameters,
+)
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
@@ -85,7 +93,7 @@ class SD3:
     name: ClassVar[str] = "sd3"
 
     def __post_init__(self) -> None:
-        take_hyperparameters(self)
+        validate_hyperparameters(self)
 
     def critic_target(
         self,
@@ -169,8 +177,8 @@ class SD3:
             critic=critic,
             target_actor=copy_tree(actor),
             target_critic=copy_tree(critic),
-            actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
-            critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critic),
+            actor_optimiser=self._optimiser(self.actor_learning_rate).init(actor),
+            critic_optimiser=self._optimiser(self.critic_learning_rate).init(critic),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:

@@ -42,7 +42,7 @@ class Statistics(NamedTuple):
         return Statistics(count, self.mean + shares[1] * shift, variance, jnp.sqrt(variance + EPSILON))
 
 
-def begin_statistics(size: int, wanted: bool) -> Statistics | None:
+def make_statistics(size: int, wanted: bool) -> Statistics | None:
     """Return the statistics of no observations, or None where none are wanted."""
     return Statistics.create((size,)) if wanted else None
 

@@ -14,17 +14,25 @@ from jaxtyping import Array, Float
 from csac.algorithms.critics import (
     Critics,
     Normalisation,
-    learn_critics,
     least_q_value,
     make_critics,
     make_targets,
     q_value,
+    update_critics,
 )
-from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, take_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    WIDTHS,
+    validate_hyperparameters,
+)
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, begin_descent, copy_tree, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
-from csac.algorithms.statistics import Statistics, begin_statistics, normalise, normalise_batch, normaliser_of
+from csac.algorithms.statistics import Statistics, make_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
@@ -87,7 +95,7 @@ class TD3:
     name: ClassVar[str] = "td3"
 
     def __post_init__(self) -> None:
-        take_hyperparameters(self)
+        validate_hyperparameters(self)
 
     def critic_target(
         self, transition: Transition, noise: Action, *, target_actor: MLP, target_critics: Critics
@@ -111,7 +119,7 @@ class TD3:
         """Take one gradient step on the critics; every `policy_delay`-th time move the actor, then the targets."""
         observations, batch = normalise_batch(state.observations, batch)
         noise = jax.random.normal(key, batch.action.shape)
-        learnt = learn_critics(
+        learnt = update_critics(
             self._optimiser(self.critic_learning_rate),
             *(state.critics, state.target_critics, state.critic_optimiser),
             *(batch, noise),
@@ -156,10 +164,10 @@ class TD3:
             target_actor=copy_tree(actor),
             critics=critics,
             target_critics=make_targets(critics, self.critic_normalisation),
-            actor_optimiser=begin_descent(self._optimiser(self.actor_learning_rate), actor),
-            critic_optimiser=begin_descent(self._optimiser(self.critic_learning_rate), critics),
+            actor_optimiser=self._optimiser(self.actor_learning_rate).init(actor),
+            critic_optimiser=self._optimiser(self.critic_learning_rate).init(critics),
             actor_loss=jnp.zeros(()),
-            observations=begin_statistics(spec.observation_size, self.normalise_observations),
+            observations=make_statistics(spec.observation_size, self.normalise_observations),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:

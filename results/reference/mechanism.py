@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from csac.algorithms.adaptation import Weights, weights_now
+from csac.algorithms.adaptation import Weights, current_weights
 from csac.algorithms.critics import least_q_value
 from csac.algorithms.csac import CSAC, State
 from csac.algorithms.distributions import kl, policy_at
@@ -94,7 +94,7 @@ def reference_of(algorithm: CSAC, state: State, updates: int) -> MLP:
 
 def weights_of(algorithm: CSAC) -> Weights:
     """Return σ and τ."""
-    return weights_now((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
+    return current_weights((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
 
 
 def parts_of_the_gradient(

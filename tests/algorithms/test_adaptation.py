@@ -29,10 +29,10 @@ from csac.algorithms.adaptation import (
     LEAST_WEIGHT,
     MOST_WEIGHT,
     Weights,
-    adapted,
-    begin_weights,
+    adapt_weights,
+    current_weights,
+    make_weights,
     weight_loss,
-    weights_now,
 )
 from csac.algorithms.networks import make_optimiser
 from csac.training.learner import Learner
@@ -46,12 +46,12 @@ def learn(relative_entropy_at, updates, target=0.02):
     """τ after some updates, where it brings about this relative entropy."""
 
     def one(learnt, _):
-        weights = weights_now(GIVEN, learnt)
+        weights = current_weights(GIVEN, learnt)
         slack = Weights(jnp.zeros(()), target - relative_entropy_at(weights.relative_entropy))
-        return adapted(learnt, slack, OPTIMISER), None
+        return adapt_weights(learnt, slack, OPTIMISER), None
 
-    learnt = begin_weights(GIVEN, Weights(1.0, 0.5), OPTIMISER)
-    return weights_now(GIVEN, jax.lax.scan(one, learnt, length=updates)[0])
+    learnt = make_weights(GIVEN, Weights(1.0, 0.5), OPTIMISER)
+    return current_weights(GIVEN, jax.lax.scan(one, learnt, length=updates)[0])
 
 
 def test_a_weight_settles_where_its_constraint_is_met():

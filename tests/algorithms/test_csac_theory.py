@@ -13,7 +13,7 @@ from scipy.special import logsumexp, softmax
 
 from csac.algorithms import CSAC, SAC
 from csac.algorithms import csac as csac_file
-from csac.algorithms.adaptation import weights_now
+from csac.algorithms.adaptation import current_weights
 from csac.types import Spec, Transition
 
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(80)
@@ -34,7 +34,7 @@ def critic(inputs: jax.Array) -> jax.Array:
 
 
 def weights_of(algorithm):
-    return weights_now((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
+    return current_weights((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
 
 
 def actor_losses(algorithm, parameters, reference, noises):

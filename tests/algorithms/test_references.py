@@ -17,7 +17,7 @@ def references(choice, keeps_earlier, updates=8, period=3, rate=0.5):
         renews = jnp.asarray(k % period == 0)
         used: Any = references_before(choice, kept, earlier if keeps_earlier else None, actor, renews)
         found.append((float(used.actor), float(used.critic)))
-        assert used.valued is (used.actor if keeps_earlier else actor)
+        assert used.evaluated is (used.actor if keeps_earlier else actor)
         kept, earlier = reference_after(choice, used.actor, actor, rate), used.critic
     return found
 
