@@ -45,6 +45,8 @@ _MISWRITTEN = (
     (r"--temperature ([\d.]\S*).*", r"write --temperature fixed --entropy-weight \1"),
 )
 
+_DASHED_NUMBER = re.compile("-(inf(inity)?|nan)", re.IGNORECASE)
+
 
 class HelpShown(Exception):
     """A command's help was asked for, and is printed."""
@@ -197,12 +199,17 @@ def _swallowed(arguments: list[str]) -> str:
 
 def _stranger(arguments: list[str], command: type[Any], elsewhere: Mapping[str, type[Any]]) -> str | None:
     """Return what is wrong with the first option that there is not, which tyro tells last of all that is wrong."""
-    known = _options(command)
-    known |= {f"--no-{option[2:]}": "" for option, off in known.items() if off.startswith("--no-")}
+    own, before = _options(command), ""
+    known = own | {f"--no-{option[2:]}": "" for option, off in own.items() if off.startswith("--no-")}
     for word in arguments:
         option = word.partition("=")[0].replace("_", "-")
-        if re.match(r"--?[A-Za-z]", word) and option not in known and not re.fullmatch(r"-(inf|nan)", option):
+        if word == "--":
+            break
+        if re.match(r"--?[A-Za-z]", word) and option not in known and not _DASHED_NUMBER.fullmatch(word):
+            if own.get(before) == "" and (" " in option or not word.startswith("--")):
+                return f"{before} needs a value; one that begins with a dash is written {before}={word}"
             return _unknown(word, command, elsewhere)
+        before = option
     return None
 
 

@@ -317,7 +317,7 @@ def _latency(arguments: list[str]) -> int:
     console, measured = make_console(), {}
     if options.plot:
         check_new(options.plot, "picture", ".png")
-    for path in options.artefacts:  # all is refused before any is measured
+    for path in options.artefacts:  # bad arguments are refused before any is measured
         check_measurement(open_artefact(path), options.calls, options.rate, options.seconds)
     for path in options.artefacts:
         console.print(f"measuring {path}", soft_wrap=True)  # once: what moves on a terminal takes time from a core

@@ -41,9 +41,9 @@ class Train(Options):
     start_from: Annotated[str | None, arg(name="from", metavar="DIR[@STEP]", help_behavior_hint="(default: none)")] = (
         None
     )
-    """Start from a copy of another run's checkpoint; whatever is not given here stays as it was there."""
+    """Start from a copy of another run's checkpoint; what is learnt and how it is evaluated stay, unless given here."""
     events: Annotated[str | None, arg(metavar="NAME,...", help_behavior_hint="(default: the task's own)")] = None
-    """Names to record from the info of an evaluation episode's last step: each becomes a column and a curve."""
+    """More names to record from the info of an evaluation episode's last step: each becomes a column and a curve."""
     env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
     """Keyword arguments for the environment, as a JSON object."""
     perturb: Annotated[
@@ -58,7 +58,7 @@ class Train(Options):
     groups: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
     """Processes to split the seeds over."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
-    """Processes that evaluate while their group trains on; 0 evaluates in between. The results are the same."""
+    """Processes per group that evaluate while it trains on; 0 evaluates in between. The results are the same."""
     wandb: FlagCreatePairsOff[bool] = False
     """Also log to Weights & Biases: one run per seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
 

@@ -145,6 +145,11 @@ def words(text):
         ("runs --all", "there is no option --all (csac runs --help)"),
         ("evaluate --foo X", "there is no option --foo (csac evaluate --help)"),
         ("study show --foo", "there is no option --foo (csac study show --help)"),
+        (
+            "report X --title -foo",
+            "--title needs a value; one that begins with a dash is written --title=-foo (csac report --help)",
+        ),
+        ("report -- -nowhere", "-nowhere does not exist; give a run directory ('csac runs' lists them)"),
         ("train X --foo 3 --steps abc", "there is no option --foo (csac train --help)"),
         (
             "train X --directory-of run",

@@ -80,6 +80,7 @@ def test_the_light_names_stay_light():
         ["evaluate", "run", "--trust-task", "--episodes", "40", "--processes", "2", "--csv", "episodes.csv"],
         ["evaluate", "run", "--trust-task", "--stochastic", "--perturb", "action_noise=0.1"],
         ["play", "run", "--trust-task", "--video", "film.mp4"],
+        ["report", "run", "--curve", "curve.png"],
     ],
     ids=" ".join,
 )

@@ -138,12 +138,14 @@ class Reporter:
         directory, csac = shlex.quote(str(run.path)), program()
         lines = [("curve", str(run.path / "curve.png"))] if has_curve else []
         if (run.path / "policy").exists():
-            film = shlex.quote(str(run.path / "play.mp4"))
-            if run.manifest.task_is_callable:  # which no command line can name
-                lines.append(("test it", f"in Python: evaluate(load({str(run.path)!r}), {run.manifest.task})"))
+            one, film = run.manifest, shlex.quote(str(run.path / "play.mp4"))
+            is_sound = len(one.failures) < len(one.seeds)
+            if one.task_is_callable:  # which no command line can name
+                task = one.task if one.task.isidentifier() else "your_task"
+                more = f", environment_arguments={one.environment_arguments}" if one.environment_arguments else ""
+                lines += [("test it", f"in Python: evaluate(load({str(run.path)!r}), {task}{more})")] * is_sound
             else:
                 lines.append(("test it", f"{csac} evaluate {directory}"))
-                is_sound = len(run.manifest.failures) < len(run.manifest.seeds)
                 lines += [("watch it", f"{csac} play {directory} --video {film}")] * is_sound
         for label, line in lines:
             self._print(Text.assemble((f"{label:<9}", "dim"), line))

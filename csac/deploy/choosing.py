@@ -58,11 +58,17 @@ def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
     return Policy.load(folder / SAVED, artefact.policy)
 
 
+def no_policies(run: RunDirectory) -> InputError:
+    """Return what to raise for a run without policies."""
+    when = "any more" if len(run.evaluations) else "yet: its first evaluation writes them"
+    return InputError(f"{run.path} holds no policies {when}")
+
+
 def choose_seed(run: RunDirectory, seed: int | None = None) -> int:
     """Return the label of the seed that `load` takes. Raises InputError as `load` does."""
     seeds = run.seeds_with_policies()
     if not seeds:
-        raise InputError(f"{run.path} holds no policies yet: its first evaluation writes them")
+        raise no_policies(run)
     if seed is None:
         return _best_seed(run, _without_failed(run, seeds))
     if isinstance(seed, bool) or not isinstance(seed, Integral):

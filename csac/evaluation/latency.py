@@ -25,6 +25,7 @@ OBSERVATIONS = 1024  # that are gone through in turn
 WARM_UP = 1_000  # calls that nobody counts
 MOST_CALLS = 100_000_000  # of one measurement: each takes 16 bytes
 MOST_SECONDS = 1e9  # that are waited for a call: more nanoseconds would not be a number in C
+SLOWEST = 10  # times the time between two calls that are due: a measurement takes as many times as long as was asked
 SECONDS_OF_A_PART = 0.25  # of a measurement at a rate: between two parts a Ctrl-C is heard
 
 
@@ -61,8 +62,8 @@ def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, s
         seconds: how long calls are made at the rate, at least one and at most as many; 0 leaves that out.
 
     Raises:
-        InputError: no artefact there, nothing here to run it with, arguments out of their range, or a rate at which
-            calls are due sooner than one can be made.
+        InputError: no artefact there, nothing here to run it with, arguments out of their range, or a rate that is
+            more than ten times what calls can be made at.
     """
     artefact = open_artefact(path)
     rate = check_measurement(artefact, calls, rate, seconds)
@@ -74,9 +75,11 @@ def measure(path: str | Path, calls: int = 100_000, rate: float | None = None, s
     several = [Latency(durations)]
     if seconds:
         part, period = max(1, round(rate * SECONDS_OF_A_PART)), round(NANOSECONDS / rate)
-        if period < (usual := np.median(durations)):
+        usual = float(np.median(durations))
+        if usual > SLOWEST * period:
             raise InputError(
-                f"at {rate:g} Hz a call is due every {period:,} ns, and one takes {usual:,.0f} ns: give a lower --rate"
+                f"{path}: at {rate:g} Hz a call is due every {period:,} ns, and one takes {usual:,.0f} ns: "
+                "give a lower rate"
             )
         several.append(Latency(*_in_parts(make_calls, round(rate * seconds), part, period), rate))
     return several

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from csac.deploy.choosing import load
+from csac.deploy.choosing import load, no_policies
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.atomic import check_name
@@ -181,8 +181,7 @@ def _follow(environment: Environment) -> None:
 def _seeds_with_policies(run: RunDirectory) -> list[int]:
     seeds = run.seeds_with_policies()
     if not seeds:
-        over = len(run.evaluations) > 0
-        raise InputError(f"{run.path} holds no policy {'any more' if over else 'yet: its first evaluation writes one'}")
+        raise no_policies(run)
     return seeds
 
 

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
     from csac.record.manifest import Manifest
     from csac.record.summaries import OverSeeds
-    from csac.studies.results import Record, Source
+    from csac.studies.collected import Record
+    from csac.studies.results import Source
     from csac.studies.study import Study
 
 

@@ -117,7 +117,7 @@ class Show(Chosen):
     no_measure: FlagCreatePairsOff[bool] = False
     """Do not time anything; use only what was measured before."""
     results: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: none)")] = None
-    """Count cells that csac study run --results has collected here as complete."""
+    """Count cells that csac study run --results has collected here as over."""
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from csac.record.csv_tables import COLUMNS, read_rows, write_rows
 from csac.record.run import RunDirectory
 from csac.studies.cells import Cell, is_final, is_in_use, read_history, write_history
+from csac.studies.collected import ROLLOUTS
 from csac.tasks.perturbations import Perturbation, perturbations_of, values_at
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-
-ROLLOUTS = "rollouts.csv"
 
 
 @dataclass(frozen=True)

@@ -5,38 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import Protocol
 
 from csac.record import manifest as manifests
 from csac.record.atomic import write_atomically
-from csac.record.csv_tables import COLUMNS, read_rows
+from csac.record.csv_tables import COLUMNS
 from csac.record.run import RunDirectory
 from csac.studies.cells import Cell, Status, Store, is_final, read_history
-from csac.studies.job import ROLLOUTS
+from csac.studies.collected import ROLLOUTS, Record, read_collected, read_rollouts, rollouts_of
 from csac.types import InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from csac.record.manifest import Manifest
-
-
-class Record(NamedTuple):
-    """What one cell has given: its manifest, the seconds that it took as far as they are known, and its tables."""
-
-    manifest: Manifest
-    seconds: float
-    evaluations: np.ndarray
-    rollouts: np.ndarray | None
-    interrupted: bool | None = None
-    """Whether it was ever stopped and resumed, None where that was not written down."""
-    longer: int = 0
-    """Steps of the longer run that it is the beginning of, 0 where it is a run of its own."""
-
-    @property
-    def failure(self) -> str:
-        """Why it failed, or nothing."""
-        return "; ".join(self.manifest.failures.values()) if self.manifest.state == "failed" else ""
 
 
 class Source(Protocol):
@@ -59,7 +36,7 @@ class Runs:
         if not is_final(path):
             return None
         run, seconds = RunDirectory.open(path), read_history(path).get("seconds", 0.0)
-        tables = run.evaluations, _rows(path / ROLLOUTS)
+        tables = run.evaluations, read_rollouts(path / ROLLOUTS)
         return Record(run.manifest, seconds, *tables, bool(run.manifest.history))
 
 
@@ -139,34 +116,5 @@ def collect(store: Store, cell: Cell, directory: str | Path) -> None:
     write_atomically(path, (json.dumps(fields, indent=1) + "\n").encode())
 
 
-def find_collected(directory: str | Path) -> list[Path]:
-    """Return the manifests of the cells that were collected in this directory and below it."""
-    return sorted(Path(directory).rglob("seed-*.json"))
-
-
-def read_collected(path: Path) -> Record:
-    """Return what a cell has given whose manifest was collected at this path.
-
-    Raises:
-        InputError: it is no cell's, or its tables are missing or damaged.
-    """
-    try:
-        content = path.read_bytes()
-        manifest, told = manifests.read(content), json.loads(content)
-    except (InputError, OSError) as error:
-        raise InputError(f"{path} is not a cell's: {error}") from None
-    tables = read_rows(path.with_suffix(".csv")), _rows(rollouts_of(path))
-    return Record(manifest, told.get("seconds", 0.0), *tables, told.get("interrupted"))
-
-
-def rollouts_of(path: Path) -> Path:
-    """Return where the fresh episodes of the cell are whose manifest was collected at this path, if there are any."""
-    return path.with_name(f"{path.stem}.{ROLLOUTS}")
-
-
 def _whatever_its_length(cell: Cell) -> str:
     return dataclasses.replace(cell, steps=0).key
-
-
-def _rows(path: Path) -> np.ndarray | None:
-    return read_rows(path) if path.exists() else None

@@ -25,9 +25,9 @@ from csac.record.summary_tables import case_comparison_table, comparison_table
 from csac.studies import sections
 from csac.studies.aggregates import over_tasks
 from csac.studies.arms import Arm, Time, by_condition, with_rows
+from csac.studies.collected import ROLLOUTS, find_collected, read_collected, rollouts_of
 from csac.studies.figures import tells_of_success
 from csac.studies.parts import Heading, Items, Paragraph, write
-from csac.studies.results import find_collected, read_collected, rollouts_of
 from csac.studies.sections import Scope, described, marks_of, plain, report_looks
 from csac.studies.standing import wall_times
 from csac.tasks.perturbations import perturbations_of
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from csac.record.manifest import Manifest
     from csac.studies.parts import Part
 
-ROLLOUTS = "rollouts.csv"  # as a study leaves them in a run
 TableName = Literal["returns", "recovery", "cases"]
 
 
@@ -69,7 +68,8 @@ class Comparison:
     @property
     def has_rows(self) -> bool:
         """Whether any run has an evaluation that counts."""
-        return any(len(arm.rows) for arm in self.arms())
+        steps = [run.rows["step"] for run in self.runs]
+        return any(len(one) if self.until is None else (one <= self.until).any() for one in steps)
 
     def arms(self) -> list[Arm]:
         """Return the arms: runs of one label on each task, or else runs that differ in their seeds alone.

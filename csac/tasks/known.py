@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable
+from collections.abc import Collection
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +15,7 @@ from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
 INSTALL = "pip install '.[robots]' in a clone of csac"
 RESERVED = frozenset({"seed", "step", "episode", "return", "length", "success"})  # columns that there are anyway
@@ -184,7 +184,7 @@ def check_events(events: Sequence[str]) -> None:
     """Raise InputError for a name that cannot be a column of evaluations.csv and a tag of TensorBoard."""
     if isinstance(events, str):
         raise InputError(f"events are a list of names: write ({events!r},)")
-    if not isinstance(events, Iterable):
+    if not isinstance(events, Collection):
         raise InputError(f"events are a list of names such as ('collision',), not {events!r:.40}")
     for name in events:
         if (

@@ -181,7 +181,8 @@ _SEVERAL = ("several groups need", "groups=1")
 
 def _choose_events(task: Task, given: Sequence[str] | None, before: Manifest | None) -> tuple[str, ...]:
     """Return the events asked for beside the task's own; without a word those of the run that this one continues."""
-    check_events(given or ())
+    if given is not None:
+        check_events(given)
     if given is None and before:
         return before.events
     return events_of(task, given or ())

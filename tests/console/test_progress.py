@@ -169,19 +169,23 @@ def test_the_end_shows_results_and_what_to_type_next(plain, clock, tmp_path):
 
 
 def test_what_is_to_be_typed_next_works(plain, clock, tmp_path):
-    failed, of_python = (make_run(tmp_path / name, [[1.0]]) for name in ("failed", "of_python"))
-    for run in (failed, of_python):
+    names = ("failed", "of_python", "nameless")
+    failed, of_python, nameless = runs = [make_run(tmp_path / name, [[1.0]]) for name in names]
+    for run in runs:
         (run.path / "policy").mkdir()
     failed.update_manifest(failures={0: "step 5: reward is nan"})  # whose best seed nobody can watch
     of_python.update_manifest(task="make_task", task_is_callable=True)  # which no command line can name
+    nameless.update_manifest(task="Pendulum-v1", task_is_callable=True, environment_arguments={"g": 9.0})
     reporter = Reporter(plain, clock)
-    for run in (failed, of_python):
+    for run in runs:
         reporter.start(run.manifest.task, "csac", [0], 1000, run.path)
         reporter.finish(run)
 
     shown = lines(plain)
     assert f"test it  csac evaluate {failed.path}" in shown
     assert f"test it  in Python: evaluate(load('{of_python.path}'), make_task)" in shown
+    more = "your_task, environment_arguments={'g': 9.0}"
+    assert f"test it  in Python: evaluate(load('{nameless.path}'), {more})" in shown
     assert "watch it" not in plain.file.getvalue()
 
 

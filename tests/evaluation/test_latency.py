@@ -155,7 +155,7 @@ def test_a_rate_that_no_call_can_keep_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(latency, "WARM_UP", 10)
     folder = leave(tmp_path / "numpy", "numpy")
     assert main(["latency", str(folder), *shlex.split("--calls 20 --rate 1e9 --seconds 0.01")]) == 2
-    assert re.search(r"at 1e\+09 Hz a call is due every 1 ns, and one takes [\d,]+ ns", capsys.readouterr().err)
+    assert re.search(r"numpy: at 1e\+09 Hz a call is due every 1 ns, and one takes [\d,]+ ns", capsys.readouterr().err)
 
 
 def test_an_observation_lies_between_the_bounds_that_a_task_has(tmp_path):

@@ -14,7 +14,8 @@ from csac.cli import main
 from csac.studies import commands
 from csac.studies.calibration import Calibration, Cost, predict
 from csac.studies.cells import HOME, Cell, Store, write_history
-from csac.studies.job import ROLLOUTS, Ended, Started, Stopped
+from csac.studies.collected import ROLLOUTS
+from csac.studies.job import Ended, Started, Stopped
 from csac.studies.results import Results, Runs, collect
 from csac.studies.study import cells_of, read_study
 

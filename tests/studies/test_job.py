@@ -15,7 +15,8 @@ from csac.evaluation.evaluator import EvaluationEpisode
 from csac.record.run import RunDirectory
 from csac.studies import job as module
 from csac.studies.cells import Store, read_history, write_history
-from csac.studies.job import ROLLOUTS, Ended, Job, execute, is_over
+from csac.studies.collected import ROLLOUTS
+from csac.studies.job import Ended, Job, execute, is_over
 from csac.studies.results import Results, collect
 
 

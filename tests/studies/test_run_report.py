@@ -163,12 +163,15 @@ def test_a_run_directory_goes_before_what_lies_beside_it(capsys):
 
 def test_damaged_cells_are_told_by_their_file(capsys):
     collected("cells", [[10.0]])
-    Path("cells/seed-0.csv").unlink()
+    Path("cells/seed-0.csv").write_text("seed,step\n0\n")
     assert csac("report cells") == 2
-    assert "cannot read cells/seed-0.csv" in capsys.readouterr().err
+    assert "cells/seed-0.csv" in capsys.readouterr().err
     Path("cells/seed-0.json").write_text("{}")
     assert csac("report cells") == 2
     assert "cells/seed-0.json is not a cell's" in capsys.readouterr().err
+    Path("cells/seed-0.csv").unlink()  # then it is a file of another kind, as a study keeps of its runs
+    assert csac("report cells") == 2
+    assert "cells holds no run" in capsys.readouterr().err
 
 
 # A report of runs.

@@ -12,7 +12,7 @@ from csac.record.csv_tables import structured
 from csac.record.manifest import EvaluationPlan, Machine, Manifest
 from csac.record.run import RunDirectory
 from csac.studies.cells import Cell
-from csac.studies.results import Record
+from csac.studies.collected import Record
 
 COLUMNS = ("seed", "step", "episode", "return", "length", "success", "out_of_bounds", "collision", "env_complete")
 COMMIT = "0123456789" * 4

@@ -41,6 +41,7 @@ LEARNERS = {
     "sd3": SD3(noise_samples=5, **SMALL),
     "ppo": PPO(rollout_steps=128, minibatches=4, hidden_sizes=(32, 32)),
 }
+LATER = {"csac, strong, 1", "sac, strong, 1"}  # of which some machines have nothing yet
 TABLES = ("evaluations.csv", "episodes.csv", "metrics.csv")
 
 
@@ -83,8 +84,8 @@ def given() -> dict[str, str]:
 
 @pytest.mark.parametrize(("name", "seeds"), CASES)
 def test_the_numbers_are_those_that_were_written_down(given, name, seeds):
-    case, known = f"{name}, {seeds}", json.loads(DIGESTS.read_text()).get(machine(), {})
-    if case not in known:
+    case, known = f"{name}, {seeds}", json.loads(DIGESTS.read_text()).get(machine())
+    if known is None or (case in LATER and case not in known):
         pytest.skip(f"nothing was written down for {case} on such a machine: {machine()}")
     assert given[case] == known[case]
 
