@@ -39,6 +39,7 @@ NAVIGATION = {
         "docs/from-stable-baselines3",
         "docs/tasks",
         "docs/perturbations",
+        "docs/deploy",
         "docs/studies",
         "docs/cluster",
         "docs/tuning",
@@ -46,9 +47,11 @@ NAVIGATION = {
         "docs/reliability",
         "docs/glossary",
     ],
-    "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")],
+    "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")]
+    + ["docs/relative-entropy"],
     "Measured": [
         "docs/performance",
+        "docs/statistics",
         "docs/gpu",
         "benchmarks/README",
         "results/*/*",
