@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms.networks import descend
+from csac.algorithms.networks import descend, init_optimiser
 from csac.algorithms.shapes import Scalar
 from csac.types import Metrics
 
@@ -58,7 +58,7 @@ def make_weights(
 
     def begin(weight: Weight, value: Scalar | float) -> LearntWeight | None:
         log_weight = jnp.log(jnp.float32(value))
-        return LearntWeight(log_weight, optimiser.init(log_weight)) if weight == "auto" else None
+        return LearntWeight(log_weight, init_optimiser(optimiser, log_weight)) if weight == "auto" else None
 
     return LearntWeights(*map(begin, given, first)) if "auto" in given else None
 

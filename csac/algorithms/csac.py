@@ -32,7 +32,7 @@ from csac.algorithms.hyperparameters import (
     validate_hyperparameters,
 )
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.networks import MLP, copy_tree, descend, init_optimiser, make_mlp, make_optimiser, polyak
 from csac.algorithms.references import ReferencePolicy, reference_after, references_before
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.algorithms.statistics import Statistics, make_statistics, normalise, normalise_batch, normaliser_of
@@ -302,8 +302,8 @@ class CSAC:
             reference=None if self.relative_entropy_form == "implicit" else copy_tree(actor),
             critics=critics,
             target_critics=make_targets(critics, self.critic_normalisation),
-            actor_optimiser=self._optimiser(self.actor_learning_rate).init(actor),
-            critic_optimiser=self._optimiser(self.critic_learning_rate).init(critics),
+            actor_optimiser=init_optimiser(self._optimiser(self.actor_learning_rate), actor),
+            critic_optimiser=init_optimiser(self._optimiser(self.critic_learning_rate), critics),
             earlier_reference=copy_tree(actor) if self.critic_reference == "earlier" else None,
             learnt_weights=make_weights(
                 (self.entropy_weight, self.relative_entropy_weight),

@@ -90,6 +90,11 @@ def make_optimiser(
     return adam
 
 
+def init_optimiser(optimiser: optax.GradientTransformation, parameters: Any) -> Any:
+    """Return the optimiser's first state for these parameters. Optax's types know no modules; ours need not."""
+    return optimiser.init(parameters)
+
+
 def descend(
     optimiser: optax.GradientTransformation, loss: Callable, parameters: Any, optimiser_state: Any, *examples: Any
 ) -> tuple[Any, Any, Metrics]:

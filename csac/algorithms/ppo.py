@@ -22,7 +22,7 @@ from csac.algorithms.hyperparameters import (
     validate_hyperparameters,
 )
 from csac.algorithms.memory import Rollout
-from csac.algorithms.networks import MLP, descend, make_optimiser, make_orthogonal_mlp
+from csac.algorithms.networks import MLP, descend, init_optimiser, make_optimiser, make_orthogonal_mlp
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar, Scalars
 from csac.algorithms.statistics import EPSILON, Statistics, normalise
 from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
@@ -265,7 +265,7 @@ class PPO:
         )
         return State(
             parameters=parameters,
-            optimiser=self._optimiser(self.learning_rate).init(parameters),
+            optimiser=init_optimiser(self._optimiser(self.learning_rate), parameters),
             observations=Statistics.create((spec.observation_size,)),
             returns=Statistics.create(()),
             discounted_return=jnp.zeros(()),

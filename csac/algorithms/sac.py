@@ -24,7 +24,7 @@ from csac.algorithms.hyperparameters import (
     validate_hyperparameters,
 )
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.networks import MLP, descend, init_optimiser, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.algorithms.statistics import Statistics, make_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
@@ -201,9 +201,9 @@ class SAC:
             critics=critics,
             target_critics=make_targets(critics, self.critic_normalisation),
             log_temperature=log_temperature,
-            actor_optimiser=self._optimiser(self.actor_learning_rate).init(actor),
-            critic_optimiser=self._optimiser(self.critic_learning_rate).init(critics),
-            temperature_optimiser=make_optimiser(self.temperature_learning_rate).init(log_temperature),
+            actor_optimiser=init_optimiser(self._optimiser(self.actor_learning_rate), actor),
+            critic_optimiser=init_optimiser(self._optimiser(self.critic_learning_rate), critics),
+            temperature_optimiser=init_optimiser(make_optimiser(self.temperature_learning_rate), log_temperature),
             observations=make_statistics(spec.observation_size, self.normalise_observations),
             actor_metrics=make_first_metrics(("actor_loss", "entropy"), self.policy_delay),
         )

@@ -22,7 +22,7 @@ from csac.algorithms.hyperparameters import (
     validate_hyperparameters,
 )
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.networks import MLP, copy_tree, descend, init_optimiser, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
@@ -177,8 +177,8 @@ class SD3:
             critic=critic,
             target_actor=copy_tree(actor),
             target_critic=copy_tree(critic),
-            actor_optimiser=self._optimiser(self.actor_learning_rate).init(actor),
-            critic_optimiser=self._optimiser(self.critic_learning_rate).init(critic),
+            actor_optimiser=init_optimiser(self._optimiser(self.actor_learning_rate), actor),
+            critic_optimiser=init_optimiser(self._optimiser(self.critic_learning_rate), critic),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:

@@ -30,7 +30,7 @@ from csac.algorithms.hyperparameters import (
     validate_hyperparameters,
 )
 from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp, make_optimiser, polyak
+from csac.algorithms.networks import MLP, copy_tree, descend, init_optimiser, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.algorithms.statistics import Statistics, make_statistics, normalise, normalise_batch, normaliser_of
 from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
@@ -164,8 +164,8 @@ class TD3:
             target_actor=copy_tree(actor),
             critics=critics,
             target_critics=make_targets(critics, self.critic_normalisation),
-            actor_optimiser=self._optimiser(self.actor_learning_rate).init(actor),
-            critic_optimiser=self._optimiser(self.critic_learning_rate).init(critics),
+            actor_optimiser=init_optimiser(self._optimiser(self.actor_learning_rate), actor),
+            critic_optimiser=init_optimiser(self._optimiser(self.critic_learning_rate), critics),
             actor_loss=jnp.zeros(()),
             observations=make_statistics(spec.observation_size, self.normalise_observations),
         )

@@ -14,7 +14,7 @@ from equations import ONE, batch_of, linear, transition
 
 from csac.algorithms import CSAC, SAC, TD3
 from csac.algorithms.critics import Critics, make_critics, normalised_critic_loss, q_values, update_critics
-from csac.algorithms.networks import BATCH, make_optimiser
+from csac.algorithms.networks import BATCH, init_optimiser, make_optimiser
 from csac.algorithms.normalisation import EPSILON, Moments, fold, fold_layer, moments_of, normalised_pass
 from csac.types import Layer, Spec, Transition
 
@@ -127,7 +127,7 @@ def test_loss_and_gradient_are_those_of_one_pass_over_both_batches():
 def test_the_critics_of_the_actors_loss_are_the_new_ones_by_the_moments_of_the_step():
     optimiser, batch = make_optimiser(0.1), transitions(1)
     critics = make_critics(jax.random.key(0), SPEC, (8, 8))
-    given = (optimiser, critics, None, optimiser.init(critics), batch, NOISE)
+    given = (optimiser, critics, None, init_optimiser(optimiser, critics), batch, NOISE)
     learnt = update_critics(*given, critic_target=soft_target, next_action=next_action)
     assert set(learnt.metrics) == {"critic_loss", "q_mean"}
 

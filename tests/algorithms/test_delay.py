@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from csac.algorithms import CSAC, SAC, TD3
-from csac.algorithms.networks import make_optimiser
+from csac.algorithms.networks import init_optimiser, make_optimiser
 from csac.types import InputError, Spec, Transition
 
 SPEC = Spec(3, 2)
@@ -135,7 +135,7 @@ def test_adam_by_hand():
     # Gradients 1 and 3 with β₁ = 0.5, β₂ = 0.999: corrected means 1 and (0.5·0.5·1 + 0.5·3)/0.75 = 7/3, corrected
     # squares 1 and (0.999·1 + 9)/1.999. Steps of 0.1: 1/√1, then (7/3)/√5.002001.
     optimiser, parameter = make_optimiser(0.1, momentum=0.5), jnp.zeros(())
-    state, steps = optimiser.init(parameter), []
+    state, steps = init_optimiser(optimiser, parameter), []
     for gradient in (1.0, 3.0):
         step, state = optimiser.update(jnp.float32(gradient), state, parameter)
         steps.append(np.asarray(step).item())
