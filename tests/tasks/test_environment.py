@@ -86,9 +86,9 @@ def test_a_task_that_cannot_be_learnt_is_refused(task, message):
 @pytest.mark.parametrize(
     ("name", "space", "message"),
     [
-        ("action_space", spaces.Box(-np.inf, np.inf, (2,)), "no bounds"),
-        ("action_space", spaces.Box(-1e300, 1e300, (2,), np.float64), "no bounds"),
-        ("action_space", spaces.Box(np.array([-1.0, -np.inf]), np.ones(2), dtype=np.float64), "no bounds"),
+        ("action_space", spaces.Box(-np.inf, np.inf, (2,)), "infinite bounds"),
+        ("action_space", spaces.Box(-1e300, 1e300, (2,), np.float64), "infinite bounds"),
+        ("action_space", spaces.Box(np.array([-1.0, -np.inf]), np.ones(2), dtype=np.float64), "infinite bounds"),
         ("action_space", spaces.Box(0, 5, (2,), np.int64), "continuous"),
         ("action_space", spaces.MultiDiscrete([2, 3]), "continuous"),
         ("action_space", spaces.Tuple([UNIT]), "continuous"),
@@ -143,7 +143,7 @@ def test_the_advice_for_actions_without_bounds_works():
 
     with pytest.raises(InputError) as refusal:
         Environment(task)
-    advice = str(refusal.value).rpartition("give it some, as ")[2].removesuffix(" does")
+    advice = str(refusal.value).rpartition("give it finite ones, as ")[2].removesuffix(" does")
     bounded = Environment(lambda: eval(advice, {"gymnasium": gymnasium, "environment": task()}))
     bounded.reset(0)
     bounded.step(np.array([0.5, -2.0], np.float32))
