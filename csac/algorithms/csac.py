@@ -22,15 +22,7 @@ from csac.algorithms.adaptation import (
 from csac.algorithms.critics import Critics, Normalisation, least_q_value, make_critics, make_targets, update_critics
 from csac.algorithms.delay import improve_delayed, make_first_metrics
 from csac.algorithms.distributions import action_at, bounded, kl, log_ratio, policy_at
-from csac.algorithms.hyperparameters import (
-    COUNT,
-    DISCOUNT,
-    NOT_NEGATIVE,
-    POSITIVE,
-    RATE,
-    WIDTHS,
-    validate_hyperparameters,
-)
+from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, check_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import MLP, copy_tree, descend, init_optimiser, make_mlp, make_optimiser, polyak
 from csac.algorithms.references import ReferencePolicy, reference_after, references_before
@@ -136,7 +128,7 @@ class CSAC:
     name: ClassVar[str] = "csac"
 
     def __post_init__(self) -> None:
-        validate_hyperparameters(self, INCOMPATIBLE)
+        check_hyperparameters(self, INCOMPATIBLE)
         self._refuse_idle_references()
 
     def critic_target(

@@ -38,9 +38,7 @@ WIDTHS = Limit(
 LARGEST = 2**31 - 1  # compiled programs count in 32 bits
 
 
-def validate_hyperparameters(
-    algorithm: Any, incompatible: Iterable[tuple[Mapping[str, Sequence[Any]], str]] = ()
-) -> None:
+def check_hyperparameters(algorithm: Any, incompatible: Iterable[tuple[Mapping[str, Sequence[Any]], str]] = ()) -> None:
     """Take an algorithm's fields as plain Python values, and refuse one outside its range or its choices.
 
     NumPy's scalars become Python's, and lists tuples, so that what is recorded does not depend on how it was given.

@@ -19,7 +19,7 @@ from csac.algorithms.hyperparameters import (
     POSITIVE,
     SHARE,
     WIDTHS,
-    validate_hyperparameters,
+    check_hyperparameters,
 )
 from csac.algorithms.memory import Rollout
 from csac.algorithms.networks import MLP, descend, init_optimiser, make_optimiser, make_orthogonal_mlp
@@ -102,7 +102,7 @@ class PPO:
     name: ClassVar[str] = "ppo"
 
     def __post_init__(self) -> None:
-        validate_hyperparameters(self)
+        check_hyperparameters(self)
         if self.rollout_steps % self.minibatches:
             raise InputError(
                 f"minibatches must divide rollout_steps into equal parts: {self.rollout_steps} steps make no "

@@ -14,15 +14,7 @@ from jaxtyping import Array, Float
 from csac.algorithms.critics import Critics, Normalisation, least_q_value, make_critics, make_targets, update_critics
 from csac.algorithms.delay import improve_delayed, make_first_metrics
 from csac.algorithms.distributions import action_at, policy_at
-from csac.algorithms.hyperparameters import (
-    COUNT,
-    DISCOUNT,
-    NOT_NEGATIVE,
-    POSITIVE,
-    RATE,
-    WIDTHS,
-    validate_hyperparameters,
-)
+from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, check_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import MLP, descend, init_optimiser, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
@@ -95,7 +87,7 @@ class SAC:
     name: ClassVar[str] = "sac"
 
     def __post_init__(self) -> None:
-        validate_hyperparameters(self)
+        check_hyperparameters(self)
         if self.temperature == "automatic" and self.entropy_weight == 0:
             raise InputError("entropy_weight must be more than 0 to begin an automatic temperature")
 

@@ -12,15 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from csac.algorithms.critics import Critics, least_q_value, make_critic, q_value
-from csac.algorithms.hyperparameters import (
-    COUNT,
-    DISCOUNT,
-    NOT_NEGATIVE,
-    POSITIVE,
-    RATE,
-    WIDTHS,
-    validate_hyperparameters,
-)
+from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, check_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import MLP, copy_tree, descend, init_optimiser, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
@@ -93,7 +85,7 @@ class SD3:
     name: ClassVar[str] = "sd3"
 
     def __post_init__(self) -> None:
-        validate_hyperparameters(self)
+        check_hyperparameters(self)
 
     def critic_target(
         self,

@@ -20,15 +20,7 @@ from csac.algorithms.critics import (
     q_value,
     update_critics,
 )
-from csac.algorithms.hyperparameters import (
-    COUNT,
-    DISCOUNT,
-    NOT_NEGATIVE,
-    POSITIVE,
-    RATE,
-    WIDTHS,
-    validate_hyperparameters,
-)
+from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, check_hyperparameters
 from csac.algorithms.memory import Replay, replay_cadence
 from csac.algorithms.networks import MLP, copy_tree, descend, init_optimiser, make_mlp, make_optimiser, polyak
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
@@ -95,7 +87,7 @@ class TD3:
     name: ClassVar[str] = "td3"
 
     def __post_init__(self) -> None:
-        validate_hyperparameters(self)
+        check_hyperparameters(self)
 
     def critic_target(
         self, transition: Transition, noise: Action, *, target_actor: MLP, target_critics: Critics
