@@ -352,11 +352,13 @@ def _report(arguments: list[str]) -> int:
     options = parse(Report, arguments, "csac report")
     from csac.studies import run_report as reports  # matplotlib is slow to import
 
+    place = options.place()
     runs = reports.read_runs(options.runs, options.labels(), lambda error: print(f"damaged: {error}", file=sys.stderr))
     comparison = reports.Comparison(runs, options.perturb, options.until)
-    if options.into:
-        page, name = options.place()
-        reports.write_table(comparison, page, name, options.table)
+    reports.refuse_places(comparison, options.curve, options.out)
+    if place:
+        page, name = place
+        reports.write_table(comparison, page, name, options.table or "returns")
         _say(str(page))
     if options.curve:
         reports.draw_curves(comparison, options.curve, options.title)

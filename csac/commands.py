@@ -302,7 +302,9 @@ class Report:
     """Where to write the report (in a directory: report.html); a Markdown version and the figures go beside it."""
     into: Annotated[str | None, arg(metavar="FILE.md#NAME", help_behavior_hint="(default: none)")] = None
     """Instead of a report, write one table into a page, between <!-- NAME: begin --> and <!-- NAME: end -->."""
-    table: Literal["returns", "recovery", "cases"] = "returns"
+    table: Annotated[Literal["returns", "recovery", "cases"] | None, arg(help_behavior_hint="(default: returns)")] = (
+        None
+    )
     """The table for --into."""
     curve: Annotated[Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")] = None
     """Instead of a report, draw the learning curves to this file."""
@@ -315,9 +317,13 @@ class Report:
                 raise InputError(f"--label is written NAME=DIR,DIR, not {text!r}")
         return [(name, [Path(path) for path in paths.split(",")]) for name, paths in pairs]
 
-    def place(self) -> tuple[Path, str]:
+    def place(self) -> tuple[Path, str] | None:
         """Return the page and the name of its markers. Raises InputError where --into is not written FILE.md#NAME."""
-        page, _, name = (self.into or "").rpartition("#")
+        if self.into is None:
+            if self.table:
+                raise InputError("--table chooses what --into writes: give --into FILE.md#NAME too")
+            return None
+        page, _, name = self.into.rpartition("#")
         if not (page and name):
             raise InputError(f"--into is written FILE.md#NAME, not {self.into!r}")
         return Path(page), name

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from csac.studies import sections
 from csac.studies.aggregates import over_tasks
 from csac.studies.arms import Arm, Time, by_condition, with_rows
 from csac.studies.collected import ROLLOUTS, find_collected, read_collected, rollouts_of
+from csac.studies.configurations import differing, filled_in, labels, merged, settings_of, unlike
 from csac.studies.figures import tells_of_success
 from csac.studies.parts import Heading, Items, Paragraph, write
 from csac.studies.sections import Scope, described, marks_of, plain, report_looks
@@ -108,19 +109,29 @@ class Comparison:
         condition = manifests[0].perturbations if manifests else self.perturbations
         task = manifests[0].task if manifests else ""
         arm = Arm(runs[0].label or "", task, tuple(map(str, perturbations_of(condition))))
+        end = max(self._end(run) for run in runs)
         for run in runs:
             failed = run.manifest.failures if run.manifest else {}
             rows = run.rows[~np.isin(run.rows["seed"], list(failed))]
             rows = rows if self.until is None else rows[rows["step"] <= self.until]
             arm.failures.update(failed)
+            if run.manifest and _is_on_its_way(run.manifest) and self._end(run) < end:
+                arm.missing += sorted(set(run.manifest.seeds) - failed.keys())
+                arm.manifests.append(run.manifest)
+                continue
             arm.evaluations.append(rows)
             arm.tests += self._tests(run, rows, failed)
             if run.manifest:
                 arm.manifests.append(run.manifest)
                 arm.times += run.times
         if manifests:
-            arm.algorithm, arm.hyperparameters = manifests[0].algorithm, _merged([_settings(one) for one in manifests])
+            arm.algorithm, arm.hyperparameters = manifests[0].algorithm, merged([settings_of(one) for one in manifests])
         return arm
+
+    def _end(self, run: Given) -> int:
+        """Return the step of a run's last evaluation that counts."""
+        steps = run.rows["step"]
+        return int((steps if self.until is None else steps[steps <= self.until]).max(initial=0))
 
     def _tests(self, run: Given, rows: np.ndarray, failed: Mapping[int, str]) -> list[np.ndarray]:
         """Return the fresh episodes of a run, or those of its last evaluation, where they tell of what happens.
@@ -145,7 +156,7 @@ class Comparison:
             }
             for one in manifests
         ]
-        for name in _differing(told)[:1]:
+        for name in differing(told)[:1]:
             values = " and ".join(dict.fromkeys(plain(one[name]) for one in told))
             raise InputError(f"{label}: its runs differ in {name}, {values}; give each a label of its own")
 
@@ -169,12 +180,22 @@ def read_runs(
     runs = (*plain_ones.values(), *labelled)
     if not runs:
         raise InputError("there is nothing to report on: give run directories ('csac runs' lists them)")
-    return runs
+    manifests = filled_in([run.manifest for run in runs])
+    return tuple(run._replace(manifest=manifest) for run, manifest in zip(runs, manifests, strict=True))
 
 
 def default_page() -> Path:
     """Return where a report goes that is given no place; nothing is created."""
     return Path("runs", "reports", datetime.now().strftime("%Y%m%d-%H%M%S"), "report.html")
+
+
+def refuse_places(comparison: Comparison, curve: Path | None, page: Path | None) -> None:
+    """Raise InputError for a picture or a page that there cannot be, so that nothing is written before it is told."""
+    if curve:
+        _kind_of(curve)
+        _one_group(comparison.arms())
+    if page:
+        _page(page)
 
 
 def write_run_report(comparison: Comparison, path: Path, title: str | None, commands: Sequence[str]) -> Path:
@@ -185,10 +206,7 @@ def write_run_report(comparison: Comparison, path: Path, title: str | None, comm
     Raises:
         InputError: it cannot be written, or the runs do not go together.
     """
-    path = path / "report.html" if path.is_dir() else path
-    if path.suffix != ".html":
-        raise InputError(f"the report is a page: name it {path.with_suffix('.html')}")
-    arms = comparison.arms()
+    path, arms = _page(path), comparison.arms()
     title = title or ", ".join(dict.fromkeys(arm.task for arm in arms if arm.task)) or "Runs"
     scope = Scope(path.stem, looks=report_looks([arm.label for arm in arms]))
     write(path, title, list(_parts(comparison, arms, scope, title, commands)))
@@ -224,17 +242,34 @@ def write_between(page: Path, name: str, text: str) -> None:
 
 def draw_curves(comparison: Comparison, path: Path, title: str | None) -> None:
     """Draw the learning curves of runs of one task as one picture. Raises InputError for several tasks."""
-    groups = by_condition(comparison.arms())
-    if len(groups) > 1:
-        raise InputError("these runs are of several tasks or perturbations: one picture would mix them")
-    ((task, condition), arms), *_ = groups.items()
-    kind = path.suffix[1:]
-    if kind not in ("png", "pdf", "svg"):
-        raise InputError(f"a picture is a .png, .pdf or .svg file, not {path}")
+    kind = _kind_of(path)
+    (task, condition), arms = _one_group(comparison.arms())
     try:
         learning_curve([(arm.label, arm.rows) for arm in arms], path, title or task, marks_of(condition), (kind,))
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+
+
+def _page(path: Path) -> Path:
+    path = path / "report.html" if path.is_dir() else path
+    if path.suffix != ".html":
+        raise InputError(f"the report is a page: name it {path.with_suffix('.html')}")
+    return path
+
+
+def _kind_of(picture: Path) -> str:
+    kind = picture.suffix[1:]
+    if kind not in ("png", "pdf", "svg"):
+        raise InputError(f"a picture is a .png, .pdf or .svg file, not {picture}")
+    return kind
+
+
+def _one_group(arms: Sequence[Arm]) -> tuple[tuple[str, tuple[str, ...]], list[Arm]]:
+    """Return the task and condition of these arms, and the arms."""
+    groups = list(by_condition(arms).items())
+    if len(groups) > 1:
+        raise InputError("these runs are of several tasks or perturbations: one picture would mix them")
+    return groups[0]
 
 
 def _tables(arms: Sequence[Arm], kind: TableName) -> list[Table]:
@@ -251,7 +286,7 @@ def _tables(arms: Sequence[Arm], kind: TableName) -> list[Table]:
                 sections.recoveries_table(own, marks_of(condition), index) for index in range(len(marks_of(condition)))
             ]
         title = described(task, condition) if len(groups) > 1 else ""
-        tables += [table._replace(title=title) for table in found if table]
+        tables += [table._replace(title=title, note=f"{table.note} {_behind(own)}".strip()) for table in found if table]
     return tables
 
 
@@ -267,10 +302,14 @@ def _parts(
     if failed:
         yield Paragraph("Seeds that failed are in no number below.")
         yield Items(tuple(failed))
+    if behind := _behind(arms):
+        yield Paragraph(behind)
     if plainly := [arm for arm in shown if not arm.condition]:
         yield from sections.curves(plainly, scope)
     if shown:
         yield from sections.returns(shown, scope)
+        if changing := unlike(shown):
+            yield Paragraph(f"Not the same on every task, see Hyperparameters: {', '.join(changing)}.")
         yield from over_tasks(arms, scope)
     if perturbed := [arm for arm in shown if arm.condition]:
         yield from sections.robustness(perturbed, scope)
@@ -305,14 +344,25 @@ def _hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
         return
     yield Heading("Hyperparameters")
     for (task, condition), own in by_condition(known).items():
-        if names := _differing([arm.hyperparameters for arm in own]):
+        if names := differing([arm.hyperparameters for arm in own]):
             rows = [Row((Cell(name), *(Cell(plain(arm.hyperparameters.get(name))) for arm in own))) for name in names]
             headings = (f"what differs on {described(task, condition)}", *(arm.label for arm in own))
             yield Table(headings, tuple(rows))
-    differing = _differing([arm.hyperparameters for arm in known])
-    same = {name: value for name, value in known[0].hyperparameters.items() if name not in differing}
+    if changing := list(_between_tasks(known)):
+        tasks = dict.fromkeys(arm.task for arm in known)
+        yield Table(("what differs between tasks", "hyperparameter", *tasks), tuple(changing))
+    others = differing([arm.hyperparameters for arm in known])
+    same = {name: value for name, value in known[0].hyperparameters.items() if name not in others}
     rows = [Row((Cell(name), Cell(plain(value)))) for name, value in same.items()]
     yield Table(("the same in all", "value"), tuple(rows))
+
+
+def _between_tasks(arms: Sequence[Arm]) -> Iterator[Row]:
+    tasks = dict.fromkeys(arm.task for arm in arms)
+    for label, names in unlike(arms).items():
+        for name in names:
+            values = {arm.task: plain(arm.hyperparameters.get(name)) for arm in arms if arm.label == label}
+            yield Row((Cell(label), Cell(name), *(Cell(values.get(task, "")) for task in tasks)))
 
 
 def _read(path: Path, label: str | None, on_damaged: Callable[[InputError], None] | None) -> list[Given]:
@@ -340,46 +390,31 @@ def _given_cell(label: str | None, path: Path) -> Given:
     return Given(label, path.with_suffix(".csv"), cell.evaluations, one, rollouts_of(path), took)
 
 
+def _is_on_its_way(manifest: Manifest) -> bool:
+    """Whether a run is being made, or was stopped and can go on."""
+    return manifest.state not in ("finished", "failed")
+
+
+def _behind(arms: Sequence[Arm]) -> str:
+    """Say which seeds are in no number since others of their arm have come further; nothing where there are none."""
+    behind = [f"{arm.label}, seed {seed}" for arm in arms for seed in arm.missing]
+    told = "Left out, as others of the same have come further (--until STEP compares what all have made)"
+    return f"{told}: {'; '.join(behind)}." if behind else ""
+
+
 def _key(run: Given) -> str:
     """Return what runs without a label have in common that are one arm."""
     one = run.manifest
     if not one:
         return f"file {run.path}"
-    fields = [one.task, one.algorithm, one.perturbations, _settings(one)]
+    fields = [one.task, one.algorithm, one.perturbations, settings_of(one)]
     return f"run {json.dumps(fields, sort_keys=True, default=str)}"
 
 
-def _settings(manifest: Manifest) -> dict[str, Any]:
-    """Return what a run was given that its numbers depend on, beside task, algorithm and perturbations."""
-    settings = {**manifest.hyperparameters, "steps": manifest.steps}
-    settings |= {
-        "evaluation interval": manifest.evaluation.interval,
-        "evaluation episodes": manifest.evaluation.episodes,
-        "evaluation seed": manifest.evaluation.first_seed,
-    }
-    settings |= {f"environment: {name}": value for name, value in manifest.environment_arguments.items()}
-    return settings
-
-
-def _merged(several: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the settings of an arm; of one that is not the same in all its runs, every value that it has."""
-    told = {
-        name: "; ".join(dict.fromkeys(plain(settings.get(name)) or "none" for settings in several))
-        for name in _differing(several)
-    }
-    return {**several[0], **told}
-
-
 def _named(arms: list[Arm], firsts: Sequence[Given]) -> list[Arm]:
-    """Give a label to each arm that has none: what learns, and how it differs from others of that name beside it."""
-    names = [arm.label or _name(run) for arm, run in zip(arms, firsts, strict=True)]
-    keys = [(name, arm.task, arm.condition) for name, arm in zip(names, arms, strict=True)]
-    labels = []
-    for arm, name, key in zip(arms, names, keys, strict=True):
-        beside = [other.hyperparameters for other, its_key in zip(arms, keys, strict=True) if its_key == key]
-        told = [f"{item} {plain(arm.hyperparameters.get(item))}" for item in _differing(beside)]
-        labels.append(name if arm.label else ", ".join([name, *told]))
-    keys = [(label, arm.task, arm.condition) for label, arm in zip(labels, arms, strict=True)]
+    """Give a label to each arm that has none; arms that it does not tell apart are told by where they are."""
+    names = labels(arms, [arm.label or _name(run) for arm, run in zip(arms, firsts, strict=True)])
+    keys = [(label, arm.task, arm.condition) for label, arm in zip(names, arms, strict=True)]
     return [
         replace(arm, label=f"{key[0]}, {run.path}" if keys.count(key) > 1 else key[0])
         for arm, key, run in zip(arms, keys, firsts, strict=True)
@@ -391,11 +426,6 @@ def _name(run: Given) -> str:
     if not one:
         return run.path.stem
     return one.algorithm.upper() + (f" ({one.preset})" if one.preset else "")
-
-
-def _differing(several: Sequence[Mapping[str, Any]]) -> list[str]:
-    names = dict.fromkeys(name for settings in several for name in settings)
-    return [name for name in names if len({plain(settings.get(name)) for settings in several}) > 1]
 
 
 def _seeds(runs: Sequence[Given]) -> set[int]:

@@ -218,7 +218,54 @@ def test_runs_of_one_label_that_differ_are_told_with_every_value():
     text = report("--label both=a,b --label c=c")
     assert "| both | 20 ± 14 | 10 | 2 |" in text
     assert "| discount | 0.99; 0.9 | 0.9 |" in text
-    assert "| policy_delay | none; 2 |  |" in text
+    assert "| policy_delay | 1; 2 | 1 |" in text  # an older run has the default of what is newer than it
+
+
+def test_a_run_from_before_a_hyperparameter_is_one_arm_with_what_has_its_default():
+    make_run_of("runs/old", [[10.0]], seeds=(0,))
+    make_run_of("runs/new", [[30.0]], seeds=(1,), hyperparameters={"policy_delay": 1, "adam_momentum": 0.9})
+    assert "| SAC | 20 ± 14 | 10 | 2 |" in report("runs")
+
+
+def test_a_method_has_one_label_on_all_tasks():
+    """Two weights on Ant make the weight a part of the label on Hopper too."""
+    for name, weight, task in (("a", 0.5, "Ant-v4"), ("b", 5.0, "Ant-v4"), ("c", 0.5, "Hopper-v4")):
+        given = {"relative_entropy_weight": weight}
+        make_run_of(f"runs/{name}", [[10.0]], algorithm="csac", task=task, hyperparameters=given)
+    text = report("runs")
+    assert text.count("| CSAC, relative_entropy_weight 0.5 | 10.00 |") == 2
+    assert "1 of 2 methods, 2 of 2 tasks, 1 of 1 seeds." in text
+    assert "Not the same on every task" not in text
+
+
+def test_a_method_that_is_another_on_another_task_is_told():
+    for name, discount, task, steps in (("a", 0.99, "Ant-v4", 100), ("b", 0.9, "Hopper-v4", 200)):
+        make_run_of(f"runs/{name}", [[10.0]], task=task, steps=steps, hyperparameters={"discount": discount})
+    text = report("runs")
+    assert "Not the same on every task, see Hyperparameters: SAC." in text
+    assert "| SAC | discount | 0.99 | 0.9 |" in text
+    assert "| SAC | steps |" not in text
+
+
+def test_a_seed_that_is_behind_the_others_is_in_no_number():
+    make_run_of("runs/a", [[100.0, 900.0], [100.0, 910.0]], seeds=(0, 1))
+    make_run_of("runs/b", [[200.0]], seeds=(2,), steps_done=10, state="interrupted")
+    text = report("runs")
+    assert "| SAC | 905 ± 7 | 20 | 2 |" in text
+    told = "Left out, as others of the same have come further (--until STEP compares what all have made): SAC, seed 2."
+    assert told in text
+    assert "| SAC | 133 ± 58 | 10 | 3 |" in report("runs --until 10")
+    assert table_of("--label it=runs")[2:] == [
+        "| it | 2 | 20 | 502 ± 4 | 2 seeds: no interval | 1.00 | 905 at 20 |",
+        "",
+        told.replace("SAC", "it"),
+    ]
+
+
+def test_seeds_that_are_equally_far_on_their_way_are_compared():
+    for seed in (0, 1):
+        make_run_of(f"runs/{seed}", [[10.0 + seed]], seeds=(seed,), steps_done=10, state="running")
+    assert "| SAC | 10.50 ± 0.71 | 10 | 2 |" in report("runs")
 
 
 def test_runs_of_one_label_are_as_long_as_what_is_left_of_them():
@@ -351,6 +398,10 @@ def test_returns_by_seed_and_step_are_enough():
         ("report --label a=a.csv --into page.md#x", "the page lacks the lines <!-- x: begin -->"),
         ("report --label a=a.csv --into none.md#x", "cannot write into none.md"),
         ("report --label a=a.csv --into page.md#it --table cases", "these runs have no table of cases"),
+        ("report --label a=a.csv --into page.md#it --curve a.gif", "a picture is a .png, .pdf or .svg file, not a.gif"),
+        ("report --label a=a.csv --into page.md#it --out a.pdf", "the report is a page: name it a.html"),
+        ("report run other --into page.md#it --curve a.png", "these runs are of several tasks"),
+        ("report run --table recovery", "--table chooses what --into writes: give --into FILE.md#NAME too"),
         ("report --label a=a.csv --curve a.gif", "a picture is a .png, .pdf or .svg file, not a.gif"),
         ("report --label a=a.csv --out a.pdf", "the report is a page: name it a.html"),
         ("report --label a=a.csv --out page.md/a.html", "cannot write page.md/a.html"),
@@ -390,3 +441,4 @@ def test_mistakes_are_told_in_one_line(capsys, line, message):
     (complaint,) = capsys.readouterr().err.splitlines()
     assert message in complaint
     assert sorted(path.name for path in Path().iterdir()) == before
+    assert Path("page.md").read_text() == "<!-- it: begin -->\n<!-- it: end -->\n"

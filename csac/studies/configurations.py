@@ -1,0 +1,94 @@
+"""What runs were given, and the labels that this gives them: what tells them apart from others of their name."""
+
+from __future__ import annotations
+
+import dataclasses
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from csac.studies.sections import plain
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from csac.record.manifest import Manifest
+    from csac.studies.arms import Arm
+
+LENGTH = "steps"
+
+
+def filled_in(manifests: Sequence[Manifest | None]) -> list[Manifest | None]:
+    """Return the manifests, with the default of each hyperparameter that an older run beside a newer one has not got.
+
+    That is what it did. One that this version does not understand stays as it is.
+    """
+    names: dict[str, set[frozenset[str]]] = {}
+    for one in filter(None, manifests):
+        names.setdefault(one.algorithm, set()).add(frozenset(one.hyperparameters))
+    return [_complete(one) if one and len(names[one.algorithm]) > 1 else one for one in manifests]
+
+
+def _complete(manifest: Manifest) -> Manifest:
+    from csac.studies.cells import complete  # which imports JAX
+
+    with suppress(InputError):
+        known = complete(manifest.algorithm, manifest.hyperparameters)
+        return dataclasses.replace(manifest, hyperparameters=known)
+    return manifest
+
+
+def settings_of(manifest: Manifest) -> dict[str, Any]:
+    """Return what a run was given that its numbers depend on, beside task, algorithm and perturbations."""
+    settings = {**manifest.hyperparameters, LENGTH: manifest.steps}
+    settings |= {
+        "evaluation interval": manifest.evaluation.interval,
+        "evaluation episodes": manifest.evaluation.episodes,
+        "evaluation seed": manifest.evaluation.first_seed,
+    }
+    settings |= {f"environment: {name}": value for name, value in manifest.environment_arguments.items()}
+    return settings
+
+
+def merged(several: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the settings of an arm; of one that is not the same in all its runs, every value that it has."""
+    told = {
+        name: "; ".join(dict.fromkeys(plain(settings.get(name)) or "none" for settings in several))
+        for name in differing(several)
+    }
+    return {**several[0], **told}
+
+
+def differing(several: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the settings that are not the same in all of these, one that is missing among them."""
+    names = dict.fromkeys(name for settings in several for name in settings)
+    return [name for name in names if len({plain(settings.get(name)) for settings in several}) > 1]
+
+
+def labels(arms: Sequence[Arm], names: Sequence[str]) -> list[str]:
+    """Return the label of each arm: its own, or its name, and how it differs from arms of that name beside it.
+
+    What tells arms apart on one task is told on every task, so that a method has one label.
+    """
+    apart = {name: _apart([arm for arm, its in zip(arms, names, strict=True) if its == name]) for name in set(names)}
+    return [
+        arm.label or ", ".join([name, *(f"{item} {plain(arm.hyperparameters.get(item))}" for item in apart[name])])
+        for arm, name in zip(arms, names, strict=True)
+    ]
+
+
+def _apart(arms: Sequence[Arm]) -> list[str]:
+    """Return the settings in which any arms on one task differ."""
+    places = dict.fromkeys((arm.task, arm.condition) for arm in arms)
+    beside = [[arm.hyperparameters for arm in arms if (arm.task, arm.condition) == place] for place in places]
+    return list(dict.fromkeys(name for own in beside for name in differing(own)))
+
+
+def unlike(arms: Sequence[Arm]) -> dict[str, list[str]]:
+    """Return the settings in which a label is not the same method on every task; its length is no part of a method."""
+    found = {}
+    for label in dict.fromkeys(arm.label for arm in arms):
+        names = differing([arm.hyperparameters for arm in arms if arm.label == label and arm.hyperparameters])
+        if names := [name for name in names if name != LENGTH]:
+            found[label] = names
+    return found
