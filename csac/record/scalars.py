@@ -50,14 +50,21 @@ class Scalars:
     `rollout/ep_rew_mean` and `rollout/ep_len_mean` are means over the last 100 training episodes, `eval/mean_reward`,
     `eval/mean_ep_length`, `eval/success_rate` and `eval/<event>` over one evaluation's episodes; `time/fps` is
     environment steps per second of this seed since the log was made, for a run that goes on from step `begin` since
-    then.
+    then. What such a run has in its tables already, `before`, counts in the means.
     """
 
-    def __init__(self, seeds: Sequence[int], begin: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        seeds: Sequence[int],
+        begin: int = 0,
+        before: Tables | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._begin = begin
         self._recent: dict[int, deque[tuple[float, int]]] = {seed: deque(maxlen=EPISODES_AVERAGED) for seed in seeds}
         self._cases: set[str] = set()  # events that happen or do not: where nobody speaks of one, it did not
         self._clock, self._began = clock, clock()
+        self.points(before or {})  # they were told when they were new
 
     def points(self, tables: Tables) -> list[Point]:
         """Return the points of these rows, by table: `episodes`, `metrics` and `evaluations`."""

@@ -23,16 +23,21 @@ FLUSH_SECONDS = 30
 
 
 class TensorBoardLog:
-    """Writes the curves of a run that goes on from step `begin` to `path/seed_<k>`.
+    """Writes the curves of a run that goes on from step `begin`, after the rows `before`, to `path/seed_<k>`.
 
     Whatever writes raises OSError where the disk is full.
     """
 
     def __init__(
-        self, path: Path, seeds: Sequence[int], begin: int = 0, clock: Callable[[], float] = time.monotonic
+        self,
+        path: Path,
+        seeds: Sequence[int],
+        begin: int = 0,
+        before: Tables | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._files = {seed: _SeedFile(path / f"seed_{seed}", begin) for seed in seeds}
-        self._scalars = Scalars(seeds, begin, clock)
+        self._scalars = Scalars(seeds, begin, before, clock)
 
     def write(self, tables: Tables) -> Sequence[str]:
         """Write the points of these rows, by table."""

@@ -43,6 +43,7 @@ class WandbLog:
         seeds: the labels of its seeds.
         begin: the step that it goes on from; 0 for a new run.
         project: W&B's project; None for the one that the run had before, or W&B's own WANDB_PROJECT, or "csac".
+        before: the rows that its tables have already, which count in means over several episodes.
         clock: seconds, for the speed.
 
     Raises:
@@ -55,14 +56,15 @@ class WandbLog:
         seeds: Sequence[int],
         begin: int = 0,
         project: str | None = None,
+        before: Tables | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._wandb = import_wandb()
-        self._run, self._scalars = run, Scalars(seeds, begin, clock)
-        before = _read(run)
-        self.project = project or before.get("project") or os.environ.get("WANDB_PROJECT") or DEFAULT_PROJECT
+        self._run, self._scalars = run, Scalars(seeds, begin, before, clock)
+        known = _read(run)
+        self.project = project or known.get("project") or os.environ.get("WANDB_PROJECT") or DEFAULT_PROJECT
         self.group = group_of(run)
-        logged = before.get("logged", {})
+        logged = known.get("logged", {})
         self._logged = {seed: int(logged.get(str(seed), 0)) for seed in seeds}
         self._waiting: SimpleQueue[list[Point] | None] = SimpleQueue()
         self._news: SimpleQueue[str] = SimpleQueue()

@@ -9,6 +9,7 @@ import jax
 
 from csac.types import InputError
 
+PRNG = "threefry2x32"  # runs are the same on every machine with the same keys
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda"}  # as JAX calls them
 
 
@@ -19,11 +20,16 @@ def choose_device(device: str) -> None:
     while it runs already. `JAX_CPU_ENABLE_ASYNC_DISPATCH=0` changes that and no number.
 
     Raises:
-        InputError: there is no such device, or this process has computed on another one.
+        InputError: there is no such device, this process has computed on another one, or JAX is set to numbers or keys
+            that csac does not compute with.
     """
     if device not in PLATFORMS:
         raise InputError(f"device must be cpu or gpu, not {device!r}")
     config: Any = jax.config
+    if config.jax_enable_x64:
+        raise InputError("csac computes in 32 bits and JAX is set to 64: unset JAX_ENABLE_X64 (jax_enable_x64)")
+    if config.jax_default_prng_impl != PRNG:
+        raise InputError(f"csac's keys are of JAX's {PRNG}: unset JAX_DEFAULT_PRNG_IMPL (jax_default_prng_impl)")
     before = config.jax_platforms
     jax.config.update("jax_platforms", PLATFORMS[device])
     try:

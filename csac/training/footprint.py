@@ -20,9 +20,12 @@ BYTES_PER_PROCESS = 600 * 2**20
 BYTES_PER_EVALUATION_PROCESS = 80 * 2**20
 
 
-def memory_needed(plan: Plan, spec: Spec) -> str:
-    """Return the line that predicts the memory needed. Raises InputError where it is more than there is."""
-    per_seed, seeds, groups = _bytes_per_seed(plan, spec), plan.seeds, len(plan.groups)
+def memory_needed(plan: Plan, spec: Spec, goes_on: bool = False) -> str:
+    """Return the line that predicts the memory needed. Raises InputError where it is more than there is.
+
+    A run that goes on from a checkpoint has its replay twice for a moment, as it was read and as JAX has it.
+    """
+    per_seed, seeds, groups = _bytes_per_seed(plan, spec, 2 if goes_on else 1), plan.seeds, len(plan.groups)
     evaluating = groups * plan.evaluation_processes
     needed = seeds * per_seed + groups * BYTES_PER_PROCESS + evaluating * BYTES_PER_EVALUATION_PROCESS
     available, limit = psutil.virtual_memory().available, memory_left()
@@ -38,15 +41,15 @@ def memory_needed(plan: Plan, spec: Spec) -> str:
     return f"{text} ({seeds} x {per_seed / 2**20:.0f} MiB, {processes} process{'es' if processes > 1 else ''}{beside})"
 
 
-def _bytes_per_seed(plan: Plan, spec: Spec) -> int:
-    """Return the size of what a seed learns and remembers, and of what one update needs beside it.
+def _bytes_per_seed(plan: Plan, spec: Spec, memories: int) -> int:
+    """Return the size of what a seed learns and remembers, `memories` times, and of what one update needs beside it.
 
-    That is the batch, and for each of its transitions a number for every unit of the networks, of which there are as
-    many as biases.
+    The latter is the batch, and for each of its transitions a number for every unit of the networks, of which there are
+    as many as biases.
     """
     algorithm, steps, key = plan.algorithm, plan.steps, jax.ShapeDtypeStruct((2,), "uint32")
     state, memory = jax.eval_shape(lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), key)
     transitions = algorithm.cadence.transitions_per_update
     units = sum(leaf.size for leaf in jax.tree.leaves(state) if len(leaf.shape) == 1)
-    kept = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((state, memory)))
+    kept = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((state, [memory] * memories)))
     return kept + 4 * transitions * (memory.rows.shape[1] + units)

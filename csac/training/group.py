@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from contextlib import closing
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -31,7 +30,7 @@ from csac.training.messages import (
     Settings,
 )
 from csac.training.seed_files import SeedFiles
-from csac.types import Snapshot
+from csac.types import InputError, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
@@ -54,12 +53,6 @@ class Evaluation(NamedTuple):
     def is_over(self) -> bool:
         """Whether it need not be waited for."""
         return self.running is None or self.running.is_over
-
-
-def train_group(settings: Settings, seeds: Sequence[int], should_stop: Callable[[], bool]) -> Iterator[GroupMessage]:
-    """Train `seeds` side by side and yield what happens, in order; the caller writes it down."""
-    with closing(Group(settings, seeds)) as group:
-        yield from group.run(should_stop)
 
 
 class Group:
@@ -242,7 +235,7 @@ class Group:
         for index, seed in enumerate(evaluation.policies):
             try:
                 episodes = yield from self._episodes(evaluation, index)
-            except EvaluationFailure as error:
+            except (EvaluationFailure, InputError) as error:  # the latter: the task cannot be made once more
                 self.environments.stop(self.seeds.index(seed))
                 yield Failed(seed, step, f"its evaluation failed: {error}", "", policies.pop(seed))
                 continue

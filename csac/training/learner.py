@@ -117,7 +117,10 @@ class Learner:
 
     def carry(self, index: int) -> Carry:
         """Return what the seed at this place carries, its state unpacked; views of NumPy, to read only."""
-        own = self._axis.of(jax.tree.map(np.asarray, self._carry), index)
+        return self._of_seed(self._carry, index)
+
+    def _of_seed(self, carry: Carry, index: int) -> Carry:
+        own = self._axis.of(jax.tree.map(np.asarray, carry), index)
         return own._replace(state=self._one.packing.unpack(own.state))
 
     def waiting(self, index: int) -> np.ndarray:
@@ -126,7 +129,8 @@ class Learner:
 
     def save(self, index: int) -> Snapshot:
         """Return what the seed at this place needs to go on, but for its memory."""
-        arrays = {name: np.array(leaf) for name, leaf in by_name(_lasting(self.carry(index))).items()}
+        own = self._of_seed(self._carry._replace(memory=None), index)  # a GPU's would be copied to the host
+        arrays = {name: np.array(leaf) for name, leaf in by_name(_lasting(own)).items()}
         values = {"updates_summed": self._updates_summed, "metrics": list(self._one.metrics)}
         return Snapshot({**arrays, "waiting": self._waiting[index].copy()}, values)
 
@@ -144,10 +148,13 @@ class Learner:
         for seed in saved:
             if problem := misfit(self.algorithm, self.spec, self._steps, seed):
                 raise InputError(f"the checkpoint does not fit: {problem}: go on with the csac that wrote it")
-        rows = np.zeros(self._carry.memory.rows.shape, self._carry.memory.rows.dtype)
+        memory = self._carry.memory
+        rows = np.zeros(memory.rows.shape, memory.rows.dtype)
+        memory = memory._replace(rows=None)  # a replay may fill half of what memory there is: never three at a time
+        self._carry = self._carry._replace(memory=memory)
         for index, fill in enumerate(memories):
             fill(self._axis.of(rows, index))
-        memory = self._carry.memory._replace(rows=jnp.array(rows))
+        memory = memory._replace(rows=jax.device_put(rows, may_alias=False))  # what is aliased cannot be donated
         lasting = _lasting(self._carry._replace(state=self._one.state))
         leaves = [jnp.array(self._axis.stack([seed.arrays[name] for seed in saved])) for name in by_name(lasting)]
         taken = Carry(memory=memory, **jax.tree.unflatten(jax.tree.structure(lasting), leaves))

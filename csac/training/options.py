@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from csac.checks import check_whole, did_you_mean
 from csac.record.manifest import SEED_LIMIT, STEPS_LIMIT
-from csac.synonyms import called_here
+from csac.synonyms import called_in_python
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -105,8 +104,6 @@ def checked_options(given: PlanOptions) -> tuple[Options, dict[str, Any]]:
 
 def _hint(name: str) -> str:
     """Return ": ..." with what an option is called here, or what is most like it, or nothing."""
-    flag, *known = ("--" + option.replace("_", "-") for option in (name, *PlanOptions.__annotations__))
-    if words := called_here(flag, known):
-        return ": " + re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), words)
-    similar = did_you_mean(name, PlanOptions.__annotations__)
-    return f": {similar}" if similar else ""
+    known = PlanOptions.__annotations__
+    hint = called_in_python(name, known) or did_you_mean(name, known)
+    return f": {hint}" if hint else ""

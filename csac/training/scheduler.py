@@ -14,12 +14,14 @@ from csac.processes import Child, core_quota, die_with_parent, move_to, usable_c
 from csac.training.checkpoint import remove_unfinished
 from csac.training.group import Group
 from csac.training.messages import (
+    TURN_STEPS,
     Boundary,
     Ended,
     GroupCrashed,
     GroupMessage,
     GroupRestarted,
     Message,
+    Noted,
     NotSaved,
     Order,
     Refused,
@@ -183,7 +185,9 @@ class _Scheduler:
         while running := [worker for worker in self.workers if not worker.over]:
             if not self.stopping and self.should_stop():
                 self.stopping = True
-                self._set_target()
+                late = self._set_target()
+                if late and self.checkpoints:
+                    yield 0, Noted(_not_waited_for(late, self._furthest(), self.checkpoints.newest))
             elif not self.stopping and self.settings.saves and self.timer.is_due() and not self._is_awaited():
                 self._set_target()
             ready = wait([worker.connection for worker in running], timeout=0.1)
@@ -249,19 +253,31 @@ class _Scheduler:
         else:
             self.waiting.append(worker)
 
-    def _set_target(self) -> None:
-        """Choose the next step that every group passes as the one to be saved at, and to stop at if that is asked."""
+    def _set_target(self) -> list[_Worker]:
+        """Choose the next step that every group passes as the one to be saved at, and to stop at if that is asked.
+
+        Return those that would keep the others waiting for too long: where there are any, there is no such step.
+        """
         self.timer.reset()
         living = [worker for worker in self.workers if not worker.over]
-        if any(worker.step == self.settings.plan.steps for worker in self.workers):
+        late = [worker for worker in living if self._is_late(worker)] if self._is_in_haste() else []
+        if late or not self.settings.saves:
+            self.target = -1
+        elif any(worker.step == self.settings.plan.steps for worker in self.workers):
             self.target = self.settings.plan.steps  # one has made all its steps, and the others are close behind
-        elif not self.settings.saves or (self._is_in_haste() and any(worker.is_starting for worker in living)):
-            self.target = -1  # a group that is still starting would keep the others waiting
         else:
             self.target = max(self._end_of_turn(worker) for worker in living)
         waiting, self.waiting = self.waiting, []
         for worker in waiting:
             self._next(worker)
+        return late
+
+    def _is_late(self, worker: _Worker) -> bool:
+        """Whether a group is still starting or, where a signal asks for a stop, was begun again and is far behind."""
+        return worker.is_starting or (self.stopping and self._furthest() - worker.step > LONGEST_LEAD + TURN_STEPS)
+
+    def _furthest(self) -> int:
+        return max(worker.step for worker in self.workers)
 
     def _is_in_haste(self) -> bool:
         """Whether nobody waits for one that is behind: not where a run ends that has enough, and is to end whole."""
@@ -291,6 +307,16 @@ class _Scheduler:
             worker = self.waiting.pop()
             worker.cores = self.free.pop(0)
             worker.tell(worker.cores)
+
+
+def _not_waited_for(late: Sequence[_Worker], furthest: int, newest: int | None) -> str:
+    told = [
+        f"seed{'s' * (len(worker.seeds) > 1)} {', '.join(map(str, worker.seeds))}, "
+        + ("still starting" if worker.is_starting else f"{furthest - worker.step:,} steps behind")
+        for worker in late
+    ]
+    where = f"step {newest:,}, its newest checkpoint" if newest else "the beginning"
+    return f"the run stops without waiting for {'; '.join(told)}: it can go on from {where}"
 
 
 def _work(connection: Connection, settings: Settings, seeds: list[int]) -> None:

@@ -9,6 +9,8 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from csac.checks import check_callable, check_path
 from csac.processes import end_if_unguarded
 from csac.record.manifest import as_kept
@@ -108,6 +110,10 @@ def train(
     check_callable("stop_when", stop_when)
     if directory is not None:
         check_path("directory", directory)
+    elif resume:
+        raise InputError(
+            "resume goes on with the run in `directory`: give one (csac.resume(directory) does without task)"
+        )
     if reporter is not None and not callable(getattr(reporter, "note", None)):
         raise InputError(f"reporter is an object such as csac.console.progress.Reporter(), not {reporter!r:.40}")
     if wandb:
@@ -115,7 +121,7 @@ def train(
     watchers = Watchers(reporter, tensorboard, wandb, on_evaluation, stop_when, [])
     before = Before.find(directory, resume, start_from)
     plan, spec = make_plan(algorithm, task, options, before, may_evaluate_beside=stop_when is None)
-    notes = [memory_needed(plan, spec), *_warmup_note(plan)]
+    notes = [memory_needed(plan, spec, goes_on=before.run is not None), *_warmup_note(plan)]
     manifest = wanted = as_kept(plan.manifest(**provenance(task, command)))
     has_schedule, defaults = algorithm.cadence.has_schedule, _defaults(algorithm)
     if before.existing:
@@ -142,7 +148,7 @@ def train(
         try:
             return _run(run, plan, notes, watchers, BEGINNING)
         except InputError:  # such as a script without a guard: once mended, it begins in the same directory
-            if not len(run.evaluations) and not steps_in(run.checkpoints):
+            if not (run.manifest.steps_done or len(run.evaluations) or steps_in(run.checkpoints)):
                 run.discard()
             raise
 
@@ -313,11 +319,21 @@ def _logs(run: RunDirectory, labels: list[int], begin: int, watchers: Watchers) 
     if watchers.tensorboard:
         from csac.record.tensorboard import TensorBoardLog
 
-        logs.append(TensorBoardLog(run.tensorboard, labels, begin))
+        logs.append(TensorBoardLog(run.tensorboard, labels, begin, _before(run, labels)))
     if watchers.wandb:
         project = watchers.wandb if isinstance(watchers.wandb, str) else None
-        logs.append(WandbLog(run, labels, begin, project))
+        logs.append(WandbLog(run, labels, begin, project, _before(run, labels)))
     return logs
+
+
+def _before(run: RunDirectory, labels: list[int]) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows that a run that goes on has already, of the tables that what comes next is averaged with."""
+    tables = {"episodes": run.rows("episodes"), "evaluations": run.evaluations}
+    return {name: _as_dicts(rows[np.isin(rows["seed"], labels)]) for name, rows in tables.items()}
+
+
+def _as_dicts(rows: np.ndarray) -> list[dict[str, Any]]:
+    return [dict(zip(rows.dtype.names or (), row, strict=True)) for row in rows.tolist()]
 
 
 def _leave(run: RunDirectory, recorder: Recorder) -> None:

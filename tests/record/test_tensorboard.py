@@ -1,3 +1,5 @@
+from contextlib import closing
+
 import pytest
 from scalars import purges, scalars
 
@@ -58,6 +60,18 @@ def test_evaluations_are_averaged_per_seed_and_step(log, tmp_path):
         "eval/mean_ep_length": [(10, 4.0)],
         "eval/success_rate": [(10, 0.0)],
     }
+
+
+def test_a_run_that_goes_on_averages_with_what_it_has_already(tmp_path):
+    """A hundred episodes of 1 to 100, success among them: the next point is the one of a run that was never stopped."""
+    episodes = [{"seed": 0, "step": 10 * i, "return": float(i), "length": 10} for i in range(1, 101)]
+    evaluation = {"seed": 0, "step": 1000, "episode": 0, "return": 1.0, "length": 4, "success": 1.0}
+    with closing(TensorBoardLog(tmp_path, [0], 1000, {"episodes": episodes, "evaluations": [evaluation]})) as log:
+        log.write({"episodes": [{"seed": 0, "step": 1010, "return": 101.0, "length": 10}]})
+        log.write({"evaluations": [{**evaluation, "step": 1020, "success": None}]})
+    told = scalars(tmp_path / "seed_0")
+    assert told["rollout/ep_rew_mean"] == [(1010, 51.5)]
+    assert told["eval/success_rate"] == [(1020, 0.0)]
 
 
 def test_closing_twice_is_harmless(log):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import TYPE_CHECKING, Any, NamedTuple
 from unittest.mock import patch
 
@@ -35,7 +36,7 @@ def run(
             learners.append(self)
 
     given = settings(algorithm, task, steps, environment_arguments=arguments, evaluation_episodes=episodes)
-    with patch.object(group, "Learner", Kept):
-        told = list(group.train_group(given, seeds, lambda: False))
+    with patch.object(group, "Learner", Kept), closing(group.Group(given, seeds)) as made:
+        told = list(made.run(lambda: False))
     carries = [learners[0].carry(index) for index in range(len(seeds))]
     return Outcome([carry.state for carry in carries], [carry.memory.rows for carry in carries], told)

@@ -10,7 +10,9 @@ from typing import Any
 import jax
 import pytest
 
+from csac.algorithms import SAC
 from csac.training.devices import choose_device
+from csac.training.train import train
 from csac.types import InputError
 
 
@@ -38,6 +40,25 @@ def test_a_process_that_has_computed_on_the_cpu_refuses_the_gpu():
 def test_another_device_is_refused():
     with pytest.raises(InputError, match="device must be cpu or gpu, not 'tpu'"):
         choose_device("tpu")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("jax_enable_x64", True, "csac computes in 32 bits and JAX is set to 64: unset JAX_ENABLE_X64"),
+        ("jax_default_prng_impl", "rbg", "csac's keys are of JAX's threefry2x32: unset JAX_DEFAULT_PRNG_IMPL"),
+    ],
+)
+def test_other_numbers_than_csac_s_are_refused_before_a_run_begins(tmp_path, name, value, message):
+    config: Any = jax.config
+    before = getattr(config, name)
+    config.update(name, value)
+    try:
+        with pytest.raises(InputError, match=message):
+            train(SAC(), "Pendulum-v1", steps=10, directory=tmp_path / "run")
+    finally:
+        config.update(name, before)
+    assert not (tmp_path / "run").exists()
 
 
 FIRST_THE_GPU = """

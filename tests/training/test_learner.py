@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import weakref
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ import pytest
 import safetensors.numpy
 import trainer  # noqa: F401  (its cache of compiled programs)
 
-from csac.algorithms import ALGORITHMS, CSAC, TD3
+from csac.algorithms import ALGORITHMS, CSAC, SAC, TD3
 from csac.algorithms.memory import row_width
 from csac.tasks.seeds import Steps
 from csac.training.checkpoint import SCHEMA_VERSION, Checkpoint, Checkpoints, Damaged
@@ -79,6 +80,15 @@ def test_what_was_saved_of_each_seed_is_taken_back(seeds):
             np.testing.assert_array_equal(ours, theirs)
     assert again.metrics() == learner.metrics()
     np.testing.assert_array_equal(advance(again, len(seeds), 11, 14), advance(learner, len(seeds), 11, 14))
+
+
+def test_the_memory_that_a_learner_begins_with_is_gone_before_the_saved_one_is_read():
+    """A replay may take half of a machine's memory: three at a time took a run along that had been trained there."""
+    learner = Learner(SAC(**TINY), SPEC, [0], 100)
+    saved, begun = learner.save(0), weakref.ref(learner._carry.memory.rows)
+    there = []
+    learner.take_back([saved], [lambda rows: there.append(begun())])
+    assert there == [None]
 
 
 def state_of(algorithm: CSAC) -> Snapshot:

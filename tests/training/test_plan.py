@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 import subprocess
 from typing import Any
 
@@ -11,10 +12,12 @@ import numpy as np
 import pytest
 
 from csac import PPO, SAC, train
+from csac.algorithms.memory import row_width
 from csac.record.manifest import Manifest
 from csac.training import provenance
+from csac.training.footprint import memory_needed
 from csac.training.options import Options, PlanOptions, checked_options
-from csac.training.plan import Before, Plan, _choose_parts
+from csac.training.plan import Before, Plan, _choose_parts, make_plan
 from csac.training.resume import Source
 from csac.training.train import _warmup_note
 from csac.types import InputError
@@ -87,6 +90,23 @@ def test_what_is_of_another_kind_is_refused_before_anything_is_made(tmp_path, gi
     with pytest.raises(InputError, match=message):
         train(SAC(), "Pendulum-v1", steps=10, directory=tmp_path / "run", **given)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_to_resume_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="resume goes on with the run in `directory`: give one"):
+        train(SAC(), "Pendulum-v1", steps=10, resume=True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_goes_on_has_room_for_its_replay_twice():
+    """As it was read from the disk, and as JAX has it."""
+    plan, spec = make_plan(
+        SAC(replay_size=2**20), "Pendulum-v1", {"steps": 2**20}, Before.find(None, False, None), True
+    )
+    replay, of_seed = 2**20 * row_width(spec) * 4, re.compile(r"1 x (\d+) MiB")
+    new, old = (int(of_seed.findall(memory_needed(plan, spec, goes_on))[0]) for goes_on in (False, True))
+    assert old - new == pytest.approx(replay / 2**20, abs=1)
 
 
 def test_a_batch_that_does_not_fit_is_refused_with_what_it_needs(tmp_path):

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from probes import Endless
+from resuming import SMALL
 
+from csac.algorithms import SAC
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.training.checkpoint import Checkpoint, Checkpoints, steps_in
 from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Refused, Rows, Saved
 from csac.training.recorder import Recorder
 from csac.training.seed_files import SeedFiles
+from csac.training.train import train
 from csac.types import InputError, Ring, Snapshot
 
 
@@ -101,3 +105,20 @@ def test_a_group_that_merely_stopped_makes_no_checkpoint_whole(recorder):
     saves(recorder, 0, 300)
     recorder.handle(1, Ended(0, {}))
     assert not steps_in(recorder.run.path / "checkpoint")
+
+
+def test_a_task_that_cannot_be_made_again_for_an_evaluation_costs_no_run(tmp_path):
+    """As a simulator that runs once on a machine: what was learnt went with the run directory."""
+    made = []
+
+    def only_one() -> Endless:
+        made.append(1)
+        if len(made) > 2:  # one that is asked for its spaces, and one to learn in
+            raise ConnectionError("port 5555 is taken")
+        return Endless()
+
+    with pytest.warns(RuntimeWarning, match="seed 0 of .* failed at step 50: its evaluation failed"):
+        run = train(SAC(**SMALL), only_one, steps=50, evaluation_interval=50, directory=tmp_path / "run")
+    assert run.manifest.state == "failed"
+    assert "port 5555 is taken" in run.manifest.failures[0]
+    assert (run.policy(0).exists(), len(run.rows("episodes"))) == (True, 5)

@@ -16,7 +16,7 @@ from resuming import SMALL, run
 from csac.algorithms import CSAC, SAC
 from csac.training import scheduler as scheduler_module
 from csac.training.checkpoint import Checkpoints, Damaged
-from csac.training.messages import Boundary, Ended, GroupCrashed, GroupRestarted, Refused, Saved
+from csac.training.messages import Boundary, Ended, GroupCrashed, GroupRestarted, Noted, Refused, Saved
 from csac.training.scheduler import _Scheduler
 
 
@@ -185,6 +185,31 @@ def test_a_run_that_has_enough_waits_for_a_group_that_is_starting_and_a_signal_d
     assert scheduler.target == target
     assert ahead.told == (["stop"] if urgent else ["save"])
     assert scheduler.waiting == ([] if urgent else [starting])
+
+
+@pytest.mark.parametrize(
+    ("steps", "target", "told"),
+    [
+        ((950_000, 900_000), -1, "seed 1, 50,000 steps behind: it can go on from step 900,000, its newest checkpoint"),
+        ((1_000_000, 900_000), -1, "seed 1, 100,000 steps behind: it can go on from step 900,000"),
+        ((950_000, 948_750), 950_000, None),  # no further than turns allow
+        ((1_000_000, 998_750), 1_000_000, None),
+    ],
+)
+def test_a_signal_waits_for_no_group_that_began_again_far_behind(tmp_path, monkeypatch, steps, target, told):
+    """Of 50,000 steps, minutes; whoever sends SIGTERM kills after seconds."""
+    SlowWorkers(monkeypatch, seconds=1.0)
+    settings = plans.settings(SAC(), "Hopper-v4", 1_000_000, tmp_path, checkpoint_interval=50_000)
+    checkpoints: Any = SimpleNamespace(newest=900_000)
+    scheduler: Any = _Scheduler(settings, [[0], [1]], lambda: True, checkpoints, lambda: True)
+    for worker, step in zip(scheduler.workers, steps, strict=True):
+        worker.step = worker.saved = worker.made = step
+    messages = [message for _, message in scheduler.run()]
+    assert scheduler.target == target
+    notes = [message.text for message in messages if isinstance(message, Noted)]
+    assert [told in note for note in notes] == [True] * bool(told)
+    ends = {message.step for message in messages if isinstance(message, Ended)}
+    assert ends == ({steps[0], steps[1] + 250} if told else {target})  # which it was making
 
 
 def test_a_worker_that_dies_while_it_waits_for_its_turn_gives_its_place_to_the_next(tmp_path, monkeypatch):
