@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import platform
 import shlex
 import shutil
 import sys
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
-import psutil
 import rich.table
 from rich import box
 from rich.console import Console
@@ -192,7 +190,7 @@ def print_runs(console: Console, runs: Sequence[RunDirectory]) -> None:
     for heading in headings:
         table.add_column(heading, justify="right" if heading in ("seeds", "steps", "last return") else "left")
     for run in runs:
-        manifest, state, last = run.manifest, _state(run), _last_return(run)
+        manifest, state, last = run.manifest, run.state, _last_return(run)
         task, algorithm, seeds = manifest.task, manifest.algorithm, len(manifest.seeds)
         steps = f"{short(manifest.steps_done)} / {short(manifest.steps)}"
         coloured = Text(state, STATE_STYLES.get(state, ""))
@@ -219,15 +217,6 @@ def _rows(results: Mapping[int, Sequence[EvaluationEpisode]]) -> np.ndarray:
         for name, value in (("success", episode.success), *((name, episode.events.get(name)) for name in events)):
             row[name] = np.nan if value is None else float(value)
     return rows
-
-
-def _state(run: RunDirectory) -> str:
-    """Return the state of the manifest, but see through a run whose process, on this machine, is no more."""
-    state, process = run.manifest.state, run.manifest.process
-    host = run.manifest.machine.host or platform.node()
-    if state == "running" and process and host == platform.node() and not psutil.pid_exists(process):
-        return "killed"
-    return state
 
 
 def _last_return(run: RunDirectory) -> str:

@@ -67,8 +67,9 @@ def c_header(network: PolicyNetwork, contract: ArtefactContract) -> str:
     ):
         if array is not None:
             arrays.add(name, array)
+    told = f"{contract.weights} {contract.noise_seed} {network.head} {guards.fallback} {guards.watchdog}"
     return template("policy.h.jinja").render(
-        identity=f"CSAC_POLICY_{hashlib.sha256(''.join(arrays.written).encode()).hexdigest()[:16]}",
+        identity=f"CSAC_POLICY_{hashlib.sha256(''.join([told, *arrays.written]).encode()).hexdigest()[:16]}",
         task=_in_comment(policy.task or "a task of its own"),
         algorithm=_in_comment(policy.algorithm),
         weights=contract.weights,

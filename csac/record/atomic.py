@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -13,8 +14,11 @@ if TYPE_CHECKING:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write beside `path`, sync, rename: a reader meets the old file or the whole new one, never a part."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    """Write beside `path`, sync, rename: a reader meets the old file or the whole new one, never a part.
+
+    Of several writers, on machines that share the folder too, one is the last.
+    """
+    aside = path.with_name(f".{path.name}.{_unique()}.{os.getpid()}")
     try:
         with open(aside, "wb") as file:
             file.write(data)
@@ -36,7 +40,7 @@ def check_name(path: Path, aside: Path) -> None:
 
 def create_atomically(path: Path, data: bytes) -> None:
     """As `write_atomically`, but raise FileExistsError where the name is taken."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}.new")
+    aside = path.with_name(f".{path.name}.{_unique()}.new")
     try:
         write_atomically(aside, data)
         try:
@@ -48,3 +52,8 @@ def create_atomically(path: Path, data: bytes) -> None:
             os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def _unique() -> str:
+    """Return what no other writer has: containers on several machines often have the same process number."""
+    return secrets.token_hex(4)

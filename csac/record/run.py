@@ -119,6 +119,12 @@ class RunDirectory:
         self.manifest = manifests.read(content)
 
     @property
+    def state(self) -> str:
+        """The state of the manifest; "killed" where that says "running" and no process holds the run's lock."""
+        state = self.manifest.state
+        return "killed" if state == "running" and fcntl and not is_locked(self.path / LOCK) else state
+
+    @property
     def checkpoints(self) -> Path:
         """The folder of its checkpoints."""
         return self.path / "checkpoint"
@@ -231,7 +237,7 @@ def now() -> str:
 
 def is_locked(path: str | Path) -> bool:
     """Whether a process holds the lock of this file, on this machine or on another that shares the folder."""
-    if fcntl is None:
+    if fcntl is None:  # Windows
         return False
     try:
         with open(path) as file:

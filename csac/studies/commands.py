@@ -180,7 +180,7 @@ def narrowed(
     """Narrow each of the studies to what it has of these tasks and algorithms; one that has nothing is left out.
 
     Raises:
-        InputError: none of them has one that is asked for.
+        InputError: none of them has one that is asked for, or these together.
     """
     known_tasks = dict.fromkeys(task for study in studies for task in study.tasks)
     known_algorithms = dict.fromkeys(name for study in studies for name in study.names)
@@ -196,6 +196,8 @@ def narrowed(
         own_names = [name for name in study.names if algorithms is None or name in algorithms]
         if own_tasks and own_names:
             chosen.append(study.narrowed(own_tasks, own_names, seeds))
+    if not chosen:
+        raise InputError(f"{' and '.join(study.name for study in studies)}: none has such a method on such a task")
     return chosen
 
 

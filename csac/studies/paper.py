@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 METHODS = ("CSAC", "SAC", "PPO", "TD3", "SD3")
-TRIALS = 5
 
 
 class Published(NamedTuple):

@@ -169,28 +169,28 @@ class SharedStudy:
 
     def complete(self, attempt: Attempt, returns: Mapping[int, float]) -> None:
         """Tell the study what a trial has reached."""
-        attempt.trial.set_user_attr("returns", {str(seed): value for seed, value in returns.items()})
-        self.study.tell(attempt.trial, float(np.mean(list(returns.values()))))
-        attempt.lock.close()
+        with self._ending(attempt):
+            attempt.trial.set_user_attr("returns", {str(seed): value for seed, value in returns.items()})
+            self.study.tell(attempt.trial, float(np.mean(list(returns.values()))))
 
     def prune(self, attempt: Attempt, failure: str = "") -> None:
         """Tell the study that a trial was not worth its end; where a seed of it failed, how."""
-        if failure:
-            attempt.trial.set_user_attr("failure", failure)
-        self.study.tell(attempt.trial, state=self._optuna.trial.TrialState.PRUNED)
-        attempt.lock.close()
+        with self._ending(attempt):
+            if failure:
+                attempt.trial.set_user_attr("failure", failure)
+            self.study.tell(attempt.trial, state=self._optuna.trial.TrialState.PRUNED)
 
     def give_back(self, attempt: Attempt) -> None:
         """Put a trial that was stopped back into the queue."""
-        self._requeue(attempt.trial.number, attempt.trial.params, attempt.trial.user_attrs)
-        attempt.lock.close()
+        with self._ending(attempt):
+            self._requeue(attempt.trial.number, attempt.trial.params, attempt.trial.user_attrs)
 
     def drop(self, attempt: Attempt) -> None:
         """Leave a trial out that could not begin; one whose configuration came from the queue goes back there."""
-        trial = self._all()[attempt.trial.number]
-        was_queued = "fixed_params" in trial.system_attrs
-        self._requeue(trial.number, *((trial.params, trial.user_attrs) if was_queued else ({}, {})))
-        attempt.lock.close()
+        with self._ending(attempt):
+            trial = self._all()[attempt.trial.number]
+            was_queued = "fixed_params" in trial.system_attrs
+            self._requeue(trial.number, *((trial.params, trial.user_attrs) if was_queued else ({}, {})))
 
     def results(self) -> list[Result]:
         """Return every trial, in order; one that was taken up again stands there once."""
@@ -288,6 +288,13 @@ class SharedStudy:
 
     def _lock(self, label: int) -> Path:
         return self.directory / "trials" / f"{label:04d}.lock"
+
+    @contextmanager
+    def _ending(self, attempt: Attempt) -> Iterator[None]:
+        """End a trial and let go of it at one stroke: a process between the two would take it for a lost one."""
+        with self._alone():
+            yield
+            attempt.lock.close()
 
     @contextmanager
     def _alone(self) -> Iterator[None]:

@@ -131,10 +131,11 @@ class Study:
 
     def conditions_for(self) -> tuple[tuple[str, ...], ...]:
         """Return the conditions, at steps that are shortened as the runs are."""
-        return tuple(
+        shortened = (
             tuple(str(replace(one, step=round(one.step * self.scale))) for one in perturbations_of(condition))
             for condition in self.conditions
         )
+        return tuple(dict.fromkeys(shortened))  # two may now be the same
 
     def entries(self) -> list[Entry]:
         """Return every cell: seed by seed, so that an unfinished study compares all methods on fewer seeds."""
@@ -208,8 +209,9 @@ def _study(name: str, told: dict[str, Any]) -> Study:
     _check_steps("steps", values.get("steps", Study.steps))
     if (last := values.get("first_seed", 0) + values.get("seeds", Study.seeds) - 1) >= SEED_LIMIT:
         raise InputError(f"the last seed would be {last:,}: seeds are below {SEED_LIMIT:,}")
-    for key in ("tasks", "conditions"):
-        if twice := _twice(values.get(key, ())):
+    written = [tuple(map(str, perturbations_of(one))) for one in values.get("conditions", ())]
+    for key, items in (("tasks", values["tasks"]), ("conditions", written)):
+        if twice := _twice(items):
             raise InputError(f"{key} has {twice} twice: its runs would count twice")
     check_events(values.get("events", ()))
     for task in values["tasks"]:

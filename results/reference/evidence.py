@@ -217,8 +217,8 @@ def task_table(task: str, arms: dict[str, Measured]) -> Table:
 
 def overall_table(study: Study, found: dict[str, dict[str, Measured]]) -> Table:
     """Return the scaled scores of the methods over all tasks."""
-    rows = []
-    for label, values in scaled(found, common_seeds(study, found)).items():
+    rows, shares = [], scaled(found, common_seeds(study, found))
+    for label, values in shares.items():
         interval = stratified_bootstrap_interval(values, interquartile_mean)
         cells = (
             Cell(label),
@@ -227,7 +227,7 @@ def overall_table(study: Study, found: dict[str, dict[str, Measured]]) -> Table:
             Cell(f"{values.min():.3f}", float(values.min())),
         )
         rows.append(Row(cells))
-    title = f"{study.title}: over {', '.join(found)}"
+    title = f"{study.title}: over {', '.join(found)}, as shares of {next(iter(shares))}"
     return Table(("method", "scaled mean", "scaled IQM", "worst seed"), tuple(rows), title)
 
 

@@ -428,6 +428,21 @@ def test_what_is_no_artefact_is_refused(tmp_path):
         open_artefact(tmp_path)
 
 
+def test_a_folder_of_artefacts_and_a_run_name_those_below(tmp_path):
+    policy, run = random_policy(contract()), tmp_path / "run"
+    formats: tuple[Format, ...] = ("numpy", "c")
+    for name in formats:
+        (run / "export" / name).mkdir(parents=True)
+        write_artefact(run / "export" / name, policy.network, ArtefactContract(policy.contract, name))
+    (run / "policy").mkdir()
+    contract().save(run / "policy" / "contract.json")
+    for place in (run, run / "export"):
+        with pytest.raises(InputError) as refusal:
+            open_artefact(place)
+        below = f"{run / 'export' / 'c'} or {run / 'export' / 'numpy'}"
+        assert str(refusal.value) == f"{place} holds no artefact itself: give {below}"
+
+
 def test_an_artefact_is_opened_by_its_file_too_and_by_no_other(tmp_path, format):
     artefact = leave(tmp_path, algorithm_policy("csac"), format)
     assert open_artefact(tmp_path / artefact.contract.file).format == format
@@ -554,10 +569,11 @@ def test_opening_leaves_nothing_in_the_folder(tmp_path, format):
 @needs_compiler
 def test_another_policy_in_one_source_file_is_refused_and_the_same_one_twice_is_not(tmp_path):
     """The second would be left out by its guard, and the first one's actions taken for its own."""
-    for name, seed in (("walk", 1), ("stand", 2)):
-        leave(tmp_path / name, random_policy(contract(), seed), "c")
+    for name, seed, watchdog in (("walk", 1, 2), ("stand", 2, 2), ("patient", 1, 3)):
+        policy = random_policy(contract(), seed)
+        leave(tmp_path / name, policy, "c", guards=make_guards(policy.contract, "middle", watchdog=watchdog))
     source = tmp_path / "main.c"
-    for second, compiles in (("walk", True), ("stand", False)):
+    for second, compiles in (("walk", True), ("stand", False), ("patient", False)):
         source.write_text(f'#include "walk/policy.h"\n#include "{second}/policy.h"\nint main(void) {{ return 0; }}\n')
         done = subprocess.run(["cc", "-c", source, "-o", tmp_path / "main.o"], capture_output=True, text=True)
         assert (done.returncode == 0) == compiles, done.stderr

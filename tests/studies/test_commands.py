@@ -364,6 +364,10 @@ def test_a_signal_is_an_exit_code_and_the_line_to_type(monkeypatch, capsys):
         ("study run tiny.toml --scale 2", "scale is a share of the steps"),
         ("study run tiny.toml --tasks Ant-v4", "tiny: no task 'Ant-v4': there is Hopper-v4"),
         ("study run smoke --tasks Swimmer-v4", "no task 'Swimmer-v4'"),
+        (
+            "study run smoke --tasks Hopper-v4 --algorithms 'CSAC (paper), tau 0.5'",
+            "none has such a method on such a task",
+        ),
         ("study run tiny.toml --engine kubernetes", "'kubernetes' is not one of"),
     ],
 )

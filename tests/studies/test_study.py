@@ -185,6 +185,10 @@ def test_what_methods_have_in_common_gives_way_to_presets_and_to_their_own(tmp_p
         (("replay_size = 150", "[[methods]]\nlabel = 'SAC'\nalgorithm = 'sac'"), "two methods are called 'SAC'"),
         (('tasks = ["Hopper-v4"]', 'tasks = ["Hopper-v4", "Hopper-v4"]'), "tasks has 'Hopper-v4' twice"),
         (("seeds = 2", "conditions = [[], []]"), "conditions has () twice"),
+        (
+            ("seeds = 2", "conditions = [['friction=2@10'], ['friction=2.0@1e1']]"),
+            "conditions has ('friction=2@10',) twice: its runs would count twice",
+        ),
         (("seeds = 2", "steps_on = {'Hopper-v4' = 5_000_000_000}"), "steps_on.Hopper-v4 must be at most"),
         (("seeds = 2", "seeds = 2\nfirst_seed = 4294967295"), "the last seed would be 4,294,967,296"),
         (("seeds = 2", "environment_arguments = {d = 2020-01-01}"), "environment_arguments holds numbers, texts"),

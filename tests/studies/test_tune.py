@@ -22,7 +22,7 @@ from csac.cli import main
 from csac.commands import Chosen
 from csac.presets import hyperparameters
 from csac.record.rendering import markdown
-from csac.record.run import RunDirectory
+from csac.record.run import RunDirectory, is_locked
 from csac.studies.job import Stopped
 from csac.studies.search_space import SPACES, searched, space_table
 from csac.studies.shared_study import Question, SharedStudy
@@ -279,6 +279,25 @@ def test_a_trial_whose_process_died_is_taken_up_and_one_that_is_run_is_not(tmp_p
     assert theirs.next(3) is None
     for attempt in (run, another, third):
         attempt.lock.close()
+
+
+@pytest.mark.parametrize("ending", ["complete", "prune", "give_back", "drop"])
+def test_a_trial_is_ended_and_let_go_of_at_one_stroke(tmp_path, ending):
+    """A process that looked in between took it for a lost one, and met Optuna's refusal to end it twice."""
+    study = SharedStudy(tmp_path / "study", question())
+    attempt = study.next(1)
+    assert attempt
+    is_alone = []
+
+    class Lock:
+        def close(self) -> None:
+            is_alone.append(is_locked(tmp_path / "study" / ".lock"))
+            attempt.lock.close()
+
+    given = ({0: 1.0},) if ending == "complete" else ()
+    getattr(study, ending)(attempt._replace(lock=Lock()), *given)
+    assert is_alone == [True]
+    assert not is_locked(tmp_path / "study" / ".lock")
 
 
 def test_a_study_that_another_process_begins_at_this_moment_is_no_stranger_s(tmp_path):
