@@ -76,3 +76,21 @@ def called_here(option: str, known: Collection[str]) -> str:
     if words:
         return f"it is {' or '.join(words)} here"
     return _NEEDLESS.get(option, "") if "--seeds" in known else ""
+
+
+def called_in_python(name: str, known: Collection[str]) -> str:
+    """Return what the `known` arguments have for one of another name, as "it is discount here", or nothing."""
+    flag, *flags = ("--" + word.replace("_", "-") for word in (name, *known))
+    told = re.sub(r"(--[a-z-]+) (automatic|gpu)", r'\1="\2"', called_here(flag, flags))
+    return re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), told)
+
+
+def written_in_python(name: str, value: object, known: Collection[str]) -> str:
+    """Return how a value is given here that other libraries give otherwise, or nothing."""
+    if "temperature" not in known:
+        return ""
+    if name == "entropy_weight" and str(value).startswith("auto"):
+        return 'it adapts with temperature="automatic"'
+    if name == "temperature" and type(value) in (int, float):
+        return f'write temperature="fixed", entropy_weight={value}'
+    return ""

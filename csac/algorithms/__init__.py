@@ -1,9 +1,10 @@
 """What is learnt. To add an algorithm, write its file and announce it here."""
 
 from csac.algorithms.csac import CSAC
+from csac.algorithms.names import names_checked
 from csac.algorithms.ppo import PPO
 from csac.algorithms.sac import SAC
 from csac.algorithms.sd3 import SD3
 from csac.algorithms.td3 import TD3
 
-ALGORITHMS = {algorithm.name: algorithm for algorithm in (CSAC, SAC, TD3, SD3, PPO)}
+ALGORITHMS = {algorithm.name: names_checked(algorithm) for algorithm in (CSAC, SAC, TD3, SD3, PPO)}

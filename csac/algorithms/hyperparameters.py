@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, ge
 
 import numpy as np
 
+from csac.synonyms import written_in_python
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ def check_hyperparameters(algorithm: Any, incompatible: Iterable[tuple[Mapping[s
     for field in dataclasses.fields(algorithm):
         value = _plain(getattr(algorithm, field.name))
         if words := _what_it_must_be(value, hints[field.name]):
-            raise InputError(f"{field.name} must be {words}, not {value!r}")
+            hint = written_in_python(field.name, value, hints)
+            raise InputError(f"{field.name} must be {words}, not {value!r}{hint and f': {hint}'}")
         object.__setattr__(algorithm, field.name, value)
     for values, why in incompatible:
         if all(getattr(algorithm, name) in refused for name, refused in values.items()):

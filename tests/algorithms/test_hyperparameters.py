@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 import math
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from csac.algorithms import ALGORITHMS, CSAC, SAC, SD3, TD3
+from csac.algorithms import ALGORITHMS, CSAC, PPO, SAC, SD3, TD3
 from csac.types import InputError
 
 BOTH = {
@@ -135,3 +136,39 @@ def test_a_replay_holds_a_batch(algorithm):
     with pytest.raises(InputError, match="replay_size must be at least batch_size, 256, not 255"):
         algorithm(replay_size=255)
     algorithm(replay_size=256)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "given", "told"),
+    [
+        (SAC, {"gamma": 0.9}, "SAC has no hyperparameter 'gamma': it is discount here"),
+        (CSAC, {"discount": 0.9, "buffer_size": 8}, "CSAC has no hyperparameter 'buffer_size': it is replay_size here"),
+        (SAC, {"learning_rate": 1}, "'learning_rate': it is actor_learning_rate and critic_learning_rate here"),
+        (SAC, {"autotune": True}, "SAC has no hyperparameter 'autotune': it is temperature=\"automatic\" here"),
+        (SAC, {"ent_coef": "auto"}, "SAC has no hyperparameter 'ent_coef': it is temperature or entropy_weight here"),
+        (CSAC, {"ent_coef": "auto"}, "CSAC has no hyperparameter 'ent_coef': it is entropy_weight here"),
+        (PPO, {"batch_size": 64}, "PPO has no hyperparameter 'batch_size': it is minibatches (their number) here"),
+        (TD3, {"discont": 0.9}, "TD3 has no hyperparameter 'discont': did you mean discount?"),
+        (SD3, {"verbose": 1}, "SD3 has no hyperparameter 'verbose'"),
+        (SAC, {"entropy_weight": "auto"}, "a finite number, not 'auto': it adapts with temperature=\"automatic\""),
+        (SAC, {"temperature": 0.2}, 'not 0.2: write temperature="fixed", entropy_weight=0.2'),
+        (PPO, {"entropy_weight": "auto"}, "entropy_weight must be a finite number, not 'auto'"),
+    ],
+)
+def test_what_other_libraries_call_it_is_told_in_python_too(algorithm, given, told):
+    with pytest.raises(InputError) as refusal:
+        algorithm(**given)
+    assert str(refusal.value).endswith(told)
+
+
+def test_a_copy_with_a_hyperparameter_of_another_name_is_refused_alike():
+    changes: dict[str, Any] = {"tau": 0.01}
+    with pytest.raises(InputError, match="SAC has no hyperparameter 'tau': it is target_rate here"):
+        dataclasses.replace(SAC(), **changes)
+    assert dataclasses.replace(SAC(), target_rate=0.01) == SAC(target_rate=0.01)
+
+
+def test_an_algorithm_shows_its_hyperparameters_to_whoever_asks():
+    for algorithm in ALGORITHMS.values():
+        names = [field.name for field in dataclasses.fields(algorithm)]
+        assert list(inspect.signature(algorithm).parameters) == names
