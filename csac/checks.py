@@ -41,12 +41,17 @@ def check_arguments(name: str, value: object) -> None:
 
 def did_you_mean(word: str, known: Iterable[str], most: int = 1) -> str:
     """Return "did you mean ...?" with what resembles `word` most, in whatever case, or nothing."""
+    matches = closest(word, known, most)
+    return f"did you mean {' or '.join(matches)}?" if matches else ""
+
+
+def closest(word: str, known: Iterable[str], most: int = 1) -> list[str]:
+    """Return what resembles `word` most, in whatever case."""
     names = {name.lower().lstrip("-"): name for name in known}  # dashes would make all options alike
     word = word.lower().lstrip("-")
     begun = [name for name in names if len(word) >= 3 and name.startswith(word)]
     exact = [word] if word in names else begun if len(begun) == 1 else []
-    matches = exact or difflib.get_close_matches(word, names, n=most)
-    return f"did you mean {' or '.join(names[match] for match in matches)}?" if matches else ""
+    return [names[match] for match in exact or difflib.get_close_matches(word, names, n=most)]
 
 
 def _least(least: int) -> str:

@@ -17,6 +17,7 @@ from csac.checks import check_arguments
 from csac.deploy.contract import ActionBounds
 from csac.tasks import known
 from csac.tasks.making import Task, check_render_mode, make, task_name
+from csac.tasks.mistakes import check_reset, failed_reset, failed_step, first_observation, raised
 from csac.tasks.physics import NOISES, PHYSICS, Noise, Physics
 from csac.tasks.silence import quietly
 from csac.tasks.snapshots import restore, snapshot
@@ -66,6 +67,7 @@ class Environment:
         self.has_memory = known.has_memory(task, self.raw)
         try:
             check_render_mode(self.raw, render_mode)
+            check_reset(self.raw)
             parts = observation_parts(_space(self.raw, "observation_space"))
             self.contract_parts = ContractParts(parts, *action_parts(_space(self.raw, "action_space")))
         except InputError as error:
@@ -99,16 +101,18 @@ class Environment:
         """Start an episode and return its first observation, float32 [observation].
 
         Raises:
-            EnvironmentFailure: the environment raised, or the observation is not finite or misshapen.
+            EnvironmentFailure: the environment raised, gave no pair of observation and info, or an observation that is
+                not finite or misshapen.
         """
         self._seed = seed
         if self._noise:
             self._noise.begin(seed)
         try:
             with self._quietly():
-                observation, _ = self.raw.reset(seed=seed)
+                given = self.raw.reset(seed=seed)
         except RAISED as error:
-            raise EnvironmentFailure(f"reset raised {one_line(error)}") from error
+            raise failed_reset(error) from error
+        observation = first_observation(given)
         try:
             return self._flatten(observation)
         except EnvironmentFailure as error:
@@ -138,7 +142,7 @@ class Environment:
             observation, reward, terminated, truncated, info = self.raw.step(action)
             terminated, truncated, info = bool(terminated), bool(truncated), dict(info)
         except RAISED as error:
-            raise EnvironmentFailure(f"step raised {one_line(error)}") from error
+            raise failed_step(error) from error
         return self._flatten(observation), scalar(reward), terminated, truncated, info
 
     def snapshot(self) -> Snapshot | None:
@@ -150,7 +154,7 @@ class Environment:
         try:
             saved = snapshot(self.raw)
         except RAISED as error:
-            raise EnvironmentFailure(f"get_snapshot raised {one_line(error)}") from error
+            raise EnvironmentFailure(f"get_snapshot raised {raised(error)}") from error
         if saved:
             _check_savable(saved)
         if saved and self._noise:
@@ -169,7 +173,7 @@ class Environment:
             if self._noise:
                 self._noise.take_back(saved.values.get("noise", {}))
         except RAISED as error:
-            raise EnvironmentFailure(f"the environment does not take its snapshot back: {one_line(error)}") from error
+            raise EnvironmentFailure(f"the environment does not take its snapshot back: {raised(error)}") from error
 
     def close(self) -> None:
         """Close the Gymnasium environment. What that raises is logged: it takes nothing back of what was done."""
@@ -205,7 +209,7 @@ def _space(environment: gymnasium.Env, name: Literal["observation_space", "actio
     try:
         space = getattr(environment, name)
     except RAISED as error:
-        raise InputError(f"the environment gives no {name}: {one_line(error)}") from None
+        raise InputError(f"the environment gives no {name}: {raised(error)}") from None
     if not isinstance(space, gymnasium.Space):
         kind = type(space)
         raise InputError(

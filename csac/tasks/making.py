@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import logging
 import sys
 import warnings
@@ -12,13 +13,17 @@ from typing import Any
 
 import gymnasium
 
-from csac.checks import did_you_mean
+from csac.checks import closest
 from csac.tasks import known
+from csac.tasks.mistakes import raised
 from csac.tasks.silence import quietly
-from csac.tasks.spaces import RAISED, message, one_line
+from csac.tasks.spaces import RAISED, message
 from csac.types import InputError
 
 Task = str | Callable[..., gymnasium.Env]
+
+_MOST_NAMED = 5  # tasks of a module
+_DRAWN_BY_PYGAME = tuple(f"gymnasium.envs.{kind}." for kind in ("box2d", "classic_control", "toy_text"))
 
 _log = logging.getLogger(__name__)
 
@@ -43,7 +48,7 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
             raise InputError(f"{name} needs a package that is not installed: {message(error)}") from error
         except RAISED as error:
             given = f" with the arguments {arguments}" if arguments else ""
-            raise InputError(f"{name} could not be made{given}: {one_line(error)}") from error
+            raise InputError(f"{name} could not be made{given}: {raised(error)}") from error
     if not isinstance(environment, gymnasium.Env):
         raise InputError(f"{name} returned {environment!r:.40}: a task's callable returns a gymnasium.Env")
     return environment
@@ -62,20 +67,42 @@ def _check_task(task: object) -> None:
 def registered(task: str) -> str:
     """Return the registered id of a task, after importing its module where one is named. Raises InputError."""
     module, _, name = task.rpartition(":")
+    before = {*gymnasium.registry}
     if module:
         try:
             importlib.import_module(module)
         except RAISED as error:
-            raise InputError(f"{task}: the module {module} cannot be imported: {one_line(error)}") from error
+            raise InputError(f"{task}: the module {module} cannot be imported: {raised(error)}") from error
     known.register(name)
     if name in gymnasium.registry and not _is_gone(gymnasium.registry[name]):
         return name
-    ids = sorted({*known.ADAPTERS, *(id for id, spec in gymnasium.registry.items() if not _is_gone(spec))})
+    raise InputError(f"no task is called {task}: {_others(module, name, before)}")
+
+
+def _others(module: str, name: str, before: set[str]) -> str:
+    """Say what may have been meant by a name that there is not; `before` were there before the module was imported."""
+    there = {id: spec for id, spec in gymnasium.registry.items() if not _is_gone(spec)}
+    if module and (own := [id for id in there if id not in before or _is_made_by(module, there[id])]):
+        named = ", ".join(f"{module}:{id}" for id in own[:_MOST_NAMED])
+        more = ", ..." if len(own) > _MOST_NAMED else ""
+        return _similar(name, own, f"{module}:") or f"{module} registers {named}{more}"
+    otherwise = f"{module} registers none of that name" if module else "write module:Id for one that a module registers"
+    return _similar(name, sorted({*known.ADAPTERS, *there})) or otherwise
+
+
+def _similar(name: str, ids: list[str], prefix: str = "") -> str:
+    """Return "did you mean ...?" with other versions of a task, or what resembles its name, or nothing."""
     family = name.rpartition("-v")[0] or name
     versions = [id for id in ids if id.rpartition("-v")[0] == family]
-    others = f"did you mean {' or '.join(versions)}?" if versions else did_you_mean(name, ids, most=3)
-    otherwise = f"{module} registers none of that name" if module else "write module:Id for one that a module registers"
-    raise InputError(f"no task is called {task}: {others or otherwise}")
+    meant = versions or closest(name, ids, most=3)
+    return f"did you mean {' or '.join(prefix + id for id in meant)}?" if meant else ""
+
+
+def _is_made_by(module: str, spec: Any) -> bool:
+    """Whether what makes a task is in a module, or below it: it may have been imported, and registered it, before."""
+    creator = spec.entry_point
+    place = creator.partition(":")[0] if isinstance(creator, str) else getattr(creator, "__module__", "")
+    return f"{place}.".startswith(f"{module}.")
 
 
 def _is_gone(spec: Any) -> bool:
@@ -104,6 +131,20 @@ def _gymnasium_silenced() -> Iterator[None]:
 def _name_of(task: Callable[..., gymnasium.Env]) -> str:
     name = getattr(task, "__name__", "")
     return "" if name == "<lambda>" else name
+
+
+def can_be_drawn(task: str) -> bool:
+    """Whether a video can be made of a task of which this process has made an environment, as far as is known of it."""
+    spec = gymnasium.registry.get(task.rpartition(":")[2])
+    creator: Any = spec.entry_point if spec else None
+    place = creator if isinstance(creator, str) else f"{getattr(creator, '__module__', '')}"
+    if place.startswith(_DRAWN_BY_PYGAME) and importlib.util.find_spec("pygame") is None:
+        return False
+    if isinstance(creator, str):
+        module, _, name = creator.partition(":")
+        creator = getattr(sys.modules.get(module), name, None)
+    modes = (getattr(creator, "metadata", None) or {}).get("render_modes")
+    return modes is None or "rgb_array" in modes
 
 
 def task_name(task: Task, environment: gymnasium.Env) -> str:

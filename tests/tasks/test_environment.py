@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import subprocess
 import sys
 from collections import OrderedDict
@@ -67,7 +68,10 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
         ("Nothing/Like-this-v7", "write module:Id"),
         ("", "write module:Id"),
         ("no_such_module:Task-v0", "the module no_such_module cannot be imported: ModuleNotFoundError"),
-        ("probes:ConstantRewards-v0", "did you mean ConstantReward-v0"),
+        ("probes:ConstantRewards-v0", "did you mean probes:ConstantReward-v0"),
+        ("probes:Endless", r"did you mean probes:Endless-v0\?"),
+        ("probes:Xyzzy-v0", r"probes registers probes:ConstantReward-v0, (probes:\w+-v0, ){4}\.\.\."),
+        ("os:Pendulm-v1", "did you mean Pendulum-v1 or"),
         ("CartPole-v1", r"CartPole-v1: the action space is Discrete\(2\)"),
         (lambda: 3, "returned 3: a task's callable returns a gymnasium.Env"),
         (probes.Endless(), r"already made \(Endless\).*a function that makes one"),
@@ -363,13 +367,136 @@ def test_a_bad_action_never_reaches_the_environment(action, message):
     assert environment.raw.unwrapped.actions == []  # pyright: ignore
 
 
-def test_the_old_step_of_four_is_a_failure_in_words():
+# What old Gym had, and what is forgotten easily.
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (([0.0], 1.0, False, {}), "not 4: the one `done` of old Gym is terminated or truncated"),
+        (([0.0], 1.0), "not 2"),
+        (None, "not None"),
+    ],
+)
+def test_a_step_that_gives_no_five_values_is_told_what_is_missing(wrapped, given, told):
     class Old(Scripted):
         def step(self, action):
-            return [0.0], 1.0, False, {}
+            return given
 
-    with pytest.raises(EnvironmentFailure, match="step raised ValueError: not enough values to unpack"):
-        Environment(Old).step(np.zeros(1, np.float32))
+    environment = Environment(lambda: gymnasium.wrappers.TimeLimit(Old(), 9) if wrapped else Old())
+    environment.reset(0)
+    with pytest.raises(EnvironmentFailure) as failure:
+        environment.step(np.zeros(1, np.float32))
+    expected = "step must return five values (observation, reward, terminated, truncated, info), "
+    assert str(failure.value) == expected + told
+
+
+def test_more_than_five_values_are_told_as_well():
+    class Generous(Scripted):
+        def step(self, action):
+            return (*super().step(action), "and one more")
+
+    with pytest.raises(EnvironmentFailure, match="step must return five values"):
+        Environment(Generous).step(np.zeros(1, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("space", "given", "told"),
+    [
+        (spaces.Box(-9, 9, (3,)), np.zeros(3), "an array of shape (3,)"),
+        (spaces.Box(-9, 9, (2,)), np.zeros(2), "an array of shape (2,)"),
+        (spaces.Box(-9, 9, (2,)), [0.0, 0.0], "a list of 2"),
+        (spaces.Box(-9, 9, (2,)), (0.0, 0.0), "(float, float)"),
+        (spaces.Dict(a=UNIT, b=UNIT), {"a": [0.0], "b": [0.0]}, "a dict"),
+        (UNIT, None, "None"),
+    ],
+)
+def test_a_reset_that_gives_the_observation_alone_is_told(space, given, told):
+    class Old(Scripted):
+        def reset(self, *, seed=None, options=None):
+            return given
+
+    environment = Environment(lambda: gymnasium.wrappers.TimeLimit(Old(space), 9))
+    with pytest.raises(EnvironmentFailure) as failure:
+        environment.reset(0)
+    expected = f"reset must return (observation, info), not {told}: in old Gym it was the observation alone"
+    assert str(failure.value) == expected
+    statistics = Environment(lambda: gymnasium.wrappers.RecordEpisodeStatistics(Old(UNIT)))  # takes the pair apart
+    with pytest.raises(EnvironmentFailure, match=r"^reset must return \(observation, info\)"):
+        statistics.reset(0)
+
+
+def test_a_reset_that_takes_no_seed_is_refused_before_anything_is_reset():
+    class Seedless(Scripted):
+        def reset(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+            raise AssertionError
+
+    class Optionless(Scripted):
+        def reset(self, seed=None):  # pyright: ignore[reportIncompatibleMethodOverride]
+            return super().reset(seed=seed)
+
+    class Adapter(gymnasium.Wrapper):
+        def reset(self, **_):
+            return [0.0], {}
+
+    hint = r"write it as def reset\(self, \*, seed=None, options=None\)"
+    for task in (Seedless, lambda: gymnasium.wrappers.TimeLimit(Seedless(), 9)):
+        with pytest.raises(InputError, match=f"Seedless: reset takes no seed: {hint}"):
+            Environment(task)
+    with pytest.raises(InputError, match=f"reset takes no options: {hint}"):  # which Gymnasium's wrappers hand on
+        Environment(lambda: gymnasium.wrappers.TimeLimit(Optionless(), 9))
+    for task in (Optionless, lambda: gymnasium.wrappers.TimeLimit(Adapter(Seedless()), 9)):
+        np.testing.assert_array_equal(Environment(task).reset(0), [0.0])
+
+
+# Where it was raised.
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """A user's module, whose environment divides by zero in a helper's function and raises in a library below it."""
+    (tmp_path / "divides.py").write_text(
+        "import json\n"
+        "import numpy as np\n"
+        "import probes\n"
+        "class Task(probes.Endless):\n"
+        "    def step(self, action):\n"
+        "        return self.divide(0)\n"
+        "    def divide(self, by):\n"
+        "        return 1 / by\n"
+        "    def reset(self, *, seed=None, options=None):\n"
+        "        json.loads('{')\n"
+        "class Stacks(probes.Endless):\n"
+        "    def step(self, action):\n"
+        "        np.concatenate(\n"
+        "            [np.zeros(1), np.zeros((1, 1))]\n"
+        "        )\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    import divides  # pyright: ignore[reportMissingImports]
+
+    yield divides
+    del sys.modules["divides"]
+
+
+def test_an_error_is_told_with_its_place_in_the_users_own_code(module):
+    task = Environment(lambda: gymnasium.wrappers.TimeLimit(module.Task(), 9))
+    with pytest.raises(EnvironmentFailure, match=r"^reset raised JSONDecodeError: .* \(divides\.py, line 10\)$"):
+        task.reset(0)
+    task.raw._has_reset = True  # pyright: ignore[reportAttributeAccessIssue]
+    task.raw._elapsed_steps = 0  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(EnvironmentFailure) as failure:
+        task.step(np.zeros(1, np.float32))
+    assert str(failure.value) == "step raised ZeroDivisionError: division by zero (divides.py, line 8)"
+    with pytest.raises(EnvironmentFailure, match=r"^step raised ValueError: .* \(divides\.py, line 13\)$"):
+        Environment(module.Stacks).step(np.zeros(1, np.float32))
+
+
+def test_an_error_of_a_library_alone_has_no_place():
+    environment = Environment(lambda: gymnasium.make("Pendulum-v1"))
+    with pytest.raises(EnvironmentFailure, match=r"before calling env\.reset\(\)$"):
+        environment.step(np.zeros(1, np.float32))
 
 
 # Several seeds
@@ -442,7 +569,8 @@ def test_a_seed_that_breaks_fails_alone_and_is_not_stepped_again():
     before, last, broken, after = steps_of(environments, 4)
     assert before.failures == last.failures == after.failures == []
     ((index, reason, details),) = broken.failures
-    assert (index, reason) == (1, "step raised RuntimeError: the simulator broke")
+    assert index == 1
+    assert re.fullmatch(r"step raised RuntimeError: the simulator broke \(probes\.py, line \d+\)", reason)
     assert "maybe_fail" in details
     assert environments.alive.tolist() == [True, False, True]
     raws = [environment.raw.unwrapped for environment in environments.environments]
@@ -471,7 +599,7 @@ def test_a_seed_that_fails_in_its_first_reset_is_reported_by_the_first_step():
     environments.reset()
     assert environments.alive.all()
     first, second = steps_of(environments, 2)
-    assert [(failure.place, failure.reason) for failure in first.failures] == [
+    assert [(failure.place, failure.reason.partition(" (")[0]) for failure in first.failures] == [
         (0, "reset raised RuntimeError: the simulator broke"),
         (1, "reset raised RuntimeError: the simulator broke"),
     ]
@@ -484,7 +612,8 @@ def test_a_seed_that_fails_in_a_later_reset_has_finished_its_episode():
     environments.reset()
     *_, last = steps_of(environments, 3)
     assert last.episodes == [(0, 3.0, 3)]
-    assert [failure.reason for failure in last.failures] == ["reset raised RuntimeError: the simulator broke"]
+    (failure,) = last.failures
+    assert failure.reason.startswith("reset raised RuntimeError: the simulator broke")
     assert environments.alive.tolist() == [False]
 
 
@@ -580,7 +709,7 @@ def test_an_environment_that_exits_has_failed_like_one_that_raises(where):
     environments = SeedEnvironments(probes.Failing, {"where": where, "exits": True, "at": 2}, [0, 1])
     environments.reset()
     steps = [environments.step(np.zeros((2, 1), np.float32)) for _ in range(4)]
-    failures = [failure.reason for step in steps for failure in step.failures]
+    failures = [failure.reason.partition(" (")[0] for step in steps for failure in step.failures]
     assert failures == [f"{where} raised SystemExit: 7"] * 2
     assert not environments.is_any_alive
 

@@ -170,7 +170,8 @@ def test_a_seed_that_neither_takes_its_episode_back_nor_can_be_reset_has_failed(
     first.reset()
     assert second.take_back(0, first.save(0)) is False
     outcome = second.step(np.zeros((1, 1), np.float32))
-    assert [failure.reason for failure in outcome.failures] == ["reset raised RuntimeError: the simulator broke"]
+    (failure,) = outcome.failures
+    assert failure.reason.startswith("reset raised RuntimeError: the simulator broke")
 
 
 def test_a_seed_that_has_failed_stays_so():
