@@ -86,6 +86,8 @@ class ArtefactContract:
         """
         path = folder / CONTRACT
         if not path.exists():
+            if below := artefacts_below(folder):
+                raise InputError(f"{folder} holds no artefact itself: give {' or '.join(map(str, below))}")
             raise InputError(f"{folder} holds no artefact: there is no {CONTRACT} (csac export writes one)")
         fields = read_json(path)
         policy = Contract.of_fields(fields, path)
@@ -100,6 +102,21 @@ class ArtefactContract:
         if sha256_of(file) != contract.sha256:
             raise InputError(f"{file} is not the file that its {CONTRACT} was written for: export it again")
         return contract
+
+
+def is_artefact(folder: Path) -> bool:
+    """Whether the contract of an artefact lies in a folder, sound or not; that of a run's policies is none."""
+    try:
+        fields = read_json(folder / CONTRACT)
+    except InputError:
+        return False
+    return isinstance(fields, dict) and "artefact_version" in fields
+
+
+def artefacts_below(folder: Path) -> list[Path]:
+    """Return the folders of artefacts in a folder of several, or in a run's own, in the order of their names."""
+    places = sorted(path.parent for pattern in ("*", "export/*") for path in folder.glob(f"{pattern}/{CONTRACT}"))
+    return [place for place in places if is_artefact(place)]
 
 
 def _as_json(value: Any) -> Any:

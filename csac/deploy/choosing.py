@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import get_args
 
 from csac.checks import check_path
-from csac.deploy.artefact_contract import ArtefactContract
+from csac.deploy.artefact_contract import ArtefactContract, artefacts_below, is_artefact
 from csac.deploy.contract import Contract, read_json
 from csac.deploy.policy import CONTRACT, SAVED, Policy
 from csac.record.run import RunDirectory, Which, is_run
 from csac.record.statistics import last_evaluations
 from csac.types import InputError
+
+_OPENED = "open it with csac.deploy.artefact.open_artefact, or load its run"
 
 
 def load(directory: str | Path, seed: int | None = None, which: Which = "last") -> Policy:
@@ -39,6 +41,8 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
     folder = Path(directory)
     if not is_run(folder) and os.path.exists(folder / SAVED):
         return _saved(folder, seed, which)
+    if not is_run(folder) and os.path.isdir(folder):
+        _refuse_artefacts(folder)
     run = RunDirectory.open(directory)
     return Policy.load(run.policy(choose_seed(run, seed), which), Contract.load(run.contract))
 
@@ -54,8 +58,17 @@ def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
     if artefact.guards.is_any:
         raise InputError(f"{folder} is an artefact with guards: csac.deploy.artefact.open_artefact keeps them")
     if artefact.file != SAVED:
-        raise InputError(f"{folder} is an artefact of the format {artefact.format}: csac.load takes those of numpy")
+        raise InputError(f"{folder} is an artefact of the format {artefact.format}: {_OPENED}")
     return Policy.load(folder / SAVED, artefact.policy)
+
+
+def _refuse_artefacts(folder: Path) -> None:
+    """Raise InputError where a folder holds what `csac export` has written, in a format that is no `Policy`."""
+    if is_artefact(folder):
+        kind = ArtefactContract.load(folder).format
+        raise InputError(f"{folder} is an exported artefact of the format {kind}: {_OPENED}")
+    if below := artefacts_below(folder):
+        raise InputError(f"{folder} holds no run, and exported artefacts in {', '.join(map(str, below))}: {_OPENED}")
 
 
 def no_policies(run: RunDirectory) -> InputError:

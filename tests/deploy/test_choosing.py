@@ -182,3 +182,20 @@ def test_an_artefact_without_guards_is_loaded_and_one_with_guards_is_not(tmp_pat
     (tmp_path / "bare" / "contract.json").write_text("[]")
     with pytest.raises(InputError, match="contract"):
         load(tmp_path / "bare")
+
+
+def test_an_artefact_of_another_format_is_told_with_what_opens_it(tmp_path):
+    pytest.importorskip("onnx")
+    policy, export = random_policy(contract()), tmp_path / "run" / "export"
+    save_run(tmp_path / "run", seeds=[0])
+    for kind in ("onnx", "c"):
+        (export / kind).mkdir(parents=True)
+        write_artefact(export / kind, policy.network, ArtefactContract(policy.contract, kind))
+        opened = "open it with csac.deploy.artefact.open_artefact, or load its run"
+        with pytest.raises(InputError, match=f"{kind} is an exported artefact of the format {kind}: {opened}"):
+            load(export / kind)
+    with pytest.raises(InputError, match=f"export holds no run, and exported artefacts in .*/c, .*/onnx: {opened}"):
+        load(export)
+    with pytest.raises(InputError, match="policy holds no run; give a run directory"):  # whose contract is a run's
+        load(tmp_path / "run" / "policy")
+    assert load(tmp_path / "run").contract.task == "Task-v0"

@@ -124,6 +124,7 @@ def test_no_number_is_cut_at_any_width(width):
     [
         ("", "give the folder of an artefact (csac export writes one)"),
         ("nowhere", "nowhere does not exist; give the folder of an artefact (csac export writes one)"),
+        (".", ". holds no artefact itself: give numpy"),
         ("numpy --calls 0", "calls must be at least 1, not 0"),
         ("numpy --calls 100000000000000", "calls must be at most 100,000,000, not 100,000,000,000,000"),
         (
