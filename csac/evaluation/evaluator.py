@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -276,6 +278,9 @@ def evaluate_episodes(
         events: names in the `info` of an episode's last step; None for those that a known task has by itself.
         perturbations: what changes the task for all of every episode, such as `("friction=2",)`.
 
+    A policy that was trained on another task, or another version of it, is warned of where its observations and actions
+    fit all the same.
+
     Raises:
         InputError: as `Evaluator`, a policy without `predict`, or perturbations that the task cannot have.
         EvaluationFailure: as `Evaluator.run`.
@@ -286,9 +291,11 @@ def evaluate_episodes(
         evaluator = Evaluator(task, environment_arguments, episodes, first_seed, events)
         evaluator.perturb(perturbed)
         try:
-            return evaluator.run(policy, deterministic)
+            played = evaluator.run(policy, deterministic)
         finally:
             evaluator.close()
+        _warn_of_another_task(policy.contract.task, task)
+        return played
     if not callable(getattr(policy, "predict", None)):
         raise InputError(f"a {type(policy).__name__} has no predict: give a policy as csac.load returns it")
     _check_episodes(episodes, first_seed)
@@ -338,6 +345,21 @@ def check_contract(policy: Policy, environment: Environment) -> None:
             f"{environment.task_name} has {_told(given[0])} and {given[1]}: evaluate it on its own task"
         )
     _check_bounds(policy.contract, parts.action_low, parts.action_high, environment.task_name)
+
+
+def _warn_of_another_task(trained_on: str | None, task: Task) -> None:
+    """Warn, as from the line that called csac, where two tasks have ids that differ by more than their modules.
+
+    What a Python function is called says nothing of the task that it makes, and is an identifier, which ids are not.
+    """
+    one, other = (name.rpartition(":")[2] if isinstance(name, str) else "" for name in (trained_on, task))
+    if one == other or "" in (one, other) or one.isidentifier():
+        return
+    frame, level = sys._getframe(), 1
+    while frame.f_back and frame.f_code.co_filename == __file__:
+        frame, level = frame.f_back, level + 1
+    text = f"the policy was trained on {trained_on} and is evaluated on {task}: their returns cannot be compared"
+    warnings.warn(text, stacklevel=level)
 
 
 def _check_bounds(contract: Contract, low: np.ndarray, high: np.ndarray, task_name: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from typing import Any
 
 import gymnasium
@@ -261,7 +262,11 @@ def test_episodes_are_offered_with_all_that_is_known_of_them():
 @pytest.mark.parametrize(
     ("task", "arguments", "message"),
     [
-        (probes.Failing, {"at": 2}, "at step 1: step raised RuntimeError: the simulator broke"),
+        (
+            probes.Failing,
+            {"at": 2},
+            r"at step 1: step raised RuntimeError: the simulator broke \(probes\.py, line \d+\)",
+        ),
         (probes.Failing, {"where": "reset"}, "at step 0: reset raised RuntimeError: the simulator broke"),
         (probes.NonFinite, {"at": 3}, "at step 2: reward is nan"),
         (probes.NonFinite, {"where": "observation"}, r"at step 0: observation\[0\] is nan"),
@@ -286,6 +291,33 @@ def test_a_policy_of_another_task_is_refused():
         evaluate(policy_for(probes.Endless), Lottery)
     with pytest.raises(InputError, match=r"Goal has at \(\), goal \(2,\) and \(2, 1\)"):
         evaluate(policy_for(Lottery), Goal)
+
+
+@pytest.mark.parametrize(
+    ("trained_on", "task", "is_warned"),
+    [
+        ("HalfCheetah-v4", "Walker2d-v4", True),
+        ("Walker2d-v5", "Walker2d-v4", True),
+        ("Walker2d-v4", "Walker2d-v4", False),
+        ("mine:Walker2d-v4", "Walker2d-v4", False),  # the module may have been imported already
+        ("make_walker", "Walker2d-v4", False),  # a Python function, of whatever
+        (None, "Walker2d-v4", False),
+        ("HalfCheetah-v4", lambda: gymnasium.make("Walker2d-v4"), False),
+    ],
+)
+def test_a_policy_of_another_task_of_the_same_sizes_is_warned_of_at_the_callers_line(trained_on, task, is_warned):
+    policy = policy_for("Walker2d-v4")
+    policy = Policy(policy.network, dataclasses.replace(policy.contract, task=trained_on))
+    for function in (evaluate, evaluate_episodes):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            assert len(function(policy, task, episodes=1)) == 1
+        assert [(warning.filename, str(warning.message)) for warning in told] == [
+            (
+                __file__,
+                f"the policy was trained on {trained_on} and is evaluated on {task}: their returns cannot be compared",
+            )
+        ] * is_warned
 
 
 @pytest.mark.parametrize(("low", "high", "is_taken"), [(-1.0, 3.0, True), (0.0, 1.0, True), (-1.0, 3.1, False)])

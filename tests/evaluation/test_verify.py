@@ -169,6 +169,7 @@ def test_guards_that_differ_are_found(tmp_path):
 
 def test_in_closed_loop_the_episodes_are_those_of_csac_evaluate(tmp_path):
     policy = algorithm_policy("csac")
+    policy = Policy(policy.network, dataclasses.replace(policy.contract, task="Follow-v0"))
     recording = verify.record(policy, "Follow-v0", episodes=3)
     expected = evaluate(policy, "Follow-v0", 3, FRESH_EVALUATION_SEED)
     np.testing.assert_array_equal(recording.returns, expected)

@@ -491,7 +491,8 @@ def policy_for(task: Any) -> Policy:
     size, actions = environment.spec
     weight = np.random.default_rng(1).normal(0, 0.3, (size, 2 * actions)).astype(np.float32)
     network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * actions, np.float32)),),)))
-    return Policy(network, Contract("Task-v0", "csac", "relu", "tanh_gaussian", *environment.contract_parts))
+    name, parts = environment.task_name, environment.contract_parts
+    return Policy(network, Contract(name, "csac", "relu", "tanh_gaussian", *parts))
 
 
 def test_an_evaluation_with_noise_depends_on_the_episode_alone():
