@@ -18,6 +18,7 @@ from csac.console.tables import duration, events_table, make_console, program, r
 from csac.console.waiting import SECONDS_OF_SILENCE, Speed
 from csac.record.rendering import number, short
 from csac.record.statistics import evaluation_matrix
+from csac.tasks.making import can_be_drawn
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -51,6 +52,7 @@ class Reporter:
         self._begin = 0
         self._curves: dict[int, list[float]] = {}
         self._failed: dict[int, str] = {}
+        self._just_told: set[int] = set()  # failed seeds of which the last lines tell
         self._evaluated_at = 0
         self._speed = Speed(clock)
         self._began = self._spoke = clock()
@@ -105,6 +107,7 @@ class Reporter:
         """Show that a seed has stopped; the others go on."""
         self._failed[seed] = f"failed at step {step:,}: {reason}"
         self._print(Text(f"seed {seed} {self._failed[seed]}", "red"))
+        self._just_told.add(seed)
 
     def note(self, text: str) -> None:
         """Show one line about the run as a whole."""
@@ -125,7 +128,8 @@ class Reporter:
         else:
             self._print(Text("no evaluations yet"))
         for seed, reason in run.manifest.failures.items():
-            self._print(Text(f"seed {seed} failed at {reason}", "red"))
+            if seed not in self._just_told:
+                self._print(Text(f"seed {seed} failed at {reason}", "red"))
         self._print_next(run, bool(len(evaluations)))
 
     def close(self) -> None:
@@ -136,17 +140,21 @@ class Reporter:
 
     def _print_next(self, run: RunDirectory, has_curve: bool) -> None:
         directory, csac = shlex.quote(str(run.path)), program()
-        lines = [("curve", str(run.path / "curve.png"))] if has_curve else []
-        if (run.path / "policy").exists():
-            one, film = run.manifest, shlex.quote(str(run.path / "play.mp4"))
-            is_sound = len(one.failures) < len(one.seeds)
+        one, film = run.manifest, shlex.quote(str(run.path / "play.mp4"))
+        is_sound = len(one.failures) < len(one.seeds)
+        log = run.path / "log.txt"
+        lines = [("why", f"the traceback is in {log}")] if one.failures and _has_traceback(log) else []
+        lines += [("curve", str(run.path / "curve.png"))] if has_curve else []
+        # A failed seed that was never evaluated would fail in a test as well: its task does not run.
+        if run.seeds_with_policies() and (is_sound or has_curve):
             if one.task_is_callable:  # which no command line can name
                 task = one.task if one.task.isidentifier() else "your_task"
                 more = f", environment_arguments={one.environment_arguments}" if one.environment_arguments else ""
                 lines += [("test it", f"in Python: evaluate(load({str(run.path)!r}), {task}{more})")] * is_sound
             else:
                 lines.append(("test it", f"{csac} evaluate {directory}"))
-                lines += [("watch it", f"{csac} play {directory} --video {film}")] * is_sound
+                is_seen = is_sound and can_be_drawn(one.task)
+                lines += [("watch it", f"{csac} play {directory} --video {film}")] * is_seen
         for label, line in lines:
             self._print(Text.assemble((f"{label:<9}", "dim"), line))
 
@@ -156,6 +164,7 @@ class Reporter:
         self._spoke = self._clock()
 
     def _say(self, text: str) -> None:
+        self._just_told.clear()
         self._print(Text(text))
 
     def _living(self) -> dict[int, int]:
@@ -233,6 +242,11 @@ def sparkline(values: Sequence[float] | np.ndarray, low: float, high: float, wid
         level = (part.mean() - low) / span if span > 0 else 0.5
         drawn += BLOCKS[min(max(int(level * len(BLOCKS)), 0), len(BLOCKS) - 1)] if math.isfinite(level) else " "
     return drawn
+
+
+def _has_traceback(log: Path) -> bool:
+    """Whether a log says more of a failure than its line: where a number is not finite, nothing was raised."""
+    return log.exists() and "\nTraceback (most recent" in log.read_text(encoding="utf-8", errors="replace")
 
 
 def _outcome(manifest: Manifest, time_taken: str) -> str:

@@ -3,8 +3,14 @@ import pytest
 from shown import lines, make_run
 
 from csac.console.progress import Reporter, sparkline
+from csac.tasks.environment import Environment
 
 DIRECTORY = "runs/Hopper-v4/csac/now"
+
+
+def leave_policies(run):
+    (run.path / "policy").mkdir()
+    (run.path / "policy" / "seed_0.safetensors").touch()
 
 
 def test_elsewhere_than_on_a_terminal_every_evaluation_is_one_line(plain, clock):
@@ -155,7 +161,7 @@ def test_closing_gives_the_cursor_back_and_may_be_repeated(terminal, clock):
 
 def test_the_end_shows_results_and_what_to_type_next(plain, clock, tmp_path):
     run = make_run(tmp_path / "my run", [[1.0, 2.0]])
-    (run.path / "policy").mkdir()
+    leave_policies(run)
     reporter = Reporter(plain, clock)
     reporter.start("Hopper-v4", "csac", [0], 1000, run.path)
     clock.now += 200
@@ -168,11 +174,62 @@ def test_the_end_shows_results_and_what_to_type_next(plain, clock, tmp_path):
     assert f"watch it csac play '{run.path}' --video '{run.path}/play.mp4'" in shown
 
 
+def test_a_failure_is_told_once_where_nothing_comes_between(plain, clock, tmp_path):
+    for name, evaluated in (("at once", False), ("long ago", True)):
+        run = make_run(tmp_path / name, [[1.0], [2.0]])
+        run.update_manifest(failures={0: "step 5: reward is nan"})
+        reporter = Reporter(plain, clock)
+        reporter.start("Hopper-v4", "csac", [0, 1], 1000, run.path)
+        reporter.failed(0, 5, "reward is nan")
+        if evaluated:
+            reporter.evaluated(10, {1: 2.0})
+        reporter.finish(run)
+        told = plain.file.getvalue().count("seed 0 failed at step 5: reward is nan")
+        assert told == (3 if evaluated else 1)  # of the second run it is told twice
+
+
+def test_a_run_that_failed_before_it_was_evaluated_points_at_the_traceback_alone(plain, clock, tmp_path):
+    run = make_run(tmp_path / "run", [[1.0]])
+    (run.path / "evaluations.csv").unlink()
+    leave_policies(run)  # of a seed that has learnt nothing, since its task does not run
+    run.update_manifest(failures={0: "step 1: reset raised ValueError: no map"})
+    run.log("seed 0 stopped at step 1: reset raised ValueError: no map\nTraceback (most recent call last):\n  ...")
+    Reporter(plain, clock).finish(run)
+    assert lines(plain)[-1] == f"why      the traceback is in {run.path}/log.txt"
+    assert "test it" not in plain.file.getvalue()
+
+    (run.path / "log.txt").write_text("2026-01-01T00:00:00+00:00 seed 0 stopped at step 1: reward is nan\n")
+    Reporter(plain, clock).finish(run)
+    assert plain.file.getvalue().count("why  ") == 1
+
+
+@pytest.mark.parametrize(
+    ("task", "has_pygame", "is_watched"),
+    [
+        ("Pendulum-v1", False, False),
+        ("Pendulum-v1", True, True),
+        ("Hopper-v4", False, True),
+        ("probes:Endless-v0", True, False),  # which draws nothing
+        ("elsewhere:Unknown-v0", False, True),
+    ],
+)
+def test_a_video_is_offered_where_it_can_be_made(plain, clock, tmp_path, monkeypatch, task, has_pygame, is_watched):
+    if not task.startswith("elsewhere:"):  # it is known of what this process has made
+        Environment(task).close()
+    run = make_run(tmp_path / "run", [[1.0]])
+    leave_policies(run)
+    run.update_manifest(task=task)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object() if has_pygame else None)
+    Reporter(plain, clock).finish(run)
+    assert ("watch it" in plain.file.getvalue()) == is_watched
+    assert "test it" in plain.file.getvalue()
+
+
 def test_what_is_to_be_typed_next_works(plain, clock, tmp_path):
     names = ("failed", "of_python", "nameless")
     failed, of_python, nameless = runs = [make_run(tmp_path / name, [[1.0]]) for name in names]
     for run in runs:
-        (run.path / "policy").mkdir()
+        leave_policies(run)
     failed.update_manifest(failures={0: "step 5: reward is nan"})  # whose best seed nobody can watch
     of_python.update_manifest(task="make_task", task_is_callable=True)  # which no command line can name
     nameless.update_manifest(task="Pendulum-v1", task_is_callable=True, environment_arguments={"g": 9.0})
