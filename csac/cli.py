@@ -184,6 +184,7 @@ def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
     from csac.console.tables import case_table, evaluation_table, make_console, silent_events
     from csac.console.waiting import progress_shown
+    from csac.deploy.choosing import step_of_policy
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.play import evaluate_run, perturbation_notes
     from csac.record.csv_tables import COLUMNS, check_new, write_rows
@@ -206,13 +207,15 @@ def _evaluate(arguments: list[str]) -> int:
                     processes=options.processes,
                     on_progress=on_progress,
                     trust_task=options.trust_task,
+                    which=options.checkpoint,
                 )
             )
     except EvaluationFailure as error:
         return _complain(error, 1)
     for line in told:
         console.print(line, soft_wrap=True)
-    manifest = RunDirectory.open(options.run).manifest
+    run = RunDirectory.open(options.run)
+    manifest = run.manifest
     console.print(evaluation_table(results, manifest.failures))
     sound = {seed: episodes for seed, episodes in results.items() if seed not in manifest.failures}
     if (cases := case_table(sound)) is not None:
@@ -223,7 +226,8 @@ def _evaluate(arguments: list[str]) -> int:
         _say(f"note: seed {seed} failed at {manifest.failures[seed]}; it is in no mean, and in no file of rows")
     _tell_of_warmup(manifest)
     if options.csv:
-        rows = [episode.row(seed, manifest.steps_done) for seed, episodes in sound.items() for episode in episodes]
+        steps = {seed: step_of_policy(run, seed, options.checkpoint) for seed in sound}
+        rows = [episode.row(seed, steps[seed]) for seed, episodes in sound.items() for episode in episodes]
         if not rows:
             return _complain(f"{options.csv} is not written: every seed that was tested had failed in training", 1)
         write_rows(options.csv, COLUMNS["evaluations"], rows)
@@ -252,6 +256,7 @@ def _play(arguments: list[str]) -> int:
                 options.perturb,
                 on_progress=on_progress,
                 trust_task=options.trust_task,
+                which=options.checkpoint,
             ):
                 text = f"return {number(episode.episode_return)} in {episode.length:,} steps"
                 console.print(f"episode {episode.episode}: {text}")

@@ -132,12 +132,14 @@ class Resume:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Test the last policies of a run on fresh episodes that neither training nor its evaluations have used."""
+    """Test the policies of a run on fresh episodes that neither training nor its evaluations have used."""
 
     run: Annotated[Positional[Path], arg(metavar="DIR")]
     """The directory of a run."""
     seed: Annotated[int | None, arg(help_behavior_hint="(default: every seed)")] = None
     """Label of the seed to test."""
+    checkpoint: Literal["last", "best"] = "last"
+    """Each seed's last policy, or the one of its best evaluation."""
     episodes: int = 10
     """Episodes per seed, the same for each."""
     processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
@@ -160,6 +162,8 @@ class Play:
     """The directory of a run."""
     seed: Annotated[int | None, arg(help_behavior_hint="(default: the one with the best last evaluations)")] = None
     """Label of the seed to watch."""
+    checkpoint: Literal["last", "best"] = "last"
+    """The seed's last policy, or the one of its best evaluation."""
     episodes: int = 1
     """Number of episodes."""
     video: Annotated[Path | None, arg(metavar="OUT.mp4", help_behavior_hint="(default: a window)")] = None

@@ -8,12 +8,14 @@ from numbers import Integral
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
+
 from csac.checks import check_path
 from csac.deploy.artefact_contract import ArtefactContract, artefacts_below, is_artefact
 from csac.deploy.contract import Contract, read_json
 from csac.deploy.policy import CONTRACT, SAVED, Policy
 from csac.record.run import RunDirectory, Which, is_run
-from csac.record.statistics import last_evaluations
+from csac.record.statistics import evaluation_matrix, last_evaluations
 from csac.types import InputError
 
 _OPENED = "open it with csac.deploy.artefact.open_artefact, or load its run"
@@ -118,3 +120,15 @@ def _best_seed(run: RunDirectory, seeds: list[int]) -> int:
 
 def _listed(seeds: list[int]) -> str:
     return ", ".join(str(seed) for seed in seeds)
+
+
+def step_of_policy(run: RunDirectory, seed: int, which: Which) -> int:
+    """Return the environment step at which a seed's last or best policy was saved."""
+    rows = run.evaluations
+    return best_step(rows[rows["seed"] == seed]) if which == "best" else run.manifest.steps_of(seed)
+
+
+def best_step(rows: np.ndarray) -> int:
+    """Return the step of the evaluation with the highest mean return, the first of equals; the rows are of one seed."""
+    steps, _, returns = evaluation_matrix(rows)
+    return int(steps[np.argmax(returns[0])])

@@ -14,7 +14,7 @@ from csac.deploy.artefact import compiler, open_artefact
 from csac.deploy.artefact_contract import ArtefactContract, Format, Weights
 from csac.deploy.c_size import Size, sizes
 from csac.deploy.card import model_card
-from csac.deploy.choosing import choose_seed
+from csac.deploy.choosing import best_step, choose_seed
 from csac.deploy.contract import FLOAT32_MAX, Contract
 from csac.deploy.guards import Guards, make_guards
 from csac.deploy.policy import Policy
@@ -22,7 +22,7 @@ from csac.deploy.writing import CARD, CURVE, check_place, placed, write_artefact
 from csac.evaluation.verify import Compared, Returns, compare_actions, compare_returns, record, returns_as_fields
 from csac.record.atomic import write_atomically
 from csac.record.run import RunDirectory, Which
-from csac.record.statistics import evaluation_matrix, last_evaluations
+from csac.record.statistics import last_evaluations
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import unlike_training
 from csac.tasks.trust import refuse_untrusted
@@ -227,8 +227,7 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
     own = rows[rows["seed"] == seed] if len(rows) else rows
     evaluation: dict[str, Any] = {}
     if len(own):
-        steps, _, returns = evaluation_matrix(own)
-        step = int(steps[np.argmax(returns[0]) if which == "best" else -1])
+        step = best_step(own) if which == "best" else int(own["step"].max())
         evaluation = {"step": step, **returns_as_fields(own["return"][own["step"] == step])}
     at = evaluation.get("step", manifest.steps_done) if which == "best" else manifest.steps_of(seed)
     last = last_evaluations(rows, points=1) if len(rows) else {}

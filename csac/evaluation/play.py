@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator
 
     from csac.evaluation.evaluator import OnProgress
+    from csac.record.run import Which
     from csac.tasks.perturbations import Perturbation
 
 DEFAULT_FRAMES_PER_SECOND = 30
@@ -41,8 +42,9 @@ def evaluate_run(
     processes: int | None = None,
     on_progress: OnProgress | None = None,
     trust_task: bool = False,
+    which: Which = "last",
 ) -> Iterator[tuple[int, list[EvaluationEpisode]]]:
-    """Yield (seed, episodes) for the last policy of each seed of a run, or of the one asked for.
+    """Yield (seed, episodes) for the last policy of each seed of a run, or of the one asked for, or for the best one.
 
     The episodes are the same for every seed, and none that training or its evaluations have seen. The task is the one
     that the run began with, but for these `perturbations`, which last from beginning to end. The episodes are shared by
@@ -65,7 +67,7 @@ def evaluate_run(
     )
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     labels = _seeds_with_policies(run) if seed is None else [seed]
-    policies = [load(directory, label) for label in labels]
+    policies = [load(directory, label, which) for label in labels]
     processes = choose_processes(evaluator, len(policies)) if processes is None else processes
     if processes == 1:
         workers = evaluator
@@ -97,12 +99,13 @@ def play(
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
     on_progress: OnProgress | None = None,
     trust_task: bool = False,
+    which: Which = "last",
 ) -> Iterator[EvaluationEpisode]:
     """Yield the episodes that a run's policy plays, in a window or, with `video`, into an .mp4 file.
 
-    Without `seed` it is the seed with the best last evaluations. The video is there once the last episode was yielded.
-    `on_progress(steps done, of how many at most)` is called after each step. An episode that reaches `LONGEST_EPISODE`
-    steps is broken off there. `perturbations` and `trust_task` are as in `evaluate_run`.
+    Without `seed` it is the seed with the best last evaluations; `which` is as in `csac.load`. The video is there once
+    the last episode was yielded. `on_progress(steps done, of how many at most)` is called after each step. An episode
+    that reaches `LONGEST_EPISODE` steps is broken off there. `perturbations` and `trust_task` are as in `evaluate_run`.
 
     Raises:
         InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
@@ -111,7 +114,7 @@ def play(
     run, perturbed = _open(directory, trust_task), values_at(constant_perturbations(perturbations), 0)
     if episodes < 1:
         raise InputError(f"{episodes} episodes: play at least one")
-    policy = load(directory, seed)
+    policy = load(directory, seed, which)
     if video is None:
         _require_display()
     else:

@@ -13,9 +13,11 @@ import pytest
 from gymnasium import spaces
 from policies import contract, random_policy
 
+from csac.cli import main
 from csac.deploy.contract import Contract
 from csac.evaluation import play as playing
 from csac.evaluation.play import evaluate_run, play
+from csac.record.csv_tables import read_rows
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.types import InputError
@@ -168,6 +170,25 @@ def test_an_ffmpeg_that_ends_is_told_in_one_line(run_of, tmp_path, monkeypatch, 
     with pytest.raises(InputError) as caught:
         list(play(run_of(3).path, video=film))
     assert str(caught.value) == f"cannot write {film}: {reason}; choose another place"
+
+
+def test_the_policy_of_the_best_evaluation_can_be_tested_and_watched(run_of, tmp_path, monkeypatch):
+    """Its rows are of the step at which it was saved."""
+    run = run_of(3)
+    best = random_policy(contract(), 5)
+    best.save_layers(run.policy(0, "best"))
+    run.append("evaluations", [evaluation(step, value) for step, value in ((3, 1.0), (6, 8.0), (9, 2.0))])
+    (expected,) = best.contract.to_environment(best.act(np.zeros((1, 2), np.float32)))[0]
+    monkeypatch.chdir(tmp_path)
+    for line in ("evaluate run --episodes 1 --csv rows.csv", "play run --video film.mp4"):
+        del ACTIONS[:]
+        assert main([*line.split(), "--trust-task", "--checkpoint", "best"]) == 0
+        np.testing.assert_allclose(np.unique(ACTIONS), [expected], rtol=1e-6)
+    assert read_rows("rows.csv")["step"].tolist() == [6]
+
+
+def evaluation(step: int, value: float) -> dict[str, Any]:
+    return {"seed": 0, "step": step, "episode": 0, "return": value, "length": 3, "success": None}
 
 
 def test_evaluating_a_run_tells_how_far_it_is(run_of):
