@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from csac.record.manifest import Manifest
+    from csac.record.plots import Format
     from csac.studies.parts import Part
 
 TableName = Literal["returns", "recovery", "cases"]
@@ -257,7 +258,7 @@ def _page(path: Path) -> Path:
     return path
 
 
-def _kind_of(picture: Path) -> str:
+def _kind_of(picture: Path) -> Format:
     kind = picture.suffix[1:]
     if kind not in ("png", "pdf", "svg"):
         raise InputError(f"a picture is a .png, .pdf or .svg file, not {picture}")
