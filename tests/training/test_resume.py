@@ -364,7 +364,7 @@ def test_two_processes_do_not_share_a_run(tmp_path, finished):
 def test_what_another_process_did_before_the_run_was_locked_is_not_undone(tmp_path, finished, monkeypatch):
     """The manifest is read before the lock is taken, and was written back as it had been."""
 
-    def meanwhile(*_: Any) -> str:
+    def meanwhile(*_: Any, **__: Any) -> str:
         RunDirectory.open(finished).update_manifest(steps=200, inexact_seeds=(0,))
         return ""
 
