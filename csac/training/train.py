@@ -316,13 +316,14 @@ def _begins_on_another_task(run: RunDirectory, begin: int) -> bool:
 def _logs(run: RunDirectory, labels: list[int], begin: int, watchers: Watchers) -> list[Log]:
     """Return where the curves go beside the tables. Both are slow to import, and some runs do without."""
     logs: list[Log] = []
+    before = _before(run, labels) if watchers.tensorboard or watchers.wandb else {}
     if watchers.tensorboard:
         from csac.record.tensorboard import TensorBoardLog
 
-        logs.append(TensorBoardLog(run.tensorboard, labels, begin, _before(run, labels)))
+        logs.append(TensorBoardLog(run.tensorboard, labels, begin, before))
     if watchers.wandb:
         project = watchers.wandb if isinstance(watchers.wandb, str) else None
-        logs.append(WandbLog(run, labels, begin, project, _before(run, labels)))
+        logs.append(WandbLog(run, labels, begin, project, before))
     return logs
 
 
