@@ -1,10 +1,12 @@
 """What csac's candidate and its peers reach in equal time: stage 4 of results/strong/PROTOCOL.md, run by run.
 
-    python -m benchmarks.equal_time speeds            # how fast each is; nothing else may run for half an hour
+    python -m benchmarks.equal_time speeds            # how fast each is; for 70 to 90 minutes nothing else may run
     python -m benchmarks.equal_time run --part 1/2    # what each peer learns in as many steps as T has room for
     python -m benchmarks.equal_time run --part 2/2    # the other half, at the same time or on another machine
 
 What is learnt depends on steps and not on time, so only the speeds need a quiet machine: two cores, one run at a time.
+The peers take half an hour of it (30 times 60 s), each of csac's two arms 20 to 30 minutes (16 runs). A speed that
+other programs disturbed is refused, and so is another machine for those that are missing.
 The runs that learn take one core each, on any machine. Each command goes on where it was stopped: a run whose file is
 there is not made again. The tables are printed by results/strong/equal_time.py.
 """
@@ -24,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from benchmarks.contenders import PEERS_PYTHON
-from benchmarks.measuring import ROOT, Process, machine, run, run_one, surroundings, watch_load
+from benchmarks.measuring import ROOT, Process, lasting, machine, run, run_one, surroundings, watch_load
 from benchmarks.tables import Row, read_rows, write_rows
 from csac.processes import usable_cores
 from csac.studies.study import Study, read_study
@@ -33,17 +35,33 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-STUDY = ROOT / "results" / "strong" / "confirm.toml"  # stage 1: the candidate, the tasks and the seeds
+STUDY = ROOT / "results" / "strong" / "confirm.toml"  # stage 1: csac's two arms, the tasks and the seeds
 CANDIDATE = "CSAC, candidate"
+OWN = (CANDIDATE, "SAC, candidate")  # csac's arms: T is the time of the first, the second is told as secondary
 FOLDER = ROOT / "results" / "strong" / "equal-time"
 PEERS = ("sb3-sac", "sbx-sac", "sbx-tqc", "sbx-crossq", "sbx-simba")  # peers/models.py has their settings
+CONTENDERS = (*OWN, *PEERS)
+# Of the peers; the versions of some are pinned nowhere, so that machine.txt has those of all.
+PACKAGES = (
+    "sbx-rl",
+    "stable-baselines3",
+    "torch",
+    "jax",
+    "flax",
+    "optax",
+    "tfp-nightly",
+    "gymnasium",
+    "mujoco",
+    "numpy",
+)
 CORES = 2
 STEPS = 100_000  # environment steps of the candidate, which take the time T
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 1.0)  # of T: when a peer is evaluated
 REPETITIONS = 3
-TIMED_STEPS = (14_000, 20_000)  # of the candidate, beyond its warm-up of 10,000
+TIMED_STEPS = (14_000, 20_000)  # of csac's arms, beyond their warm-up of 10,000
 TIMED_SECONDS = 60.0  # of a peer: its steps are counted after two thirds, and at the end
-QUIET = 0.2  # processors that other programs may keep busy without a warning
+LEAST_UPDATES = 10  # of a peer before its first count: SBX's CrossQ compiles a program in each of its first three
+QUIET = 0.2  # processors that other programs may keep busy: a speed beside more than that does not count
 
 
 class Run(NamedTuple):
@@ -81,12 +99,12 @@ Speeds = dict[tuple[str, str], list[Speed]]  # of a contender on a task, its rep
 # How fast each is.
 
 
-def training(study: Study, task: str, steps: int) -> list[str]:
-    """Return the arguments of `csac` for a run of the candidate of so many steps.
+def training(study: Study, arm: str, task: str, steps: int) -> list[str]:
+    """Return the arguments of `csac` for a run of one of its arms of so many steps.
 
     csac always evaluates its last policy. One episode is the least that it can be asked for, a second or less.
     """
-    method = next(method for method in study.methods if method.label == CANDIDATE)
+    method = next(method for method in study.methods if method.label == arm)
     words = ["train", task, "--algorithm", method.algorithm]
     for name, value in method.hyperparameters_on(task).items():
         words += _flag(name.replace("_", "-"), value)
@@ -116,9 +134,9 @@ def time_training(words: Sequence[str]) -> float:
 
 
 def measure(contender: str, study: Study, task: str) -> Speed:
-    """Return how fast the candidate or a peer is now. Raises InputError where its command fails."""
-    if contender == CANDIDATE:
-        first, second = (time_training(training(study, task, steps)) for steps in TIMED_STEPS)
+    """Return how fast an arm of csac or a peer is now. Raises InputError where its command fails."""
+    if contender in OWN:
+        first, second = (time_training(training(study, contender, task, steps)) for steps in TIMED_STEPS)
         return Speed((first, second), TIMED_STEPS)
     what = ["--task", task, "--seed", str(study.first_seed), "--seconds", str(TIMED_SECONDS)]
     try:
@@ -126,7 +144,7 @@ def measure(contender: str, study: Study, task: str) -> Speed:
     except RuntimeError as error:
         raise InputError(f"{contender} on {task}: {error}") from None
     (first, before, updates), (second, after, _) = answer["marks"]
-    if not (updates and before < after):
+    if updates < LEAST_UPDATES or before >= after:
         raise InputError(
             f"{contender} on {task} still warmed up after {first:.0f} s: this machine is too slow to time it"
         )
@@ -134,45 +152,66 @@ def measure(contender: str, study: Study, task: str) -> Speed:
 
 
 def measured(folder: Path, study: Study) -> Speeds:
-    """Return the speeds of speeds.csv. Raises InputError where those of another candidate are there."""
+    """Return the speeds of speeds.csv. Raises InputError where those of another arm of csac are there."""
     path = folder / "speeds.csv"
     found: Speeds = {}
     for row in read_rows(path) if path.exists() else []:
-        if row["contender"] == CANDIDATE and row["command"] != _command(study, row["task"]):
-            raise InputError(f"{path} was measured with another candidate than {STUDY.name} has: remove it")
+        if row["command"] != _command(study, row["contender"], row["task"]):
+            raise InputError(f"{path} was measured with another {row['contender']} than {STUDY.name} has: remove it")
         speed = Speed((row["first_seconds"], row["last_seconds"]), (row["first_steps"], row["last_steps"]))
         found.setdefault((row["contender"], row["task"]), []).append(speed)
     return found
 
 
+def unmeasured(folder: Path, study: Study) -> list[tuple[int, str, str]]:
+    """Return the repetition, the task and the contender of what speeds.csv has not got, in turns."""
+    found = measured(folder, study)
+    turns = itertools.product(range(REPETITIONS), study.tasks, CONTENDERS)
+    return [(turn, task, one) for turn, task, one in turns if len(found.get((one, task), [])) <= turn]
+
+
+def note_machine(folder: Path) -> None:
+    """Write machine.txt before the first speed. Raises InputError where there are speeds of another machine."""
+    path, here = folder / "machine.txt", [*machine(1.0), peers_versions()]
+    if not (folder / "speeds.csv").exists():
+        path.write_text("".join(f"{line}\n" for line in here), encoding="utf-8")
+        return
+    there = lasting(path.read_text(encoding="utf-8").splitlines()) if path.exists() else []
+    if other := next((line for line in lasting(here) if line not in there), ""):
+        raise InputError(
+            f"the speeds in {folder} are of another machine or other versions, as {path.name} has not got "
+            f"{other!r}: go on there, or remove them"
+        )
+
+
 def measure_speeds(folder: Path, study: Study) -> None:
     """Measure what speeds.csv has not got, all in turns, and write plan.csv.
 
-    The candidate's first runs on a task are not counted: they compile what the others find.
+    The first runs of csac's arms on a task are not counted: they compile what the others find.
+
+    Raises:
+        InputError: other programs ran beside a measurement, which is not written then, or this is another machine.
     """
     _need_peers()
     folder.mkdir(parents=True, exist_ok=True)
-    prepared = set()
-    for repetition, task, contender in itertools.product(range(REPETITIONS), study.tasks, (CANDIDATE, *PEERS)):
-        if len(measured(folder, study).get((contender, task), [])) > repetition:
-            continue
-        if contender == CANDIDATE and task not in prepared:
+    left, prepared = unmeasured(folder, study), set()
+    if left:
+        note_machine(folder)
+    for repetition, task, contender in left:
+        if contender in OWN and (contender, task) not in prepared:
             for steps in TIMED_STEPS:  # which have programs of their own: the replay has a row for each step
-                time_training(training(study, task, steps))
-            prepared.add(task)
+                time_training(training(study, contender, task, steps))
+            prepared.add((contender, task))
         others = watch_load()
         speed, load = measure(contender, study, task), others()
-        warning = ": TOO MUCH, nothing else may run" if load > QUIET else ""
-        what = f"{contender} on {task}: {speed.rate:.1f} steps/s"
-        print(f"{what}; other programs kept {load:.2f} cores busy{warning}", flush=True)
-        moments = zip(("first", "last"), speed.seconds, speed.steps, strict=True)
+        what = f"{contender} on {task}: {speed.rate:.1f} steps/s; other programs kept {load:.2f} cores busy"
+        if load > QUIET:
+            raise InputError(f"{what}, more than {QUIET}: it does not count, and the same command measures it again")
+        print(what, flush=True)
         row = {"contender": contender, "task": task, "repetition": repetition}
-        for name, seconds, steps in moments:
+        for name, seconds, steps in zip(("first", "last"), speed.seconds, speed.steps, strict=True):
             row |= {f"{name}_seconds": float(seconds), f"{name}_steps": steps}
-        row |= {"load": load, "command": _command(study, task) if contender == CANDIDATE else ""}
-        add_row(folder / "speeds.csv", row)
-        if not (folder / "machine.txt").exists():
-            (folder / "machine.txt").write_text("".join(f"{line}\n" for line in machine(1.0)))
+        add_row(folder / "speeds.csv", {**row, "load": load, "command": _command(study, contender, task)})
     write_rows(folder / "plan.csv", plan(measured(folder, study), study.tasks))
 
 
@@ -182,7 +221,7 @@ def plan(speeds: Speeds, tasks: Iterable[str]) -> list[Row]:
     Raises InputError for what was not measured often enough.
     """
     rows = []
-    for task, contender in itertools.product(tasks, (CANDIDATE, *PEERS)):
+    for task, contender in itertools.product(tasks, CONTENDERS):
         own = speeds.get((contender, task), [])
         if len(own) < REPETITIONS:
             raise InputError(
@@ -218,8 +257,9 @@ def read_plan(folder: Path, study: Study) -> tuple[dict[str, float], dict[tuple[
     return limits, steps
 
 
-def _command(study: Study, task: str) -> str:
-    return shlex.join(["csac", *training(study, task, TIMED_STEPS[-1])])
+def _command(study: Study, contender: str, task: str) -> str:
+    """Return what an arm of csac is timed by; a peer's settings are in models.py."""
+    return shlex.join(["csac", *training(study, contender, task, TIMED_STEPS[-1])]) if contender in OWN else ""
 
 
 # What the peers learn.
@@ -271,12 +311,26 @@ def run_peers(folder: Path, study: Study, part: tuple[int, int]) -> list[Run]:
             failed.append(one)
             print(f"failed: {name}: {error}", file=sys.stderr, flush=True)
             continue
-        print(f"{name}: {answer['step']:,} steps, {answer['updates']:,} updates", flush=True)
+        failure = "; training failed with NaN, which counts as 0" if answer["failed"] else ""
+        print(f"{name}: {answer['step']:,} steps, {answer['updates']:,} updates{failure}", flush=True)
     return failed
 
 
 def _script(peer: str, *what: str) -> list[str]:
     return [PEERS_PYTHON, str(ROOT / "benchmarks" / "peers" / "equal_time.py"), "--peer", peer, *what]
+
+
+def peers_versions() -> str:
+    """Return the versions of the peers' Python and libraries. Raises InputError where one is not installed."""
+    script = "import platform, sys; from importlib.metadata import version; "
+    script += "print(platform.python_version(), *map(version, sys.argv[1:]))"
+    ended = subprocess.run([PEERS_PYTHON, "-c", script, *PACKAGES], capture_output=True, text=True)
+    if ended.returncode:
+        reason = ended.stderr.strip().rpartition("\n")[2]
+        raise InputError(f"{PEERS_PYTHON} lacks a library: run `make peers` ({reason})")
+    python, *versions = ended.stdout.split()
+    told = (f"{name} {version}" for name, version in zip(PACKAGES, versions, strict=True))
+    return f"the peers: Python {python}, {', '.join(told)}"
 
 
 def _need_peers() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import resource
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from benchmarks.operations import DOMINANT, Product
 from csac.processes import usable_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
 ROOT = Path(__file__).resolve().parents[1]
 TASK = "HalfCheetah-v4"
@@ -170,6 +171,11 @@ def machine(seconds: float) -> list[str]:
         f"csac {version('csac')} at commit {_commit()}, Python {platform.python_version()}, "
         + ", ".join(f"{name} {version(name)}" for name in packages),
     ]
+
+
+def lasting(lines: Iterable[str]) -> list[str]:
+    """Return the lines of `machine` without what changes on one machine: how fast it multiplied, and the commit."""
+    return [re.sub(r"; one core multiplies .*| at commit [^,]*", "", line) for line in lines]
 
 
 def _commit() -> str:

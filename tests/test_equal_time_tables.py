@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import runpy
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from made import MadeRecords
 
-from benchmarks.equal_time import CANDIDATE, FOLDER, PEERS, SHARES, STEPS, STUDY
+from benchmarks.equal_time import CANDIDATE, FOLDER, OWN, PEERS, SHARES, STEPS, STUDY
 from csac.studies.cells import Cell
 from csac.studies.study import read_study
 from csac.types import InputError
@@ -22,7 +23,9 @@ SCRIPT = Path(__file__).parents[1] / "results" / "strong" / "equal_time.py"
 TABLES = SimpleNamespace(**runpy.run_path(str(SCRIPT)))
 CONFIRMED = read_study(STUDY)
 LIMITS = {"Walker2d-v4": 20.0, "Ant-v4": 30.0}
-RATES = {CANDIDATE: 5_000.0, **dict.fromkeys(PEERS, 100.0)}  # steps per second
+SAC = "SAC, candidate"
+RATES = {CANDIDATE: 5_000.0, SAC: 4_600.0, **dict.fromkeys(PEERS, 100.0)}  # steps per second
+STEPS_IN_T = {(CANDIDATE, task): STEPS for task in LIMITS} | {(SAC, "Walker2d-v4"): 110_000, (SAC, "Ant-v4"): 92_000}
 # What every seed of a peer reaches on Walker2d and Ant.
 RETURNS = dict(zip(PEERS, [(100.0, 200.0), (50.0, 300.0), (350.0, 90.0), (450.0, 80.0), (10.0, 20.0)], strict=True))
 
@@ -49,7 +52,7 @@ def folder(tmp_path) -> Path:
     lines = ["task,contender,limit,rate,share,steps"]
     for task, limit in LIMITS.items():
         for contender, rate in RATES.items():
-            steps = STEPS if contender == CANDIDATE else rate * limit
+            steps = STEPS_IN_T.get((contender, task), rate * limit)
             name = f'"{contender}"' if "," in contender else contender
             lines += [f"{task},{name},{limit},{rate},{share},{round(share * steps)}" for share in SHARES]
     (tmp_path / "plan.csv").write_text("\n".join([*lines, ""]))
@@ -61,7 +64,9 @@ def folder(tmp_path) -> Path:
 
 
 def candidate(cell: Cell, step: int) -> float:
-    """On Walker2d 300, 300, 500 and 500 in the last fifth; on Ant 100; before that 7."""
+    """On Walker2d 300, 300, 500 and 500 in the last fifth; on Ant 100; before that 7. SAC's are step / 100."""
+    if cell.algorithm == "sac":
+        return step / 100
     if step <= 80_000:
         return 7.0
     return 100.0 if cell.task == "Ant-v4" else 300.0 + 200.0 * (step > 90_000)
@@ -81,6 +86,19 @@ def test_the_return_at_equal_time_is_the_mean_of_the_last_fifth(folder):
     assert f"| SBX CrossQ | 450.0 ± 0.0 | 450.0 {crossq}" in lines
     assert f"| {CANDIDATE} | 400.0 ± 0.0 | 400.0 | 7.00 | 7.00 | 7.00 | 7.00 | 500.0 |" in lines  # Walker2d
     assert f"| {CANDIDATE} | 100.0 ± 0.0 | 100.0 | 7.00 | 7.00 | 7.00 | 7.00 | 100.0 |" in lines  # Ant
+
+
+def test_sac_is_told_by_the_steps_that_it_makes_in_t_and_of_no_more_than_it_was_run_for(folder):
+    lines = told(folder).splitlines()
+
+    assert "| Walker2d-v4 | SAC, candidate | 4600.0 | 20 | 110,000 |" in lines
+    note = "110,000 steps in T, but it was run for 100,000, which is what is told of it"
+    assert f"- SAC, candidate on Walker2d-v4: {note}" in lines
+    assert not any("SAC, candidate on Ant-v4:" in line for line in lines)
+    # Evaluated every 5,000 steps: at 0.2 to 1 T the last by 22,000 to 110,000; the mean of 85,000 to 100,000.
+    assert "| SAC, candidate | 925.0 ± 0.0 | 925.0 | 200.0 | 400.0 | 650.0 | 850.0 | 1,000.0 |" in lines
+    # The last by 18,400 to 92,000 steps; the mean of those above 73,600 = 0.8 x 92,000: 75,000 to 90,000.
+    assert "| SAC, candidate | 825.0 ± 0.0 | 825.0 | 150.0 | 350.0 | 550.0 | 700.0 | 900.0 |" in lines
 
 
 def test_a_share_by_which_a_peer_has_made_no_step_is_empty(folder):
@@ -103,13 +121,17 @@ def test_scores_are_shares_of_sb3_s_sac(folder):
 
 
 def test_the_candidate_is_compared_with_every_peer_over_both_tasks_and_on_each(folder):
-    lines = told(folder).splitlines()
+    page, _, secondary = told(folder).partition("**SAC, candidate (secondary), against each peer: seeds 100, ")
+    lines = page.strip().splitlines()
 
     always, never, half = "1.000 (1.000 to 1.000)", "0.000 (0.000 to 0.000)", "0.500 (0.500 to 0.500)"
     assert f"| SB3 SAC | {half} | not told apart | {always} | {never} |" in lines
     assert f"| SBX TQC | {always} | better | {always} | {always} |" in lines
     assert f"| SBX CrossQ | {half} | not told apart | {never} | {always} |" in lines
     assert lines[-1] == "Better than every one of the 5: missed."
+    assert re.findall(r"^\| (S.*?) \| (.*) \| better \|", secondary, re.MULTILINE) == [
+        (label, always) for label in TABLES.PEERS.values()
+    ]
 
 
 @pytest.mark.parametrize(
@@ -133,14 +155,17 @@ def test_below_five_common_seeds_there_is_no_verdict(folder):
     assert "- left out, since not every method has them on every task: seeds 102" in lines
     assert "**Walker2d-v4: seeds 100, 101, 102, 103, 104**" in lines
     assert "**Ant-v4: seeds 100, 101, 103, 104**" in lines
-    assert "**The candidate against each peer, seeds 100, 101, 103, 104**" in lines
+    assert f"**{CANDIDATE}, against each peer: seeds 100, 101, 103, 104**" in lines
     assert "| SBX TQC | 1.000 | no verdict | 1.000 (1.000 to 1.000) | 1.000 |" in lines
-    assert lines[-1] == "Better than every one of the 5: open: too few seeds."
+    assert "Better than every one of the 5: open: too few seeds." in lines
 
 
 def test_a_seed_that_failed_counts_as_0_and_is_listed(folder):
     write_peer(folder / "Walker2d-v4" / "sb3-sac" / "seed-101.csv", LIMITS["Walker2d-v4"], np.nan, np.nan)
-    lines = told(folder, failing=lambda cell: "NaN" if (cell.task, cell.seed) == ("Ant-v4", 104) else "").splitlines()
+    failed = ("csac", "Ant-v4", 104)
+    lines = told(
+        folder, failing=lambda cell: "NaN" if (cell.algorithm, cell.task, cell.seed) == failed else ""
+    ).splitlines()
 
     assert "- failed, and counted as 0: SB3 SAC on Walker2d-v4: seeds 101" in lines
     assert f"- failed, and counted as 0: {CANDIDATE} on Ant-v4: seeds 104" in lines
@@ -162,7 +187,7 @@ def test_without_the_candidate_s_stage_nothing_is_compared(folder):
     lines = told(folder, lambda cell, step: None).splitlines()
 
     assert f"- not run: {CANDIDATE} on Ant-v4: seeds 100, 101, 102, 103, 104" in lines
-    assert lines[-1].startswith(f"| Ant-v4 | {CANDIDATE} |")
+    assert lines[-1].startswith(f"| Ant-v4 | {SAC} |")
 
 
 def test_rows_of_another_plan_or_half_a_file_are_refused(folder):
@@ -184,12 +209,35 @@ def test_without_a_whole_plan_there_are_no_tables(folder):
     plan.write_text("\n".join(line for line in plan.read_text().splitlines() if not line.startswith("Ant-v4,sbx-sac")))
     with pytest.raises(InputError, match=r"sbx-sac on Ant-v4 was not measured: python -m benchmarks.equal_time speeds"):
         told(folder)
+    plan.write_text("\n".join(line for line in plan.read_text().splitlines() if f'"{SAC}"' not in line))
+    with pytest.raises(InputError, match=r"SAC, candidate on Walker2d-v4 was not measured"):
+        told(folder)
     plan.unlink()
     with pytest.raises(InputError, match=r"plan.csv is missing or damaged: python -m benchmarks.equal_time speeds"):
         told(folder)
 
 
+def run_script(monkeypatch, *arguments: str | Path) -> None:
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *map(str, arguments)])
+    runpy.run_path(str(SCRIPT), run_name="__main__")
+
+
+def test_the_tables_are_written_between_the_marks_of_a_page(folder, tmp_path, monkeypatch, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("Before.\n\n<!-- time: begin -->\nold\n<!-- time: end -->\n\nAfter.\n")
+    given = ("--folder", folder, "--results", tmp_path / "nothing", "--into")
+    run_script(monkeypatch, *given, f"{page}#time")
+
+    before, _, rest = page.read_text().partition("<!-- time: begin -->\n")
+    tables, _, after = rest.partition("<!-- time: end -->")
+    assert (before, after, capsys.readouterr().out) == ("Before.\n\n", "\n\nAfter.\n", "")
+    run_script(monkeypatch, *given[:-1])
+    assert tables.strip() == capsys.readouterr().out.strip() != ""
+    with pytest.raises(SystemExit, match="the page lacks the lines <!-- other: begin -->"):
+        run_script(monkeypatch, *given, f"{page}#other")
+
+
 def test_the_tables_are_of_the_runs_that_are_made():
     assert tuple(TABLES.PEERS) == PEERS
-    assert (TABLES.CANDIDATE, TABLES.STEPS) == (CANDIDATE, STEPS)
+    assert (TABLES.CANDIDATE, TABLES.OWN, TABLES.STEPS) == (CANDIDATE, OWN, STEPS)
     assert FOLDER.parent == SCRIPT.parent == STUDY.parent

@@ -6,8 +6,9 @@ r"""Train one peer with one seed, to learn how fast it is on a task or what it h
 
 With `--seconds` nothing is evaluated: a line of JSON has how many steps and updates were over after two thirds of the
 seconds and at their end, which are those since the process was started: imports and compilation count. With `--steps`
-it is evaluated after each of them, in 10 deterministic episodes, and training ends with the last. The peers and their
-settings are in models.py; `python -m benchmarks.equal_time` runs all of them.
+it is evaluated after each of them, in 10 deterministic episodes, and training ends with the last, or where it fails:
+the evaluations that are left are NaN then. The peers and their settings are in models.py;
+`python -m benchmarks.equal_time` runs all of them.
 """
 
 import argparse
@@ -126,17 +127,42 @@ def count_steps(model, seconds, launched, now=time.monotonic):
 
 
 def learn(model, environment, steps):
-    """Return the step, the updates, and the returns and lengths of ten episodes, after each of `steps`."""
-    found, left = [], list(steps)
+    """Return the step, the updates, and the returns and lengths of ten episodes, after each of `steps`.
+
+    Once the actor is not finite, returns are NaN and lengths 0, whatever its actions would still be worth.
+    """
+    found = []
 
     def look():
-        if left and model.num_timesteps >= left[0]:
+        if model.num_timesteps >= steps[len(found)]:
+            if has_failed(model):
+                return True
             found.append((model.num_timesteps, model._n_updates, evaluate(model, environment, EPISODES)))
-            del left[0]
-        return not left
+        return len(found) == len(steps)
 
-    train(model, steps[-1] + 1, look)  # one more than wanted: what ends training is `look`
-    return found
+    try:
+        train(model, steps[-1] + 1, look)  # one more than wanted: what ends training is `look`
+    except Exception:  # PyTorch refuses a distribution that is not finite by a ValueError, where JAX goes on
+        if not has_failed(model):
+            raise
+    left = steps[len(found) :] if has_failed(model) else []
+    return found + [(step, model._n_updates, [(math.nan, 0)] * EPISODES) for step in left]
+
+
+def has_failed(model):
+    """Return whether a parameter of the actor is not finite, which it will never be again."""
+    import numpy
+
+    return not all(numpy.isfinite(values).all() for values in _parameters(model.policy))
+
+
+def _parameters(policy):
+    """Return the arrays of the actor, of SBX or of SB3."""
+    if hasattr(policy, "actor_state"):
+        import jax
+
+        return jax.tree.leaves(policy.actor_state.params)
+    return [parameter.detach().cpu().numpy() for parameter in policy.actor.parameters()]
 
 
 def main(given=None):
@@ -157,8 +183,8 @@ def main(given=None):
             for episode, told in enumerate(episodes):
                 writer.writerow((arguments.peer, arguments.task, arguments.seed, *reached, episode, *told))
     os.replace(partial, arguments.out)
-    step, updates, _ = found[-1]
-    print(json.dumps({"step": step, "updates": updates}), flush=True)
+    step, updates, ((last, _), *_) = found[-1]
+    print(json.dumps({"step": step, "updates": updates, "failed": math.isnan(last)}), flush=True)
 
 
 if __name__ == "__main__":

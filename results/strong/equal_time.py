@@ -1,10 +1,12 @@
 """What csac's candidate and its peers have learnt in equal time: what PROTOCOL.md asks for in stage 4.
 
     python results/strong/equal_time.py
+    python results/strong/equal_time.py --into PAGE.md#NAME
 
-The runs are those of `python -m benchmarks.equal_time`, in equal-time/; the candidate's are those of stage 1, in
+The runs are those of `python -m benchmarks.equal_time`, in equal-time/; those of csac's arms are of stage 1, in
 results/studies. The return at equal time of a run is the mean of its evaluations in the last fifth: a peer's of the
-time T, the candidate's of the 100,000 steps of which T is the time.
+time T, the candidate's of the 100,000 steps of which T is the time. That of SAC on the candidate's critics, which is
+secondary, is of the steps that it makes in T, but of no more than the 100,000 that it was run for.
 """
 
 from __future__ import annotations
@@ -31,14 +33,17 @@ from csac.record.statistics import (
 )
 from csac.studies.arms import Arm, gather
 from csac.studies.results import Results, Source
+from csac.studies.run_report import write_between
 from csac.studies.study import Study, read_study
 from csac.types import InputError
 
 HERE = Path(__file__).parent
 EVIDENCE = SimpleNamespace(**runpy.run_path(str(HERE.parent / "reference" / "evidence.py")))
 CANDIDATE = "CSAC, candidate"  # of confirm.toml, and of plan.csv
-STEPS = 100_000  # of the candidate, which take the time T
-LAST_SHARE = 0.2  # of T, or of the candidate's steps: the evaluations there are the return at equal time
+SECONDARY = "SAC, candidate"
+OWN = (CANDIDATE, SECONDARY)
+STEPS = 100_000  # of the candidate, which take the time T; no run of csac's arms is longer
+LAST_SHARE = 0.2  # of T, or of the steps of csac's arms: the evaluations there are the return at equal time
 # By the folders of benchmarks/equal_time.py. The first is the SAC automatic of this stage: what scores are shares of.
 PEERS = {
     "sb3-sac": "SB3 SAC",
@@ -68,7 +73,7 @@ class Reached(NamedTuple):
     value: float
     """The mean of its evaluations in the last fifth; NaN where training failed."""
     returns: dict[float, float]
-    """The evaluation at each share of T; the candidate's is the last one by then."""
+    """The evaluation at each share of T; of csac's arms it is the last one by then."""
 
 
 Plans = dict[tuple[str, str], Plan]  # by contender and task
@@ -112,12 +117,13 @@ def _table(path: Path, columns: tuple[str, ...], written_by: str) -> list[dict[s
     return rows
 
 
-def of_candidate(arm: Arm, plan: Plan) -> dict[int, Reached]:
-    """Return what each seed of the candidate has reached."""
+def of_own(arm: Arm, plan: Plan) -> dict[int, Reached]:
+    """Return what each seed of an arm of csac has reached in the steps that T has room for, of those that it ran."""
     reached = {seed: Reached(np.nan, dict.fromkeys(plan.steps, np.nan)) for seed in arm.failures}
     if len(arm.rows):
         at, seeds, returns = evaluation_matrix(arm.rows)
-        values = EVIDENCE.final_returns(arm.rows, STEPS)
+        within = min(STEPS, max(plan.steps.values()))
+        values = EVIDENCE.final_returns(arm.rows[arm.rows["step"] <= within], within)
         for seed, line in zip(seeds.tolist(), returns, strict=True):
             by_then = {share: line[at <= steps] for share, steps in plan.steps.items()}
             last = {share: float(some[-1]) if len(some) else np.nan for share, some in by_then.items()}
@@ -126,9 +132,9 @@ def of_candidate(arm: Arm, plan: Plan) -> dict[int, Reached]:
 
 
 def gathered(study: Study, results: Source, folder: Path, plans: Plans) -> Found:
-    """Return what every peer, and after them the candidate, has reached on each task, as far as it has run."""
+    """Return what every peer, and after them csac's arms, have reached on each task, as far as they have run."""
     seeds = range(study.first_seed, study.first_seed + study.seeds)
-    candidate = {arm.task: arm for arm in gather(study.narrowed(algorithms=[CANDIDATE]), results)}
+    arms = gather(study.narrowed(algorithms=list(OWN)), results)
     found: Found = {}
     for task in study.tasks:
         files = {(peer, seed): folder / task / peer / f"seed-{seed}.csv" for peer in PEERS for seed in seeds}
@@ -136,7 +142,7 @@ def gathered(study: Study, results: Source, folder: Path, plans: Plans) -> Found
             label: {s: read_peer(files[peer, s], plans[peer, task]) for s in seeds if files[peer, s].exists()}
             for peer, label in PEERS.items()
         }
-        found[task][CANDIDATE] = of_candidate(candidate[task], plans[CANDIDATE, task])
+        found[task] |= {arm.label: of_own(arm, plans[arm.label, task]) for arm in arms if arm.task == task}
     return found
 
 
@@ -161,7 +167,7 @@ def measured(found: Found) -> dict[str, dict[str, EVIDENCE.Measured]]:
 def speed_table(study: Study, plans: Plans) -> Table:
     """Return how far each contender comes in T."""
     rows = []
-    for task, (name, label) in itertools.product(study.tasks, {**PEERS, CANDIDATE: CANDIDATE}.items()):
+    for task, (name, label) in itertools.product(study.tasks, (*PEERS.items(), *zip(OWN, OWN, strict=True))):
         plan = plans[name, task]
         steps = max(plan.steps.values())
         cells = (
@@ -194,18 +200,21 @@ def task_table(task: str, reached: dict[str, dict[int, Reached]], seeds: Sequenc
     return Table(headings, tuple(rows), f"{task}: seeds {_seeds(seeds)}")
 
 
-def comparisons(found: dict[str, dict[str, EVIDENCE.Measured]], seeds: Sequence[int]) -> tuple[Table, list[str]]:
-    """Return how the candidate compares with each peer, over all tasks and on each, and the verdicts."""
+def comparisons(
+    found: dict[str, dict[str, EVIDENCE.Measured]], own: str, seeds: Sequence[int]
+) -> tuple[Table, list[str]]:
+    """Return how an arm of csac compares with each peer, over all tasks and on each, and the verdicts."""
     returns = EVIDENCE.scores(found, lambda one: one.final, seeds)
     rows, verdicts = [], []
     for peer in PEERS.values():
-        interval = improvement_interval(returns[CANDIDATE], returns[peer])
+        interval = improvement_interval(returns[own], returns[peer])
         verdicts.append(EVIDENCE.verdict(interval))
-        pairs = [(methods[CANDIDATE].final, methods[peer].final) for methods in found.values()]
-        cells = [Cell(peer), _probability(returns[CANDIDATE], returns[peer]), Cell(verdicts[-1])]
+        pairs = [(methods[own].final, methods[peer].final) for methods in found.values()]
+        cells = [Cell(peer), _probability(returns[own], returns[peer]), Cell(verdicts[-1])]
         rows.append(Row((*cells, *(_probability(*pair) for pair in pairs))))
-    headings = ("candidate against", "P(higher return)", "so", *(f"P(higher return), {task}" for task in found))
-    return Table(headings, tuple(rows), f"The candidate against each peer, seeds {_seeds(seeds)}"), verdicts
+    headings = ("against", "P(higher return)", "so", *(f"P(higher return), {task}" for task in found))
+    title = f"{own}{'' if own == CANDIDATE else ' (secondary)'}, against each peer: seeds {_seeds(seeds)}"
+    return Table(headings, tuple(rows), title), verdicts
 
 
 def _probability(values: np.ndarray, others: np.ndarray) -> Cell:
@@ -233,6 +242,16 @@ def notes(study: Study, found: Found, seeds: Sequence[int]) -> list[str]:
     return [f"{what}: seeds {_seeds(which)}" for what, which in lists if which]
 
 
+def shorter(study: Study, plans: Plans) -> list[str]:
+    """Return which arm of csac was not run for all the steps that it makes in T."""
+    made = {(task, own): max(plans[own, task].steps.values()) for task in study.tasks for own in OWN}
+    return [
+        f"{own} on {task}: {steps:,} steps in T, but it was run for {STEPS:,}, which is what is told of it"
+        for (task, own), steps in made.items()
+        if steps > STEPS
+    ]
+
+
 def surroundings(folder: Path) -> list[str]:
     """Return what the speeds depend on: the machine, as far as it was noted, and what else ran on it."""
     machine, path = folder / "machine.txt", folder / "speeds.csv"
@@ -249,20 +268,22 @@ def surroundings(folder: Path) -> list[str]:
 def told(study: Study, results: Source, folder: Path) -> str:
     """Return all that is known of stage 4, in Markdown. Raises InputError where T is not known."""
     plans = read_plan(folder / "plan.csv")
-    for task, name in itertools.product(study.tasks, (CANDIDATE, *PEERS)):
+    for task, name in itertools.product(study.tasks, (*OWN, *PEERS)):
         if (name, task) not in plans:
             raise InputError(f"{name} on {task} was not measured: python -m benchmarks.equal_time speeds")
     study = dataclasses.replace(study, title="Equal time")
     found = gathered(study, results, folder, plans)
     over = measured(found)
     seeds = EVIDENCE.common_seeds(study, over)
-    parts = [f"## {study.title}", _list([*notes(study, found, seeds), *surroundings(folder)])]
+    listed = [*notes(study, found, seeds), *shorter(study, plans), *surroundings(folder)]
+    parts = [f"## {study.title}", _list(listed)]
     tables = [speed_table(study, plans)]
     tables += [task_table(task, found[task], next(iter(one.values())).seeds) for task, one in over.items()]
     if seeds:
-        comparison, verdicts = comparisons(over, seeds)
+        comparison, verdicts = comparisons(over, CANDIDATE, seeds)
         tables += [EVIDENCE.overall_table(study, over), comparison]
         parts += [*map(markdown, tables), f"Better than every one of the {len(PEERS)}: {aim(verdicts)}."]
+        parts.append(markdown(comparisons(over, SECONDARY, seeds)[0]))
     else:
         parts += map(markdown, tables)
     return "\n\n".join(part for part in parts if part)
@@ -277,13 +298,20 @@ def _seeds(seeds: Iterable[int]) -> str:
 
 
 def main() -> None:
-    """Print the tables."""
+    """Print the tables, or write them into a page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, default=HERE / "equal-time", help="where the runs' files are")
-    parser.add_argument("--results", type=Path, default=EVIDENCE.CELLS, help="where the candidate's cells/ lies")
+    parser.add_argument("--results", type=Path, default=EVIDENCE.CELLS, help="where cells/ of csac's arms lies")
+    parser.add_argument("--into", metavar="PAGE.md#NAME", help="write between the marks NAME of a page")
     arguments = parser.parse_args()
     try:
-        print(told(read_study(HERE / "confirm.toml"), Results(arguments.results, may_be_empty=True), arguments.folder))
+        source = Results(arguments.results, may_be_empty=True)
+        text = told(read_study(HERE / "confirm.toml"), source, arguments.folder)
+        if arguments.into:
+            page, _, name = arguments.into.partition("#")
+            write_between(Path(page), name, f"{text}\n")
+        else:
+            print(text)
     except InputError as error:
         sys.exit(str(error))
 

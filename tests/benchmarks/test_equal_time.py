@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -12,10 +13,12 @@ from typing import Any
 
 import equal_time
 import models
+import numpy as np
 import pytest
 from evaluation import evaluate
 
 from benchmarks import equal_time as runner
+from benchmarks import measuring
 from benchmarks.contenders import PEERS_PYTHON
 from benchmarks.measuring import ROOT, Process
 from benchmarks.tables import read_rows, write_rows
@@ -33,6 +36,8 @@ class Model:
     def __init__(self, pace: float = 0.0, warmup: int = 0) -> None:
         self.pace, self.warmup, self.at = pace, warmup, 100.0
         self.num_timesteps = self._n_updates = 0
+        self.weights = np.ones(2)
+        self.policy = SimpleNamespace(actor_state=SimpleNamespace(params={"kernel": self.weights}))
 
     def learn(self, steps: int, callback: Any) -> None:
         while self.num_timesteps < steps:
@@ -41,7 +46,10 @@ class Model:
             self.at += self.pace
             if not callback._on_step():
                 return
-            self._n_updates += self.num_timesteps > self.warmup
+            self.update()
+
+    def update(self) -> None:
+        self._n_updates += self.num_timesteps > self.warmup
 
     def now(self) -> float:
         return self.at
@@ -70,6 +78,54 @@ def test_an_evaluation_comes_after_the_updates_of_its_step(monkeypatch):
         (5, 2, ("a task", 10)),
         (9, 6, ("a task", 10)),
     ]
+
+
+class Diverging(Model):
+    """Its actor is NaN after the update of its sixth step. SBX's goes on with that."""
+
+    def update(self) -> None:
+        super().update()
+        if self.num_timesteps == 6:
+            self.weights[1] = np.nan
+
+
+class Refusing(Diverging):
+    """SB3's, whose parameters are PyTorch's, refuses to act by NaN."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        parameter = SimpleNamespace(detach=lambda: SimpleNamespace(cpu=lambda: SimpleNamespace(numpy=self.numpy)))
+        self.policy = SimpleNamespace(actor=SimpleNamespace(parameters=lambda: iter([parameter])))
+
+    def numpy(self) -> np.ndarray:
+        return self.weights
+
+    def update(self) -> None:
+        if np.isnan(self.weights).any():
+            raise ValueError("Expected parameter loc to satisfy the constraint Real(), but found invalid values")
+        super().update()
+
+
+@pytest.mark.usefixtures("_callbacks")
+@pytest.mark.parametrize(("model", "updates"), [(Diverging(), 9), (Refusing(), 6)])
+def test_what_is_left_of_a_run_that_diverged_is_nan(model, updates, monkeypatch):
+    monkeypatch.setattr(equal_time, "evaluate", lambda model, environment, episodes: [(7.0, 3)] * episodes)
+    found = equal_time.learn(model, "a task", [2, 5, 9, 30])
+
+    assert found[:2] == [(2, 2, [(7.0, 3)] * 10), (5, 5, [(7.0, 3)] * 10)]
+    assert [(step, made, len(episodes)) for step, made, episodes in found[2:]] == [(9, updates, 10), (30, updates, 10)]
+    assert all(math.isnan(total) and not length for *_, episodes in found[2:] for total, length in episodes)
+    assert model.num_timesteps < 12  # nothing is learnt any more
+
+
+@pytest.mark.usefixtures("_callbacks")
+def test_a_run_that_breaks_off_with_a_finite_actor_is_no_result(monkeypatch):
+    def broken(*_: Any) -> None:
+        raise ValueError("a file is gone")
+
+    monkeypatch.setattr(equal_time, "evaluate", broken)
+    with pytest.raises(ValueError, match="a file is gone"):
+        equal_time.learn(Model(), "a task", [2, 5])
 
 
 class Task:
@@ -108,6 +164,19 @@ def arguments(tmp_path, monkeypatch) -> list[str]:
 
 def test_the_clock_of_a_run_by_hand_starts_with_the_script(arguments):
     assert equal_time.read_arguments([*arguments, "--seconds", "5"]).launched == equal_time.IMPORTED
+
+
+@pytest.mark.usefixtures("_callbacks")
+def test_the_file_of_a_run_that_diverged_has_every_evaluation(arguments, monkeypatch, capsys):
+    monkeypatch.setattr(equal_time, "make_peer", lambda *_: Diverging())
+    monkeypatch.setattr(equal_time, "evaluate", lambda model, environment, episodes: [(7.0, 3)] * episodes)
+    equal_time.main([*arguments, "--steps", "5", "9", "--out", "run.csv"])
+
+    rows = read_rows(Path("run.csv"))
+    assert [row["step"] for row in rows] == [5] * 10 + [9] * 10
+    assert [row["return"] for row in rows[:10]] == [7] * 10
+    assert all(math.isnan(row["return"]) for row in rows[10:])
+    assert json.loads(capsys.readouterr().out) == {"step": 9, "updates": 9, "failed": True}
 
 
 @pytest.mark.parametrize(
@@ -235,8 +304,11 @@ def test_a_peer_is_evaluated_after_the_updates_of_its_steps_and_ends_by_itself(p
 # How fast each is.
 
 # Steps per second, and the seconds before the first step: T is 10 s + 100,000 steps / 100.
-PACES = {runner.CANDIDATE: (100.0, 10.0), **{peer: (10.0 * (i + 1), 5.0) for i, peer in enumerate(runner.PEERS)}}
+PACES = {peer: (10.0 * (i + 1), 5.0) for i, peer in enumerate(runner.PEERS)}
+PACES |= {runner.CANDIDATE: (100.0, 10.0), "SAC, candidate": (110.0, 10.0)}
 T = 1010.0
+MACHINE = ["processor: one, 2 cores; one core multiplies at 50 operations/s", "csac 0.1.0 at commit abc, Python 3.11.7"]
+PEERS_VERSIONS = "the peers: Python 3.11.7, flax 0.12.8"
 
 
 @pytest.fixture
@@ -252,7 +324,9 @@ def measured(monkeypatch) -> list[tuple[str, str]]:
 
     monkeypatch.setattr(runner, "measure", measure)
     monkeypatch.setattr(runner, "time_training", lambda words: made.append(("prepared", words[1])) or 1.0)
-    monkeypatch.setattr(runner, "machine", lambda seconds: ["a processor"])
+    monkeypatch.setattr(runner, "machine", lambda seconds: MACHINE)
+    monkeypatch.setattr(runner, "peers_versions", lambda: PEERS_VERSIONS)
+    monkeypatch.setattr(runner, "watch_load", lambda: lambda: 0.1)
     monkeypatch.setattr(runner, "PEERS_PYTHON", __file__)
     return made
 
@@ -262,8 +336,9 @@ def folder(tmp_path, measured) -> Path:
     """Where everything has its speed."""
     assert runner.main(["speeds", "--folder", str(tmp_path)]) == 0
     prepared = [("prepared", STUDY.tasks[0])] * 2  # both lengths have programs of their own
-    assert measured[:3] == [*prepared, (runner.CANDIDATE, STUDY.tasks[0])]
-    assert len(measured) == 3 * 2 * 6 + 2 * 2
+    own = [[*prepared, (label, STUDY.tasks[0])] for label in (runner.CANDIDATE, "SAC, candidate")]
+    assert measured[:6] == [*own[0], *own[1]]
+    assert len(measured) == 3 * 2 * 7 + 2 * 2 * 2
     measured.clear()
     return tmp_path
 
@@ -277,15 +352,16 @@ def test_the_plan_has_the_steps_of_each_in_the_time_of_the_candidate(folder):
     limits, steps = runner.read_plan(folder, STUDY)
     assert limits == dict.fromkeys(STUDY.tasks, T)
     assert steps[runner.CANDIDATE, "Ant-v4"][-1] == 100_000
+    assert steps["SAC, candidate", "Ant-v4"][-1] == 110_000
     for i, peer in enumerate(runner.PEERS):
         pace = 10 * (i + 1)
         assert steps[peer, "Ant-v4"] == [round(pace * (share * T - 5)) for share in runner.SHARES]
-    assert (folder / "machine.txt").read_text() == "a processor\n"
+    assert (folder / "machine.txt").read_text().splitlines() == [*MACHINE, PEERS_VERSIONS]
 
 
 def test_a_share_of_the_time_without_a_step_is_left_out():
     slow = runner.Speed((800.0, 900.0), (100.0, 300.0))
-    speeds = {(contender, "Ant-v4"): [slow] * 3 for contender in runner.PEERS}
+    speeds = {(contender, "Ant-v4"): [slow] * 3 for contender in runner.CONTENDERS}
     speeds[runner.CANDIDATE, "Ant-v4"] = [runner.Speed((10.0, 510.0), (0.0, 50_000.0))] * 3
     told = [row for row in runner.plan(speeds, ["Ant-v4"]) if row["contender"] == "sb3-sac"]
     assert [row["share"] for row in told] == [0.8, 0.85, 0.9, 0.95, 1.0]  # its first step is over after 750 s
@@ -295,7 +371,7 @@ def test_a_share_of_the_time_without_a_step_is_left_out():
 def test_only_what_was_not_measured_is_measured(folder, measured):
     path = folder / "speeds.csv"
     rows = read_rows(path)
-    assert len(rows) == 3 * 2 * 6
+    assert len(rows) == 3 * 2 * 7
     write_rows(path, rows[:-1])
     (folder / "plan.csv").unlink()
 
@@ -306,6 +382,75 @@ def test_only_what_was_not_measured_is_measured(folder, measured):
     assert (folder / "plan.csv").exists()
 
 
+def test_a_speed_beside_other_programs_is_refused_and_measured_again(tmp_path, measured, monkeypatch, capsys):
+    loads = iter([0.1, 0.2, 0.31, *[0.1] * 50])
+    monkeypatch.setattr(runner, "watch_load", lambda: lambda: next(loads))
+    assert runner.main(["speeds", "--folder", str(tmp_path)]) == 2
+
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "sb3-sac on Walker2d-v4: 15.0 steps/s; other programs kept 0.31 cores busy, more than 0.2: it does" in error
+    assert "does not count, and the same command measures it again" in error
+    assert [row["contender"] for row in read_rows(tmp_path / "speeds.csv")] == [runner.CANDIDATE, "SAC, candidate"]
+
+    measured.clear()
+    assert runner.main(["speeds", "--folder", str(tmp_path)]) == 0
+    assert measured[0] == ("sb3-sac", "Walker2d-v4")
+
+
+def test_on_another_machine_or_with_other_versions_nothing_is_measured(folder, measured, monkeypatch, capsys):
+    path = folder / "speeds.csv"
+    write_rows(path, read_rows(path)[:-1])
+    other = MACHINE[0].replace("2 cores", "4 cores")
+    monkeypatch.setattr(runner, "machine", lambda seconds: [other, MACHINE[1]])
+    assert runner.main(["speeds", "--folder", str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert "of another machine or other versions, as machine.txt has not got 'processor: one, 4 cores': go on" in error
+    assert error.count("\n") == 1
+
+    monkeypatch.setattr(runner, "machine", lambda seconds: MACHINE)
+    monkeypatch.setattr(runner, "peers_versions", lambda: PEERS_VERSIONS.replace("0.12.8", "0.12.9"))
+    assert runner.main(["speeds", "--folder", str(folder)]) == 2
+    assert "machine.txt has not got 'the peers: Python 3.11.7, flax 0.12.9'" in capsys.readouterr().err
+
+    (folder / "machine.txt").unlink()
+    assert runner.main(["speeds", "--folder", str(folder)]) == 2
+    assert not measured
+
+
+def test_a_machine_stays_the_same_at_another_pace_and_commit(folder, measured, monkeypatch):
+    path = folder / "speeds.csv"
+    write_rows(path, read_rows(path)[:-1])
+    later = [line.replace(" 50 ", " 61 ").replace("commit abc", "commit def with changes") for line in MACHINE]
+    monkeypatch.setattr(runner, "machine", lambda seconds: later)
+    assert runner.main(["speeds", "--folder", str(folder)]) == 0
+    assert measured == [("sbx-simba", "Ant-v4")]
+
+
+def test_what_lasts_of_a_machine_are_its_processors_and_versions(monkeypatch):
+    def lines(rate: float, commit: str) -> list[str]:
+        monkeypatch.setattr(measuring, "one_core_rate", lambda seconds: rate)
+        monkeypatch.setattr(measuring, "_commit", lambda: commit)
+        return measuring.machine(1.0)
+
+    first, second = lines(50.0, "abc"), lines(61.0, "def with changes")
+    assert first != second
+    assert measuring.lasting(first) == measuring.lasting(second)
+    assert " cores, " in measuring.lasting(first)[0]
+    assert f"numpy {np.__version__}" in measuring.lasting(first)[1]
+
+
+def test_the_peers_versions_are_those_of_their_own_python(monkeypatch):
+    monkeypatch.setattr(runner, "PEERS_PYTHON", sys.executable)
+    monkeypatch.setattr(runner, "PACKAGES", ("numpy", "pytest"))
+    python = ".".join(map(str, sys.version_info[:3]))
+    assert runner.peers_versions() == f"the peers: Python {python}, numpy {np.__version__}, pytest {pytest.__version__}"
+
+    monkeypatch.setattr(runner, "PACKAGES", ("numpy", "no-such-library"))
+    with pytest.raises(InputError, match=r"lacks a library: run `make peers` \(.*no-such-library\)$"):
+        runner.peers_versions()
+
+
 def test_without_every_speed_there_is_no_plan(folder):
     speeds = runner.measured(folder, STUDY)
     speeds["sbx-tqc", "Ant-v4"].pop()
@@ -313,15 +458,17 @@ def test_without_every_speed_there_is_no_plan(folder):
         runner.plan(speeds, STUDY.tasks)
 
 
-def test_the_speed_of_another_candidate_is_refused(folder):
-    (index,) = [i for i, method in enumerate(STUDY.methods) if method.label == runner.CANDIDATE]
+@pytest.mark.parametrize("label", runner.OWN)
+def test_the_speed_of_another_candidate_is_refused(folder, label):
+    (index,) = [i for i, method in enumerate(STUDY.methods) if method.label == label]
     other = dataclasses.replace(STUDY.methods[index], hyperparameters={"policy_delay": 1})
     methods = (*STUDY.methods[:index], other, *STUDY.methods[index + 1 :])
-    with pytest.raises(InputError, match=r"speeds.csv was measured with another candidate than confirm.toml has"):
+    with pytest.raises(InputError, match=rf"speeds.csv was measured with another {label} than confirm.toml has"):
         runner.measured(folder, dataclasses.replace(STUDY, methods=methods))
 
 
-def test_the_candidate_is_timed_with_every_hyperparameter_of_stage_1(monkeypatch):
+@pytest.mark.parametrize("label", runner.OWN)
+def test_the_candidate_is_timed_with_every_hyperparameter_of_stage_1(monkeypatch, label):
     trained: dict[str, Any] = {}
 
     def train(algorithm: Any, task: str, **options: Any) -> Any:
@@ -329,9 +476,9 @@ def test_the_candidate_is_timed_with_every_hyperparameter_of_stage_1(monkeypatch
         return SimpleNamespace(manifest=SimpleNamespace(state="finished", failures={}))
 
     monkeypatch.setattr("csac.training.train.train", train)
-    csac(runner.training(STUDY, "Ant-v4", 20_000))
+    csac(runner.training(STUDY, label, "Ant-v4", 20_000))
 
-    (candidate,) = [method for method in STUDY.methods if method.label == runner.CANDIDATE]
+    (candidate,) = [method for method in STUDY.methods if method.label == label]
     assert dataclasses.asdict(trained["algorithm"]) == candidate.hyperparameters_on("Ant-v4")
     assert (trained["task"], trained["steps"], trained["first_seed"]) == ("Ant-v4", 20_000, 100)
     assert (trained["evaluation_interval"], trained["evaluation_episodes"]) == (20_000, 1)
@@ -348,10 +495,12 @@ def test_the_candidate_s_speed_is_that_of_two_commands_and_a_peer_s_that_of_its_
         return answer
 
     monkeypatch.setattr(runner, "run_one", run_one)
-    assert runner.measure(runner.CANDIDATE, STUDY, "Ant-v4") == runner.Speed((150.0, 210.0), (14_000, 20_000))
+    for label in runner.OWN:
+        assert runner.measure(label, STUDY, "Ant-v4") == runner.Speed((150.0, 210.0), (14_000, 20_000))
     assert runner.measure("sbx-sac", STUDY, "Ant-v4") == runner.Speed((41.0, 61.0), (820, 1220))
     assert [(one.peer, one.task, one.seed, one.seconds) for one in given] == [("sbx-sac", "Ant-v4", 100, 60.0)]
-    for marks in ([[41.0, 20, 0], [61.0, 40, 10]], [[64.0, 820, 720], [64.0, 820, 720]]):
+    # CrossQ compiles at its first three updates: these may not be within the window.
+    for marks in ([[41.0, 20, 9], [61.0, 40, 29]], [[64.0, 820, 720], [64.0, 820, 720]]):
         answer["marks"] = marks
         with pytest.raises(InputError, match=r"sbx-sac on Ant-v4 still warmed up after \d+ s: this machine is too"):
             runner.measure("sbx-sac", STUDY, "Ant-v4")
@@ -362,7 +511,7 @@ def test_the_candidate_s_speed_is_that_of_two_commands_and_a_peer_s_that_of_its_
 
 @pytest.fixture
 def started(monkeypatch) -> list[tuple[dict[str, str], list[int], list[int]]]:
-    """Arguments, steps and cores of the runs, which fail for SBX's TQC on Ant and else write a file."""
+    """Arguments, steps and cores of the runs, which break off for SBX's TQC on Ant and else write a file."""
     commands: list[tuple[dict[str, str], list[int], list[int]]] = []
 
     def run(processes: list[Process], environment: Any) -> list[dict[str, Any]]:
@@ -373,7 +522,7 @@ def started(monkeypatch) -> list[tuple[dict[str, str], list[int], list[int]]]:
         if (given["--peer"], given["--task"]) == ("sbx-tqc", "Ant-v4"):
             raise RuntimeError("it broke")
         write_rows(Path(given["--out"]), [{"step": one} for one in steps for _ in range(10)])
-        return [{"step": steps[-1], "updates": 900}]
+        return [{"step": steps[-1], "updates": 900, "failed": given["--peer"] == "sbx-simba"}]
 
     monkeypatch.setattr(runner, "run", run)
     monkeypatch.setattr(runner, "usable_cores", lambda: [4, 7])
@@ -389,7 +538,12 @@ def test_peers_run_seed_by_seed_and_what_is_there_is_not_run_again(folder, start
     _, steps = runner.read_plan(folder, STUDY)
     assert all(wanted == steps[given["--peer"], given["--task"]] for given, wanted, _ in started)
     assert {tuple(cores) for *_, cores in started} == {(4,)}
-    assert "failed: sbx-tqc on Ant-v4, seed 100: it broke" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "failed: sbx-tqc on Ant-v4, seed 100: it broke" in told.err
+    assert (
+        "sbx-simba on Ant-v4, seed 104: 50,250 steps, 900 updates; training failed with NaN, which counts" in told.out
+    )
+    assert "sbx-crossq on Ant-v4, seed 104: 40,200 steps, 900 updates\n" in told.out
 
     started.clear()
     assert runner.main(["run", "--folder", str(folder)]) == 3
