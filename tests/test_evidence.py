@@ -218,6 +218,9 @@ def test_each_stage_is_written_from_the_results_of_the_screen(folder):
     assert (implicit["relative_entropy_form"], implicit["reference_rate"]) == ("implicit", 0.005)
     two = written["CSAC, periodic 1000, two references"]
     assert (two["critic_reference"], two["relative_entropy_weight"]) == ("earlier", 0.5)
+    learnt = written["CSAC, periodic 1000, relative-entropy weight automatic"]
+    assert (learnt["relative_entropy_weight"], learnt["target_relative_entropy"]) == ("auto", 0.01)
+    assert f"{form}, relative-entropy weight automatic" not in written
 
 
 def test_a_best_form_in_the_actor_only_is_given_what_it_has_not(folder):
@@ -229,6 +232,7 @@ def test_a_best_form_in_the_actor_only_is_given_what_it_has_not(folder):
     methods = {method.label: method for method in read_study(folder / "options.toml").methods[2:]}
     assert list(methods)[1] == form
     assert f"{form}, in the actor only" not in methods
+    assert f"{form}, relative-entropy weight automatic" in methods
     implicit = methods[f"{form}, implicit, log-densities bounded"].hyperparameters_on("Hopper-v4")
     assert implicit["relative_entropy_form"] == "implicit"
     two = methods["CSAC, periodic 1000, two references"].hyperparameters_on("Hopper-v4")
@@ -242,5 +246,9 @@ def test_nothing_is_chosen_before_every_cell_has_run(folder):
 
 
 def test_where_nothing_differs_few_are_told_apart():
-    shares = EVIDENCE.false_verdicts(tasks=1, seeds=4, trials=3)  # four seeds have no interval
-    assert shares == (0.0, 0.0, 0.0)
+    # By chance: of 100 pairs on one task about 11 are, as PROTOCOL.md has it, half of them as better.
+    shares = EVIDENCE.false_verdicts(tasks=1, seeds=5, trials=50)
+    assert 0.03 <= shares.apart <= 0.25
+    assert 0 < shares.better < shares.apart
+    assert shares.better <= shares.either_better <= 2 * shares.better
+    assert EVIDENCE.false_verdicts(tasks=1, seeds=4, trials=3) == (0.0, 0.0, 0.0)  # four seeds have no interval

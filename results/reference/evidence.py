@@ -60,11 +60,12 @@ PERIODIC = Method(
 )
 OPTIONS: dict[str, dict[str, Any]] = {
     "entropy weight automatic": {"entropy_weight": "auto"},
-    "relative-entropy weight automatic": {"relative_entropy_weight": "auto", "target_relative_entropy": 0.01},
     "log-densities bounded": {"target_log_prob_bound": 5.0},
     "implicit, log-densities bounded": {"relative_entropy_form": "implicit", "target_log_prob_bound": 5.0},
     "in the actor only": {"relative_entropy_form": "actor_only"},
 }
+LEARNT = "relative-entropy weight automatic"
+TARGET: dict[str, Any] = {"relative_entropy_weight": "auto", "target_relative_entropy": 0.01}
 
 # Which stage is looked at, how many of its best are taken, and into which files their arms go.
 STAGES = {
@@ -81,7 +82,7 @@ class Measured(NamedTuple):
     early: np.ndarray  # [seed] at 100,000 steps; NaN where nothing was evaluated there
     drawdown: np.ndarray  # [seed]
     area_lost: np.ndarray  # [seed] as a share of the return before the perturbation, in steps; NaN without one
-    dispersion: float
+    dispersion: float  # NaN where a seed failed: those that are left say nothing of how far apart all of them lie
 
 
 # What runs have reached.
@@ -112,7 +113,7 @@ def measure(arm: Arm, steps: int, seeds: Sequence[int]) -> Measured:
         of({seed: float(curve[at == EARLY][0]) for seed, curve in curves.items() if EARLY in at}, 0.0),
         of({seed: drawdown(curve) for seed, curve in curves.items()}, np.inf),
         of({seed: one.area_lost / abs(one.before) for seed, one in recovered.items()}, np.inf),
-        dispersion_across(returns),
+        np.nan if arm.failures.keys() & set(seeds) else dispersion_across(returns),
     )
 
 
@@ -197,9 +198,10 @@ def task_table(task: str, arms: dict[str, Measured]) -> Table:
     """Return what each method has reached on one task."""
     rows = []
     for label, one in arms.items():
-        known, falls = one.final[~np.isnan(one.final)], one.drawdown[np.isfinite(one.drawdown)]
+        known = one.final[~np.isnan(one.final)]
         std = f" ± {number(known.std(ddof=1), known.mean())}" if len(known) > 1 else ""
-        fall, early = (falls.mean() if len(falls) else np.nan), one.early.mean()
+        early = one.early.mean()
+        fall = one.drawdown.mean() if np.isfinite(one.drawdown).all() else np.nan  # one that failed has none
         cells = (
             Cell(label),
             Cell(str(len(known)), len(known)),
@@ -332,15 +334,19 @@ def best(study: Study, source: Source) -> list[Method]:
 def options(form: Method) -> list[Method]:
     """Return a form, with less and more weight, and each option alone that it has not.
 
-    Two references need `periodic` in the target.
+    Two references need `periodic` in the target, and a learnt weight a copy of 1,000 updates before: where the form has
+    another reference, `periodic` 1000 is given them.
     """
     told = form.hyperparameters
     is_explicit = told.get("relative_entropy_form", "explicit") == "explicit"
     base = form if told["reference_policy"] == "periodic" and is_explicit else PERIODIC
     two = _changed(base, "two references", {"critic_reference": "earlier"})
+    # Its target is meant for a copy of 1,000 updates before: within a shorter lag no policy moves as far.
+    learnt = form if (told["reference_policy"], told.get("reference_period")) == ("periodic", 1000) else PERIODIC
     weights = [_changed(form, f"tau {tau:g}", {"relative_entropy_weight": tau}) for tau in WEIGHTS]
     new = {words: changes for words, changes in OPTIONS.items() if {**told, **changes} != told}
-    return [form, *weights, *(_changed(form, words, changes) for words, changes in new.items()), two]
+    changed = [_changed(form, words, changes) for words, changes in new.items()]
+    return [form, *weights, *changed, _changed(learnt, LEARNT, TARGET), two]
 
 
 def write(stage: str, folder: Path, source: Source) -> list[Path]:
