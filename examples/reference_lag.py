@@ -3,9 +3,10 @@
     python examples/reference_lag.py
 
 The first table is in refreshes: iterations of conservative value iteration, each with its exact improvement, in a small
-random task (tests/algorithms/test_csac_theory.py shows that CSAC's equations are those). The other two are in updates:
-plain gradient descent on CSAC's actor loss with its reference policies. In the second Q always pulls one way, in the
-third the bracket has a best policy, exp(Q/sigma), and the distance to it is halved.
+random task (tests/algorithms/test_csac_theory.py shows that CSAC's equations are those). The others are in updates:
+descent on CSAC's actor loss with its reference policies. In the second Q always pulls one way, in the third the bracket
+has a best policy, exp(Q/sigma), and the distance to it is halved; both are plain gradient descent. The fourth is the
+second with Adam.
 """
 
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from csac.algorithms.adaptation import Weights
 from csac.algorithms.csac import CSAC
@@ -22,6 +24,8 @@ from csac.algorithms.references import ReferencePolicy, reference_after, referen
 from csac.types import Layer
 
 STATES, ACTIONS = 10, 5
+PULL = 0.01  # slope of the Q that rises evenly with the mean
+NOISE = 0.05  # standard deviation of the noise in the gradient that Adam is given
 
 
 class Choice(NamedTuple):
@@ -30,6 +34,16 @@ class Choice(NamedTuple):
     policy: ReferencePolicy
     period: int = 1000
     rate: float = 0.005
+
+
+CHOICES = (
+    Choice("algorithm1"),
+    Choice("previous"),
+    Choice("average", rate=0.05),
+    Choice("average", rate=0.005),
+    Choice("periodic", period=100),
+    Choice("periodic", period=1000),
+)
 
 
 def conservative_value_iteration(alpha: float, beta: float, discount: float, iterations: int) -> np.ndarray:
@@ -69,11 +83,31 @@ def predicted_slow_down(choice: Choice, resistance: float) -> float:
     return 1.0 + resistance / (1.0 if choice.policy == "previous" else choice.rate)
 
 
-def measured_slow_down(choice: Choice, tau: float, std: float, learning_rate: float, updates: int = 6000) -> float:
+def predicted_slow_down_with_adam(choice: Choice, tau: float, std: float, learning_rate: float, noise: float) -> float:
+    """Return how many times longer the same way takes with Adam, where its gradient has noise or none at all.
+
+    Adam divides by the root of the second moment. Where noise dominates that, it is plain descent with the learning
+    rate over the noise. Without noise every step is one learning rate long, until the reference is so far behind that
+    it pulls as hard as Q: by then the pace is that of the reference, pull / (τ L / std²), whatever the learning rate.
+    """
+    if noise:
+        return predicted_slow_down(choice, learning_rate / noise * tau / std**2)
+    lag = {"algorithm1": 0.0, "previous": 1.0, "average": 1.0 / choice.rate, "periodic": choice.period}[choice.policy]
+    return max(1.0, learning_rate * lag * tau / std**2 / PULL)
+
+
+def measured_slow_down(
+    choice: Choice,
+    tau: float,
+    std: float,
+    optimiser: optax.GradientTransformation,
+    updates: int = 6000,
+    noise: float = 0.0,
+) -> float:
     """Return how many times longer the mean of a Gaussian takes than without relative entropy, after a transient."""
 
     def speed(weight: float) -> float:
-        way = means(choice, Weights(0.0, weight), std, learning_rate, updates, even_pull)
+        way = means(choice, Weights(0.0, weight), std, optimiser, updates, even_pull, noise)
         return float(way[-1] - way[updates // 2 - 1]) / (updates - updates // 2)
 
     return speed(0.0) / speed(tau)
@@ -105,7 +139,8 @@ def measured_half_life(choice: Choice, weights: Weights, std: float, learning_ra
     period = choice.period if choice.policy == "periodic" else 1
     periods = int(np.ceil(3 * predicted_half_life(choice, weights, std, learning_rate) / period))
     updates = 2 * period * periods  # both halves end with a period
-    distance = 1.0 - np.asarray(means(choice, weights, std, learning_rate, updates, _pull_to_one(weights, std)))
+    way = means(choice, weights, std, optax.sgd(learning_rate), updates, _pull_to_one(weights, std))
+    distance = 1.0 - np.asarray(way)
     left = distance[-1] / distance[updates // 2 - 1]
     return float(updates // 2 * np.log(0.5) / np.log(left))
 
@@ -116,31 +151,42 @@ def largest_stable_resistance(choice: Choice) -> float:
 
 
 def means(
-    choice: Choice, weights: Weights, std: float, learning_rate: float, updates: int, critic: Callable
+    choice: Choice,
+    weights: Weights,
+    std: float,
+    optimiser: optax.GradientTransformation,
+    updates: int,
+    critic: Callable,
+    noise: float = 0.0,
 ) -> jax.Array:
-    """Return the mean of a Gaussian policy after each update [update] by plain descent on CSAC's actor loss, from 0."""
+    """Return the mean of a Gaussian policy after each update [update] on CSAC's actor loss, from 0.
+
+    `noise` is the standard deviation of what is added to the gradient.
+    """
     algorithm = CSAC(relative_entropy_weight=float(weights.relative_entropy), relative_entropy_estimator="closed_form")
 
     def loss(actor: MLP, reference: MLP | None) -> jax.Array:
         networks = {"reference": reference, "critics": (critic, critic)}
         return algorithm.actor_loss(actor, jnp.zeros(1), jnp.zeros(1), weights=weights, **networks)[0]
 
-    def update(carry: tuple[MLP, MLP], step: jax.Array) -> tuple[tuple[MLP, MLP], jax.Array]:
-        actor, kept = carry
+    def update(carry: tuple[MLP, MLP, optax.OptState], step: jax.Array) -> tuple[tuple, jax.Array]:
+        actor, kept, optimiser_state = carry
         used = references_before(choice.policy, kept, None, actor, step % choice.period == 0).actor
         slope = jax.grad(loss)(actor, used).layers[0].bias[0]
-        moved = _gaussian(actor.layers[0].bias[0] - learning_rate * slope, std)
+        slope += noise * jax.random.normal(jax.random.fold_in(jax.random.key(0), step))
+        change, optimiser_state = optimiser.update(slope, optimiser_state)
+        moved = _gaussian(actor.layers[0].bias[0] + change, std)
         kept = reference_after(choice.policy, used, actor, choice.rate)
         assert kept is not None
-        return (moved, kept), moved.layers[0].bias[0]
+        return (moved, kept, optimiser_state), moved.layers[0].bias[0]
 
     first = _gaussian(jnp.zeros(()), std)
-    return jax.lax.scan(update, (first, first), jnp.arange(updates))[1]
+    return jax.lax.scan(update, (first, first, optimiser.init(jnp.zeros(()))), jnp.arange(updates))[1]
 
 
 def even_pull(inputs: jax.Array) -> jax.Array:
     """A Q that rises evenly with the mean."""
-    return 1e-2 * jnp.arctanh(inputs[1:])
+    return PULL * jnp.arctanh(inputs[1:])
 
 
 def _pull_to_one(weights: Weights, std: float) -> Callable:
@@ -173,7 +219,7 @@ def main() -> None:
 
     def slow_down(choice: Choice, tau: float) -> tuple[float, float]:
         predicted = predicted_slow_down(choice, learning_rate * tau / std**2)
-        return predicted, measured_slow_down(choice, tau, std, learning_rate)
+        return predicted, measured_slow_down(choice, tau, std, optax.sgd(learning_rate))
 
     _print_by_reference(slow_down, 3)
     print(f"\nUpdates until half of the distance to SAC's policy is left; sigma = {sigma}, the others the same")
@@ -185,23 +231,31 @@ def main() -> None:
 
     _print_by_reference(half_life, 1)
 
+    learning_rate, tau = 3e-4, 0.5
+    print(f"\nUpdates with Adam: how many times longer the same way takes; learning rate {learning_rate}, tau = {tau}")
+    print(f"reference        | no noise: predicted measured | noise {NOISE}: predicted measured")
+    for choice in CHOICES:
+        cells = []
+        # Without noise every step goes the same way, and the mean must stay where tanh can be undone.
+        for noise, updates in ((0.0, 8_000), (NOISE, 40_000)):
+            predicted = predicted_slow_down_with_adam(choice, tau, std, learning_rate, noise)
+            measured = measured_slow_down(choice, tau, std, optax.adam(learning_rate), updates, noise)
+            cells.append(f"{predicted:9.2f} {measured:8.2f}")
+        print(f"{_name(choice):<16} | {cells[0]:>28} | {cells[1]:>31}")
+
+
+def _name(choice: Choice) -> str:
+    number = {"periodic": f" {choice.period}", "average": f" {choice.rate}"}.get(choice.policy, "")
+    return choice.policy + number
+
 
 def _print_by_reference(values: Callable[[Choice, float], tuple[float, float]], decimals: int) -> None:
     """Print a row for each reference, and for each weight what is predicted beside what is measured."""
     print("reference        | tau = 0.05: predicted measured |  0.5: predicted measured |    5: predicted measured")
-    choices = (
-        Choice("algorithm1"),
-        Choice("previous"),
-        Choice("average", rate=0.05),
-        Choice("average", rate=0.005),
-        Choice("periodic", period=100),
-        Choice("periodic", period=1000),
-    )
-    for choice in choices:
-        number = {"periodic": f" {choice.period}", "average": f" {choice.rate}"}.get(choice.policy, "")
+    for choice in CHOICES:
         pairs = [values(choice, tau) for tau in (0.05, 0.5, 5.0)]
         cells = [f"{predicted:9.{decimals}f} {measured:8.{decimals}f}" for predicted, measured in pairs]
-        print(f"{choice.policy + number:<16} | {cells[0]:>29} | {cells[1]:>23} | {cells[2]:>23}")
+        print(f"{_name(choice):<16} | {cells[0]:>29} | {cells[1]:>23} | {cells[2]:>23}")
 
 
 if __name__ == "__main__":

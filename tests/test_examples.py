@@ -1,16 +1,21 @@
-"""The examples that speak of the theory print what the theory says."""
+"""The examples that speak of the theory print what the theory says, and documents hold what they print."""
 
 from __future__ import annotations
 
 import math
+import re
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import optax
 import pytest
 
-LAG = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "examples" / "reference_lag.py")))
+ROOT = Path(__file__).parents[1]
+LAG = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "reference_lag.py")))
+READING = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "minibatch_reading.py")))
+NUMBER = re.compile(r"[-+]?\d+\.?\d*")
 
 
 @pytest.mark.parametrize(("tau", "expected"), [(0.05, 0.9), (0.5, 0.9), (5.0, 5.0 / 5.2), (50.0, 50.0 / 50.2)])
@@ -32,7 +37,8 @@ def test_an_iteration_leaves_the_larger_of_alpha_and_the_discount(tau, expected)
 def test_a_reference_slows_down_by_its_lag(choice, lag):
     # 0.01·0.5 / 0.5² = 0.02 of the way back to the reference in each update: 1 + 0.02 x lag times as long.
     assert LAG.predicted_slow_down(choice, 0.02) == pytest.approx(1 + 0.02 * lag)
-    assert LAG.measured_slow_down(choice, 0.5, 0.5, 0.01, updates=600) == pytest.approx(1 + 0.02 * lag, rel=1e-3)
+    measured = LAG.measured_slow_down(choice, 0.5, 0.5, optax.sgd(0.01), updates=600)
+    assert measured == pytest.approx(1 + 0.02 * lag, rel=1e-3)
 
 
 @pytest.mark.parametrize(("tau", "lag"), [(0.25, 49.5), (50.0, 100.0)])
@@ -40,7 +46,8 @@ def test_a_period_lags_by_half_of_it_and_by_all_of_it_where_it_holds_fast(tau, l
     choice, resistance = LAG.Choice("periodic", period=100), 0.001 * tau / 0.5**2
     expected = 1 + resistance * lag if tau < 1 else resistance * lag
     assert LAG.predicted_slow_down(choice, resistance) == pytest.approx(expected, rel=1e-3)
-    assert LAG.measured_slow_down(choice, tau, 0.5, 0.001, updates=800) == pytest.approx(expected, rel=1e-3)
+    measured = LAG.measured_slow_down(choice, tau, 0.5, optax.sgd(0.001), updates=800)
+    assert measured == pytest.approx(expected, rel=1e-3)
 
 
 NEAR_THE_END = [LAG.Choice("previous"), LAG.Choice("average", rate=0.05), LAG.Choice("periodic", period=20)]
@@ -76,9 +83,72 @@ def test_a_long_lag_is_a_refresh():
 def test_beyond_its_limit_a_step_back_is_larger_than_the_one_before(choice):
     def steps(share):
         tau = share * LAG.largest_stable_resistance(choice) * 0.5**2 / 0.01
-        way = LAG.means(choice, LAG.Weights(0.0, tau), 0.5, 0.01, 40, LAG.even_pull)
+        way = LAG.means(choice, LAG.Weights(0.0, tau), 0.5, optax.sgd(0.01), 40, LAG.even_pull)
         return np.abs(np.diff(np.asarray(way)))[-20:]  # one period
 
     stable, unstable = steps(0.9), steps(1.1)
     assert stable.max() < 2e-4  # of 1e-4 that Q alone moves it
     assert unstable[-1] > 3 * unstable[1] > 0
+
+
+@pytest.mark.parametrize(
+    ("choice", "lag"),
+    [
+        (LAG.Choice("previous"), 1.0),
+        (LAG.Choice("average", rate=0.05), 20.0),
+        (LAG.Choice("periodic", period=50), 50.0),
+    ],
+)
+def test_adam_without_noise_goes_at_full_speed_until_the_reference_pulls_as_hard(choice, lag):
+    # The pull is 0.01, and a step of 3e-4 against 1 / 0.5² = 4: with τ L = 100 the way takes 3e-4·4·100 / 0.01 = 12
+    # times as long, and with τ L = 5 no longer than without.
+    for product, expected in ((100.0, 12.0), (5.0, 1.0)):
+        tau = product / lag
+        assert LAG.predicted_slow_down_with_adam(choice, tau, 0.5, 3e-4, 0.0) == pytest.approx(expected)
+        measured = LAG.measured_slow_down(choice, tau, 0.5, optax.adam(3e-4), 4_000)
+        assert measured == pytest.approx(expected, rel=0.07), product  # `previous` goes to and fro as well
+
+
+@pytest.mark.parametrize(
+    ("choice", "tau", "expected"),
+    [
+        # 3e-4 / 0.1 x 5 / 0.5² = 0.06 of the way back in each update, and a lag of 20.
+        (LAG.Choice("average", rate=0.05), 5.0, 1 + 0.06 * 20),
+        # 0.015 of it, and a period leaves 0.985^200 = 0.0487. (Adam's mean of ten gradients reaches into the next one.)
+        (LAG.Choice("periodic", period=200), 1.25, 200 * 0.015 / (1 - 0.0487)),
+    ],
+)
+def test_adam_in_noise_is_descent_with_the_rate_over_the_noise(choice, tau, expected):
+    assert LAG.predicted_slow_down_with_adam(choice, tau, 0.5, 3e-4, 0.1) == pytest.approx(expected, rel=1e-3)
+    measured = LAG.measured_slow_down(choice, tau, 0.5, optax.adam(3e-4), 100_000, 0.1)
+    assert measured == pytest.approx(expected, rel=0.06)
+
+
+@pytest.mark.parametrize("std", [1.0, 0.1, 0.01])
+def test_only_noise_is_left_of_a_sampled_relative_entropy_towards_the_actor_itself(std):
+    exact, sampled = (
+        READING.gradients(READING.CSAC(relative_entropy_estimator=estimator, reference_policy="algorithm1"), std)
+        for estimator in ("closed_form", "sampled")
+    )
+    mean, deviation = READING.moments(sampled - exact)
+    # d/dμ of 0.5 log(π/π̃) at a = tanh(μ + std ξ) is that of the log-density in its first argument, 0.5 ξ / std.
+    assert mean == pytest.approx(0.0, abs=1e-3 / std)
+    assert deviation == pytest.approx(0.5 / std, rel=1e-3)
+    without = READING.gradients(READING.CSAC(relative_entropy_weight=0.0), std)
+    np.testing.assert_allclose(exact, without, atol=1e-6 / std)
+
+
+@pytest.mark.parametrize(
+    ("example", "document"),
+    [pytest.param(LAG, "docs/relative-entropy.md", marks=pytest.mark.slow), (READING, "docs/algorithms/csac.md")],
+    ids=["reference_lag", "minibatch_reading"],
+)
+def test_documents_hold_what_an_example_prints(example, document, capsys):
+    example.main()
+    told = (ROOT / document).read_text()
+    for table in capsys.readouterr().out.strip().split("\n\n"):
+        heading, *_ = table.splitlines()
+        held = told[told.index(f"```\n{heading}\n") + 4 :].partition("\n```")[0]
+        assert NUMBER.sub("", held).split() == NUMBER.sub("", table).split()
+        printed, written = (np.array(NUMBER.findall(text), float) for text in (table, held))
+        np.testing.assert_allclose(printed, written, rtol=0.03, atol=2e-3)

@@ -10,10 +10,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equations import CLOSED_FORM, CRITICS, LINEAR, ONE, POLICY, REFERENCE, batch_of, gaussian, transition, update
+from equations import (
+    CLOSED_FORM,
+    CRITICS,
+    LINEAR,
+    ONE,
+    POLICY,
+    REFERENCE,
+    batch_of,
+    gaussian,
+    linear,
+    transition,
+    update,
+)
+from probes import Endless, Result
 
 from csac.algorithms import CSAC
 from csac.algorithms.distributions import kl, policy_at
+from csac.tasks.seeds import SeedEnvironments
 
 MECHANISM = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "results" / "reference" / "mechanism.py")))
 
@@ -108,3 +122,56 @@ def test_the_reference_is_that_of_the_next_update(reference_policy):
         told.append(metrics["relative_entropy"])
     np.testing.assert_allclose(found, told, rtol=1e-4, atol=1e-6)
     assert (max(found) > 1e-4) == (reference_policy != "algorithm1")
+
+
+class Counting(Endless):
+    """Observes the steps of its episode, which has four."""
+
+    def __init__(self) -> None:
+        super().__init__(length=4)
+
+    def step(self, action: np.ndarray) -> Result:
+        _, *rest = super().step(action)
+        return np.array([self.steps], np.float32), *rest
+
+
+@pytest.mark.parametrize(("sigma", "tau"), [(0.0, 0.5), (0.2, 0.0)])
+def test_a_rollout_has_what_each_state_is_worth_and_is_charged(monkeypatch, sigma, tau):
+    monkeypatch.setitem(MECHANISM.roll_out.__globals__, "ROLLOUT_STEPS", 400)
+    algorithm = CSAC(entropy_weight=sigma, relative_entropy_weight=tau, **CLOSED_FORM, **LINEAR)
+    # N(0.2 s, 0.5²) towards N(0, 0.5²) is a KL of 0.08 s² at step s; the critics say s + 1 and s + 5 of any action.
+    actor = linear([[0.2, 0.0]], [0.0, float(np.log(0.5))])
+    critics = (linear([[1.0], [0.0]], [5.0]), linear([[1.0], [0.0]], [1.0]))
+    state = algorithm.init(jax.random.key(0), ONE, 1000)._replace(actor=actor, critics=critics)
+    environments = SeedEnvironments(Counting, None, [0])
+    found = MECHANISM.roll_out(algorithm, state, gaussian(0.0, 0.5), environments, jax.random.key(1))
+    environments.close()
+
+    step = np.arange(400) % 4
+    np.testing.assert_array_equal(found.observation[:, 0], step)
+    np.testing.assert_array_equal(found.ended, step == 3)
+    assert not found.terminated.any()
+    np.testing.assert_allclose(found.reward, 1.0)
+    np.testing.assert_allclose(found.q_value, step + 1)
+    np.testing.assert_allclose(found.next_q_value, step + 2)
+    within = ~found.ended[:-1]
+    np.testing.assert_allclose(found.next_charge[:-1][within], found.charge[1:][within], rtol=1e-6)
+    if tau:
+        np.testing.assert_allclose(found.charge, tau * 0.08 * step**2, atol=1e-6)
+        np.testing.assert_allclose(found.next_charge, tau * 0.08 * (step + 1) ** 2, atol=1e-6)
+    else:
+        noises = jax.random.normal(jax.random.key(2), (20_000, 1))
+        log_prob = jax.vmap(policy_at(actor, jnp.zeros(1)).log_prob)(noises).mean()
+        assert found.charge[step == 0].mean() == pytest.approx(sigma * float(log_prob), abs=0.06)
+
+
+@pytest.mark.slow
+def test_a_run_is_looked_at_beside_the_actor_before_its_last_update(tmp_path):
+    name = "previous, closed_form"
+    MECHANISM.run(name, "probes:Endless-v0", 2 * MECHANISM.INTERVAL, 10, 0, tmp_path)
+    rows = np.genfromtxt(tmp_path / "previous-closed_form.csv", delimiter=",", names=True)
+    assert rows["step"].tolist() == [137, 274]
+    # All states are the same, so the KL to the next update's reference is that to the actor before the last one.
+    assert (rows["churn"] > 0).all()
+    np.testing.assert_allclose(rows["relative_entropy"], rows["churn"], rtol=1e-4)
+    assert (rows["update"] > 0).all()

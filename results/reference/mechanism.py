@@ -1,14 +1,15 @@
 """What the relative entropy does along real training runs: one file of numbers for each reference policy and estimator.
 
-    python results/reference/mechanism.py run "periodic, closed_form"      one arm, 30,000 steps of Walker2d-v4
-    python results/reference/mechanism.py run                              every arm that has no file yet
-    python results/reference/mechanism.py draw                             mechanism.png and a table from the files
+    python results/reference/mechanism.py run "periodic, closed_form" --into FOLDER      one arm
+    python results/reference/mechanism.py run --into FOLDER                              every arm without a file there
+    python results/reference/mechanism.py draw                                           the figure and the tables
 
-The run is what `csac train` makes with one seed. Every few hundred steps it is looked at; docs/relative-entropy.md says
-what the columns mean.
+The run is what `csac train` makes with one seed: Hopper-v4, 5,000 steps, as those whose files lie in mechanism/, which
+`draw` reads. Every 137 steps it is looked at; docs/relative-entropy.md says what the columns mean.
 """
 
 import argparse
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,11 +31,33 @@ from csac.training.learner import Learner
 from csac.types import Spec
 
 HERE = Path(__file__).parent / "mechanism"
+
+
+def _arm(policy: str, estimator: str = "closed_form", tau: float = 0.5, rate: float = 0.005) -> dict[str, Any]:
+    return {
+        "reference_policy": policy,
+        "relative_entropy_estimator": estimator,
+        "relative_entropy_weight": tau,
+        "reference_rate": rate,
+    }
+
+
 ARMS: dict[str, dict[str, Any]] = {
-    f"{policy}, {estimator}": {"reference_policy": policy, "relative_entropy_estimator": estimator}
+    f"{policy}, {estimator}": _arm(policy, estimator)
     for policy in ("algorithm1", "previous", "periodic", "average")
     for estimator in ("closed_form", "sampled")
 }
+# The same product of weight and lag, 100, which `average, closed_form` has as well; and a weight that is large.
+WEIGHTS: dict[str, dict[str, Any]] = {
+    "previous, tau 100": _arm("previous", tau=100.0),
+    "average 0.05, tau 5": _arm("average", tau=5.0, rate=0.05),
+    "periodic 1000, tau 0.1": _arm("periodic", tau=0.1),
+    "algorithm1 sampled, tau 50": _arm("algorithm1", "sampled", tau=50.0),
+    "previous, tau 50": _arm("previous", tau=50.0),
+    "average 0.005, tau 50": _arm("average", tau=50.0),
+    "periodic 1000, tau 50": _arm("periodic", tau=50.0),
+}
+BESIDE_WEIGHTS = ("algorithm1, closed_form", "previous, closed_form", "average, closed_form", "periodic, closed_form")
 INTERVAL = 137  # steps between two looks: seven of them are not quite a period of 1,000, which is seen at all ages
 LOOKS_PER_ROLLOUT = 4
 BATCHES = 16  # of the training's size, to tell the gradient from its noise
@@ -234,9 +257,9 @@ def critic_error(rollout: Rollout, discount: float) -> dict[str, float]:
     }
 
 
-def run(name: str, task: str, steps: int, warmup_steps: int, seed: int) -> None:
-    """Train one arm, look at it as it goes, and write its file."""
-    algorithm = CSAC(warmup_steps=warmup_steps, **ARMS[name])
+def run(name: str, task: str, steps: int, warmup_steps: int, seed: int, folder: Path) -> None:
+    """Train one arm, look at it as it goes, and write its file into a folder."""
+    algorithm = CSAC(warmup_steps=warmup_steps, **ARMS.get(name) or WEIGHTS[name])
     environments, aside = (SeedEnvironments(task, None, [label]) for label in (seed, 10_000 + seed))
     learner = Learner(algorithm, environments.spec, [seed], steps)
     observations = environments.reset()
@@ -271,10 +294,10 @@ def run(name: str, task: str, steps: int, warmup_steps: int, seed: int) -> None:
         print(f"{name}: step {step:,}, relative entropy {rows[-1]['relative_entropy']:.4g}", flush=True)
     environments.close()
     aside.close()
-    HERE.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     names = list(rows[0])
     lines = [",".join(names), *(",".join(_text(row.get(column)) for column in names) for row in rows)]
-    write_atomically(_file(name), ("\n".join(lines) + "\n").encode())
+    write_atomically(_file(folder, name), ("\n".join(lines) + "\n").encode())
 
 
 def draw(rows: np.ndarray, count: int, spec: Spec, batch_size: int, generator: np.random.Generator) -> np.ndarray:
@@ -284,10 +307,17 @@ def draw(rows: np.ndarray, count: int, spec: Spec, batch_size: int, generator: n
 
 
 def show() -> None:
-    """Write the figure, and print a table of the arms' means over the second half of their runs."""
+    """Write the figure, and print tables of the arms' means over the second half of their runs."""
+    tables = {name: np.genfromtxt(_file(HERE, name), delimiter=",", names=True) for name in (*ARMS, *WEIGHTS)}
+    _draw({name: tables[name] for name in ARMS})
+    _print_means("second half of the run", {name: tables[name] for name in ARMS})
+    print()
+    _print_means("by weight", {name: tables[name] for name in (*BESIDE_WEIGHTS, *WEIGHTS)})
+
+
+def _draw(tables: dict[str, np.ndarray]) -> None:
     from matplotlib.figure import Figure
 
-    tables = {name: np.genfromtxt(_file(name), delimiter=",", names=True) for name in ARMS if _file(name).exists()}
     colours = {"algorithm1": "#0072B2", "previous": "#D55E00", "periodic": "#009E73", "average": "#CC79A7"}
     figure = Figure(figsize=(16, 7.5), layout="constrained")
     for axes, (column, title, is_log) in zip(figure.subplots(2, 4).flat, FIGURES, strict=True):
@@ -304,16 +334,18 @@ def show() -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=len(ARMS) // 2, frameon=False)
     figure.savefig(HERE.with_suffix(".png"), dpi=110)
 
+
+def _print_means(heading: str, tables: dict[str, np.ndarray]) -> None:
     columns = [column for column in next(iter(tables.values())).dtype.names or () if column != "step"]
-    print("| " + " | ".join(["second half of the run", *tables]) + " |")
+    print("| " + " | ".join([heading, *tables]) + " |")
     print("| --- |" + " ---: |" * len(tables))
     for column in columns:
         means = [np.nanmean(rows[column][len(rows) // 2 :]) for rows in tables.values()]
         print("| " + " | ".join([column, *(f"{mean:.3g}" for mean in means)]) + " |")
 
 
-def _file(name: str) -> Path:
-    return HERE / f"{name.replace(', ', '-')}.csv"
+def _file(folder: Path, name: str) -> Path:
+    return folder / f"{name.replace(', ', '-').replace(' ', '-')}.csv"
 
 
 def _text(value: float | None) -> str:
@@ -327,18 +359,25 @@ def _copy(tree: Any) -> Any:
 def main() -> None:
     """Run arms, or draw what there is."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=("run", "draw"))
-    parser.add_argument("arm", nargs="?", choices=tuple(ARMS))
-    parser.add_argument("--task", default="Walker2d-v4")
-    parser.add_argument("--steps", type=int, default=30_000)
-    parser.add_argument("--warmup-steps", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=0)
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("draw", help="write mechanism.png, and print the tables of docs/relative-entropy.md")
+    running = commands.add_parser("run", help="train and look")
+    running.add_argument("arm", nargs="?", choices=(*ARMS, *WEIGHTS))
+    running.add_argument("--into", required=True, type=Path, metavar="FOLDER", help="of runs of one task and length")
+    running.add_argument("--task", default="Hopper-v4")
+    running.add_argument("--steps", type=int, default=5_000)
+    running.add_argument("--warmup-steps", type=int, default=1_000)
+    running.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.command == "draw":
         show()
-    else:
-        for name in [arguments.arm] if arguments.arm else [name for name in ARMS if not _file(name).exists()]:
-            run(name, arguments.task, arguments.steps, arguments.warmup_steps, arguments.seed)
+        return
+    names = [arguments.arm] if arguments.arm else [*ARMS, *WEIGHTS]
+    missing = [name for name in names if not _file(arguments.into, name).exists()]
+    if not missing:
+        sys.exit(f"every arm that is asked for has a file in {arguments.into}: nothing to run")
+    for name in missing:
+        run(name, arguments.task, arguments.steps, arguments.warmup_steps, arguments.seed, arguments.into)
 
 
 if __name__ == "__main__":
