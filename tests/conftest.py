@@ -37,11 +37,14 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
 
 
-LONGEST = ("training", "tasks")
+LONGEST = ("training", "tasks", "test_results.py", "test_cli.py")  # folders and files
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the rooms that take longest first: else one process is left with them alone at the end."""
-    items.sort(
-        key=lambda item: LONGEST.index(item.path.parent.name) if item.path.parent.name in LONGEST else len(LONGEST)
-    )
+    """Put what takes longest first: else one process is left with it alone at the end."""
+
+    def place(item: pytest.Item) -> int:
+        names = item.path.parent.name, item.path.name
+        return next((place for place, name in enumerate(LONGEST) if name in names), len(LONGEST))
+
+    items.sort(key=place)
