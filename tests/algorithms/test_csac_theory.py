@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -298,6 +299,21 @@ def improve(algorithm, log_reference, q):
     return jax.nn.log_softmax(log_policy - size * slope, axis=1)
 
 
+@lru_cache
+def iteration(algorithm):
+    """One iteration of an algorithm, compiled once for all tests: each uses the tables."""
+
+    @jax.jit
+    def step(q, log_before):
+        if algorithm.relative_entropy_form == "implicit":
+            log_before = None
+        log_policy = improve(algorithm, log_before, q)
+        value = -expected_loss(algorithm, log_policy, log_before, q)
+        return log_policy, value, expected_target(algorithm, log_policy, log_before, q)
+
+    return step
+
+
 def iterate(sigma, tau, iterations, estimator: Any = "sampled", first_q=FIRST_Q, **options):
     """CSAC's own equations, exactly: yields (Q_k, log π_k, V_k).
 
@@ -311,15 +327,7 @@ def iterate(sigma, tau, iterations, estimator: Any = "sampled", first_q=FIRST_Q,
         discount=DISCOUNT,
         **options,
     )
-
-    @jax.jit
-    def step(q, log_before):
-        if algorithm.relative_entropy_form == "implicit":
-            log_before = None
-        log_policy = improve(algorithm, log_before, q)
-        value = -expected_loss(algorithm, log_policy, log_before, q)
-        return log_policy, value, expected_target(algorithm, log_policy, log_before, q)
-
+    step = iteration(algorithm)
     iterates = []  # and not one by one: between two of a generator's, float64 would stay on for everybody
     with jax.enable_x64(True):
         q, log_policy = jnp.array(first_q), jnp.array(FIRST_POLICY)

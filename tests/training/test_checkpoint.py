@@ -509,6 +509,7 @@ TRAIN = [
     *("train", "Hopper-v4", "--actor-hidden-sizes", "8", "8", "--critic-hidden-sizes", "8", "8"),
     *("--batch-size", "8", "--warmup-steps", "40", "--replay-size", "150", "--steps", "400"),
     *("--evaluation-interval", "100", "--evaluation-episodes", "1", "--checkpoint-interval", "100"),
+    *("--evaluation-processes", "0"),
 ]
 SHORT: dict[str, Any] = {"steps": 400, "evaluation_interval": 100, "evaluation_episodes": 1, "checkpoint_interval": 100}
 LONGER: dict[str, Any] = {**SHORT, "steps": 500}
@@ -637,9 +638,19 @@ def test_a_manifest_is_never_seen_empty(tmp_path, monkeypatch):
         RunDirectory.create(tmp_path / "run", Manifest(task="t", algorithm="a", seeds=(0,), steps=1))
 
 
-def test_a_fork_killed_before_it_had_its_checkpoint_copies_once_more(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def short_run(tmp_path_factory):
+    return train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path_factory.mktemp("short") / "run", **SHORT).path
+
+
+@pytest.fixture
+def first(short_run, tmp_path):
+    """A finished run to fork from or to extend."""
+    return RunDirectory.open(shutil.copytree(short_run, tmp_path / "first"))
+
+
+def test_a_fork_killed_before_it_had_its_checkpoint_copies_once_more(tmp_path, first, monkeypatch):
     """By then its source has made other checkpoints."""
-    first = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "first", **SHORT)
 
     def killed(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -663,17 +674,15 @@ def test_a_fork_killed_before_it_had_its_checkpoint_copies_once_more(tmp_path, m
     assert tables(again.path) == tables(first.path)
 
 
-def test_a_fork_that_wants_no_checkpoints_begins_with_one_all_the_same(tmp_path):
-    first = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "first", **SHORT)
+def test_a_fork_that_wants_no_checkpoints_begins_with_one_all_the_same(tmp_path, first):
     plain: dict[str, Any] = {**LONGER, "checkpoint_interval": 0}
     fork = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "fork", start_from=first.path, **plain)
     resume(first.path, steps=500)
     assert tables(fork.path) == tables(first.path)
 
 
-def test_a_stranger_s_checkpoint_is_refused_in_one_line(tmp_path):
+def test_a_stranger_s_checkpoint_is_refused_in_one_line(tmp_path, first):
     """Its checksums are right, and what it holds is not what csac saves."""
-    first = train(CSAC(**SMALL), "Hopper-v4", directory=tmp_path / "first", **SHORT)
     place = first.path / "checkpoint"
     for step in steps_in(place):
         files = SeedFiles(place, 0, {}).write(step, Snapshot({"learner.x": np.zeros(2)}, {"learner": []}), ring(4, 0))
