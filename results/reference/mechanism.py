@@ -57,6 +57,7 @@ WEIGHTS: dict[str, dict[str, Any]] = {
     "average 0.005, tau 50": _arm("average", tau=50.0),
     "periodic 1000, tau 50": _arm("periodic", tau=50.0),
 }
+TOLD_BY_WEIGHT = ("relative_entropy", "kl_gradient", "update", "churn", "churn_since_last_look", "std", "monte_carlo")
 BESIDE_WEIGHTS = ("algorithm1, closed_form", "previous, closed_form", "average, closed_form", "periodic, closed_form")
 INTERVAL = 137  # steps between two looks: seven of them are not quite a period of 1,000, which is seen at all ages
 LOOKS_PER_ROLLOUT = 4
@@ -312,7 +313,7 @@ def show() -> None:
     _draw({name: tables[name] for name in ARMS})
     _print_means("second half of the run", {name: tables[name] for name in ARMS})
     print()
-    _print_means("by weight", {name: tables[name] for name in (*BESIDE_WEIGHTS, *WEIGHTS)})
+    _print_by_weight({name: tables[name] for name in (*BESIDE_WEIGHTS, *WEIGHTS)})
 
 
 def _draw(tables: dict[str, np.ndarray]) -> None:
@@ -342,6 +343,23 @@ def _print_means(heading: str, tables: dict[str, np.ndarray]) -> None:
     for column in columns:
         means = [np.nanmean(rows[column][len(rows) // 2 :]) for rows in tables.values()]
         print("| " + " | ".join([column, *(f"{mean:.3g}" for mean in means)]) + " |")
+
+
+def _print_by_weight(tables: dict[str, np.ndarray]) -> None:
+    print("| arm | τ | τL | " + " | ".join(TOLD_BY_WEIGHT) + " |")
+    print("| --- |" + " ---: |" * (2 + len(TOLD_BY_WEIGHT)))
+    arms = {**ARMS, **WEIGHTS}
+    for name in sorted(tables, key=lambda name: _weight_and_lag(arms[name])[1]):
+        means = [np.nanmean(tables[name][column][len(tables[name]) // 2 :]) for column in TOLD_BY_WEIGHT]
+        weight, product = _weight_and_lag(arms[name])
+        print("| " + " | ".join([name, f"{weight:g}", f"{product:,.4g}", *(f"{mean:.3g}" for mean in means)]) + " |")
+
+
+def _weight_and_lag(arm: dict[str, Any]) -> tuple[float, float]:
+    """Return τ and its product with the lag of the reference, in updates; a period counts whole."""
+    lags = {"algorithm1": 0.0, "previous": 1.0, "average": 1.0 / arm["reference_rate"], "periodic": 1000.0}
+    tau = arm["relative_entropy_weight"]
+    return tau, tau * lags[arm["reference_policy"]]
 
 
 def _file(folder: Path, name: str) -> Path:
