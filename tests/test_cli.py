@@ -1,4 +1,5 @@
 import dataclasses
+import inspect
 import io
 import os
 import re
@@ -14,6 +15,8 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
+import csac.evaluation.export as exporting
+import csac.evaluation.play as playing
 import csac.training.train as training
 from csac.algorithms import ALGORITHMS, CSAC, SAC
 from csac.arguments import peek
@@ -21,6 +24,8 @@ from csac.cli import main
 from csac.commands import Chosen
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
+from csac.evaluation.export import ExportOptions
+from csac.record.csv_tables import read_rows
 from csac.record.manifest import EvaluationPlan, Manifest
 from csac.record.run import RunDirectory
 from csac.training.checkpoint import Checkpoint
@@ -30,6 +35,7 @@ from csac.types import Layer, PolicyNetwork, PolicyParameters
 
 NOTHING = Manifest(task="t", algorithm="csac", seeds=(0,), steps=1)
 SUPPORT = Path(__file__).parent / "support"
+COMMANDS = ("train", "resume", "evaluate", "play", "export", "latency", "runs", "report", "study", "tune")
 TINY = "--batch-size 8 --actor-hidden-sizes 8 --critic-hidden-sizes 8"
 
 
@@ -87,6 +93,19 @@ def train_call(monkeypatch):
         return calls[-1]
 
     return call
+
+
+def calls_of(monkeypatch, module, name, result=()):
+    """What a command calls a function with, by the names of its arguments, instead of running it."""
+    calls, signature = [], inspect.signature(getattr(module, name))
+
+    def called(*given, **named):
+        arguments = signature.bind(*given, **named).arguments
+        calls.append({name: value for name, value in arguments.items() if name not in ("reporter", "on_progress")})
+        return result
+
+    monkeypatch.setattr(module, name, called)
+    return calls
 
 
 def make_run(path, task, observation_size, low, high, seeds=(0, 1)):
@@ -349,6 +368,97 @@ def test_train_passes_its_options_on(train_call):
     assert call["start_from"] is None
 
 
+def test_resume_passes_its_options_on(monkeypatch):
+    calls = calls_of(monkeypatch, training, "resume", RunDirectory(Path("run"), replace(NOTHING, state="finished")))
+    line = "resume some/run --steps 2e3 --trust-task"
+    assert csac(line) == csac("resume some/run") == 0
+    told = {"directory": Path("some/run"), "evaluation_processes": None}
+    assert calls == [
+        {**told, "steps": 2_000, "trust_task": True, "command": f"csac {line}"},
+        {**told, "steps": None, "trust_task": False, "command": "csac resume some/run"},
+    ]
+
+
+def test_evaluate_passes_its_options_on(monkeypatch):
+    make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+    calls = calls_of(monkeypatch, playing, "evaluate_run")
+    line = "evaluate run --seed 1 --checkpoint best --episodes 4 --processes 3 --stochastic"
+    assert csac(f"{line} --perturb friction=2 --perturb action_noise=0.1 --trust-task") == 0
+    assert csac("evaluate run") == 0
+    assert calls == [
+        {
+            "directory": Path("run"),
+            "seed": 1,
+            "episodes": 4,
+            "deterministic": False,
+            "perturbations": ("friction=2", "action_noise=0.1"),
+            "processes": 3,
+            "trust_task": True,
+            "which": "best",
+        },
+        {
+            "directory": Path("run"),
+            "seed": None,
+            "episodes": 10,
+            "deterministic": True,
+            "perturbations": (),
+            "processes": None,
+            "trust_task": False,
+            "which": "last",
+        },
+    ]
+
+
+def test_play_passes_its_options_on(monkeypatch):
+    make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+    calls = calls_of(monkeypatch, playing, "play")
+    line = "play run --seed 1 --checkpoint best --episodes 4 --video film.mp4 --perturb friction=2 --trust-task"
+    assert csac(line) == csac("play run") == 0
+    assert calls == [
+        {
+            "directory": Path("run"),
+            "seed": 1,
+            "episodes": 4,
+            "video": Path("film.mp4"),
+            "perturbations": ("friction=2",),
+            "trust_task": True,
+            "which": "best",
+        },
+        {
+            "directory": Path("run"),
+            "seed": None,
+            "episodes": 1,
+            "video": None,
+            "perturbations": (),
+            "trust_task": False,
+            "which": "last",
+        },
+    ]
+
+
+def test_export_passes_its_options_on(monkeypatch):
+    make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
+    calls = calls_of(monkeypatch, exporting, "export_run")
+    line = "export run --seed 1 --checkpoint best --format 'onnx, c' --out there --weights int8 --stochastic "
+    line += "--noise-seed 5 --fallback middle --observation-range recorded --range-margin 0.25 --watchdog 3 "
+    line += "--rate-limit 0.1 --episodes 4 --card --trust-task"
+    assert csac(line) == csac("export run") == csac("export run --stochastic --no-rollouts") == 0
+    told = {"directory": Path("run"), "seed": None, "which": "last", "place": None, "trust_task": False}
+    assert calls == [
+        {
+            "directory": Path("run"),
+            "formats": ("onnx", "c"),
+            "seed": 1,
+            "which": "best",
+            "place": Path("there"),
+            "options": ExportOptions(5, "int8", "middle", "recorded", 0.25, 3, 0.1, 4, card=True),
+            "trust_task": True,
+        },
+        {**told, "formats": ("numpy",), "options": ExportOptions()},
+        {**told, "formats": ("numpy",), "options": ExportOptions(noise_seed=0, episodes=0)},
+    ]
+
+
 def test_train_without_options_uses_the_defaults(train_call):
     call = train_call("Hopper-v4")
 
@@ -452,8 +562,8 @@ def test_help_lists_the_commands(capsys):
     assert csac("--help") == 0
 
     output = capsys.readouterr().out
-    for command in ("train", "resume", "evaluate", "play", "runs"):
-        assert output.count(f"csac {command} ") >= 2
+    for command in COMMANDS:
+        assert output.count(f"  csac {command} ") == 2
 
 
 @pytest.mark.parametrize("words", ["train", "study show", "resume"])
@@ -644,6 +754,17 @@ def test_evaluate_takes_one_seed(trained, capsys):
     assert csac(f"evaluate {trained[1]} --seed 1 --episodes 1 --stochastic") == 0
 
     assert words(capsys.readouterr().out)[1:] == ["1 10.00 10.00 10.00 10.0"]
+
+
+def test_evaluate_samples_where_it_is_asked_to():
+    make_run("run", "probes:ActionReward-v0", 1, [-1.0], [1.0])
+
+    def returns(options, name):
+        assert csac(f"evaluate run --seed 0 --episodes 4 --trust-task --csv {name}.csv {options}") == 0
+        return read_rows(f"{name}.csv")["return"].tolist()
+
+    assert returns("", "steady") == [-0.25] * 4  # the action 0, where 0.5 were best
+    assert len(set(returns("--stochastic", "sampled"))) == 4
 
 
 def test_evaluate_names_the_seeds_there(trained, capsys):
@@ -895,7 +1016,6 @@ def test_a_gpu_that_is_not_there_is_one_line(tmp_path):
         env={**os.environ, "CUDA_VISIBLE_DEVICES": ""},
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
     assert result.returncode == 2

@@ -63,6 +63,36 @@ def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
     assert not (tmp_path / "run").exists()  # once mended, the script begins there
 
 
+WITH_A_CHILD = """
+import os, signal
+from csac.processes import Child, die_with_parent
+
+def work(connection):
+    die_with_parent()
+    print(os.getpid(), flush=True)
+    signal.pause()
+
+if __name__ == "__main__":
+    Child(work, daemon=True).process.join()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux ends a process with its parent")
+def test_a_process_dies_with_its_parent(tmp_path):
+    """Alive, it would write into a run that another process has taken over."""
+    script = tmp_path / "script.py"
+    script.write_text(WITH_A_CHILD)
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        parent.kill()
+        try:
+            parent.communicate(timeout=30)  # until nobody holds the other end of the pipe any more
+        except subprocess.TimeoutExpired:
+            os.kill(child, signal.SIGKILL)
+            pytest.fail("the child outlived its parent")
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux moves threads")
 def test_a_thread_that_ends_meanwhile_keeps_no_other_where_it_was(monkeypatch):
     moved = []

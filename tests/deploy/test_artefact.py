@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +143,35 @@ def test_the_state_of_the_noise_is_that_of_pcg32s_own_seeding():
     assert noise_state(42) == state
 
 
+def normals(seed: int) -> Iterator[float]:
+    """PCG32's numbers after `seed`, made standard normal two by two (Box and Muller 1958)."""
+    state = noise_state(seed)
+
+    def whole() -> int:  # below 2^24
+        nonlocal state
+        mixed, turn = ((state >> 18 ^ state) >> 27) % 2**32, state >> 59
+        state = (state * 6364136223846793005 + 109) % 2**64
+        return (mixed >> turn | mixed << -turn % 32) % 2**32 >> 8
+
+    while True:
+        radius, angle = (whole() + 1) / 2**24, 2 * math.pi * whole() / 2**24
+        yield math.sqrt(-2 * math.log(radius)) * math.cos(angle)
+
+
+@needs_compiler
+@pytest.mark.parametrize("algorithm", ["csac", "ppo"])
+def test_a_controller_in_c_samples_by_itself_and_goes_on_after_a_reset(tmp_path, algorithm):
+    artefact, drawn = leave(tmp_path, algorithm_policy(algorithm), "c", noise_seed=3), normals(3)
+    observation, actions = np.full(5, 0.1, np.float32), []
+    for step in range(10):
+        if step == 5:
+            artefact.reset()
+        actions.append(artefact.act(observation))
+        noise = np.array(list(islice(drawn, 3)), np.float32)
+        np.testing.assert_allclose(actions[-1], artefact.act(observation, noise), atol=2e-5)
+    assert len({tuple(action) for action in actions}) == 10
+
+
 # Guards: known answers of the definition, then every format against it.
 
 TWO = contract(((None, (2,)),), (2,), low=-1.0, high=3.0)  # a range of 4, its middle 1
@@ -239,6 +271,23 @@ def test_every_format_guards_as_defined(tmp_path, format, given):
         expected.append(guarded(chosen, state, policy.contract, observation, action))
         np.testing.assert_allclose(artefact.act(observation), expected[-1], atol=2e-5)
     assert np.isfinite(expected).all() or chosen.fallback is None
+
+
+@pytest.mark.parametrize(
+    "given", [{"fallback": "0.25,-0.5,2"}, {"fallback": "last"}, {"fallback": "zero", "watchdog": 2}]
+)
+def test_every_format_takes_no_action_that_is_no_number(tmp_path, format, given):
+    """The observation is good, but the first layer overflows, and the second one sums infinities of both signs."""
+    policy = algorithm_policy("csac")
+    policy.network.parameters.actors[0][0].weight[0] *= 1e6
+    chosen, state = make_guards(policy.contract, **given), GuardState()
+    artefact = leave(tmp_path, policy, format, guards=chosen)
+    good, far = np.zeros(5, np.float32), np.array([3e38, 0, 0, 0, 0], np.float32)
+    assert np.isnan(policy.act(far[None])).all()
+    for observation in (far, good, far, far, good):
+        action = policy.contract.to_environment(policy.act(observation[None])[0])
+        expected = guarded(chosen, state, policy.contract, observation, action)
+        np.testing.assert_allclose(artefact.act(observation), expected, atol=2e-5)
 
 
 @pytest.mark.parametrize(
@@ -672,11 +721,15 @@ def test_the_header_is_cpp_as_well(tmp_path, algorithm):
     noise_seed = None if algorithm == "sd3" else 1
     leave(tmp_path, policy, "c", guards=make_guards(policy.contract, **GUARDED), noise_seed=noise_seed)
     source = tmp_path / "main.cpp"
-    source.write_text('#include "policy.h"\nint main() { csac_state s = CSAC_INITIAL; float o[5] = {}, a[3]; '
-                      'csac_step(&s, o, a); csac_reset(&s); csac_policy(o, a); return a[0] > 2.0f; }\n')  # fmt: skip
+    source.write_text('#include <cstdio>\n#include "policy.h"\n'
+                      'int main() { csac_state s = CSAC_INITIAL; float o[5] = {0.1f, 0.2f, 0.3f, 0.4f, 0.5f}, a[3]; '
+                      'csac_step(&s, o, a); csac_reset(&s); csac_policy(o, a); '
+                      'for (int i = 0; i < 3; i++) std::printf("%.9g\\n", double(a[i])); return 0; }\n')  # fmt: skip
     flags = ("-std=c++11", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
     compile_c(*flags, source, "-o", tmp_path / "main", program="c++")
-    assert subprocess.run([tmp_path / "main"]).returncode == 0
+    lines = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True).stdout.split()
+    expected = policy.predict(np.array([0.1, 0.2, 0.3, 0.4, 0.5]))[0]
+    np.testing.assert_allclose(np.array(lines, float), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("compiler", ["cc", "arm-none-eabi-gcc"])

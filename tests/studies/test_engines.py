@@ -8,7 +8,7 @@ from studying import cell, jobs
 
 from csac.record.run import RunDirectory
 from csac.studies import engines
-from csac.studies.cells import Store, is_final
+from csac.studies.cells import Cell, Store, is_final
 from csac.studies.engines import run_here, run_in_processes, split_cores
 from csac.studies.job import Advanced, Ended, Started, Stopped
 from csac.tasks.seeds import training_seed
@@ -28,7 +28,10 @@ def uninterrupted(tmp_path_factory):
 
 
 def test_cells_are_run_to_their_end_and_told(tmp_path):
-    messages, two = [], jobs(tmp_path, cell(0), cell(1), keep_checkpoints=False)
+    changed = cell(
+        1, perturbations=("friction=2@150",), events=("fell",), environment_arguments={"healthy_reward": 0.5}
+    )
+    messages, two = [], jobs(tmp_path, cell(0), changed, keep_checkpoints=False)
     run_here(two, messages.append)
     first, second = (job.cell.key for job in two)
     told = [(type(message), message.key) for message in messages]
@@ -37,7 +40,7 @@ def test_cells_are_run_to_their_end_and_told(tmp_path):
     store = Store(tmp_path)
     assert [store.status(job.cell).state for job in two] == ["complete", "complete"]
     assert not (two[0].path / "checkpoint").exists()
-    assert RunDirectory.open(two[1].path).manifest.seeds == (1,)
+    assert [Cell.of_run(RunDirectory.open(job.path).manifest) for job in two] == [job.cell for job in two]
 
 
 def test_a_cell_that_crashed_goes_on_and_leaves_the_same_files(tmp_path, uninterrupted):

@@ -399,6 +399,36 @@ def test_a_search_begins_with_the_preset_that_learns_its_entropy_weight(monkeypa
     assert second.actor_learning_rate != first.actor_learning_rate
 
 
+def test_a_trial_is_trained_as_the_command_says(monkeypatch):
+    fake = FakeTrain(constant)
+    monkeypatch.setattr(training, "train", fake)
+    line = f"tune probes:Endless-v0 {TINY} --search discount --trials 1 --steps 90 --seeds 3 --first-seed 7 --groups 2 "
+    line += "--device gpu --evaluation-interval 30 --evaluation-episodes 4 --checkpoint-interval 40 "
+    line += "--keep-checkpoints 1 --directory out --env-kwargs '{\"length\": 5}'"
+    assert csac(line) == 0
+    assert fake.calls == [
+        {
+            "algorithm": SAC(batch_size=8, actor_hidden_sizes=(8,), critic_hidden_sizes=(8,), warmup_steps=20),
+            "task": "probes:Endless-v0",
+            "environment_arguments": {"length": 5},
+            "directory": Path("out/trials/0000"),
+            "resume": True,
+            "tensorboard": False,
+            "steps": 90,
+            "seeds": 3,
+            "first_seed": 7,
+            "groups": 2,
+            "device": "gpu",
+            "evaluation_interval": 30,
+            "evaluation_episodes": 4,
+            "evaluation_seed": TUNING_EVALUATION_SEED,
+            "checkpoint_interval": 40,
+            "keep_checkpoints": 1,
+            "command": f"csac {line}",
+        }
+    ]
+
+
 # What it leaves.
 
 

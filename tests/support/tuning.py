@@ -47,7 +47,7 @@ class FakeTrain:
         self.calls: list[dict[str, Any]] = []
 
     def __call__(self, algorithm: Any, task: str, *, directory: Path, stop_when: Any, **options: Any) -> RunDirectory:
-        self.calls.append({"algorithm": algorithm, "directory": directory, **options})
+        self.calls.append({"algorithm": algorithm, "task": task, "directory": directory, **options})
         seeds = range(options["first_seed"], options["first_seed"] + options["seeds"])
         run, interval = self._run(directory, algorithm, seeds, options), options["evaluation_interval"]
         if self.failing(algorithm):

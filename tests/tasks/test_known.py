@@ -471,6 +471,8 @@ def test_events_stay_in_a_longer_run_and_in_a_fork(cases, tmp_path):
     assert len(forked.evaluations) == 6
     grown = resume(tmp_path / "fork", steps=80)
     assert len(grown.evaluations) == 8
+    curves = scalars(grown.path / "tensorboard" / "seed_0")
+    assert [[step for step, _ in curves[f"eval/{name}"]] for name in ("mean_reward", "stops")] == [[60, 80]] * 2
     assert grown.manifest.events == ("crashed", "stops", "nothing")
     for change, events in (({"start_from": source, "directory": tmp_path / "x"}, ["stops"]), ({"resume": True}, [])):
         arguments = {"directory": tmp_path / "fork", "steps": 80, **SHORT, **change}
@@ -655,10 +657,12 @@ def test_a_process_that_dies_is_one_line(tmp_path, capsys):
     assert output.err == ("csac: the evaluation was broken off: its process was killed by SIGKILL (out of memory?)\n")
 
 
-def test_processes_are_chosen_by_the_work_and_at_least_one_is_asked_for():
+def test_processes_are_chosen_by_the_work_and_at_least_one_is_asked_for(monkeypatch):
+    monkeypatch.setattr("csac.evaluation.pool.usable_cores", lambda: [0, 1, 2])
     assert choose_processes(Evaluator("probes:Cases-v0", episodes=EPISODES_AT_ONCE), 1) == 1
-    most = choose_processes(Evaluator("probes:Cases-v0", episodes=1000), 5)
-    assert most == len(os.sched_getaffinity(0))
+    for quota, most in ((None, 3), (2, 2)):
+        monkeypatch.setattr("csac.evaluation.pool.core_quota", lambda quota=quota: quota)
+        assert choose_processes(Evaluator("probes:Cases-v0", episodes=1000), 5) == most
     with pytest.raises(InputError, match="0 processes: use at least one"):
         EvaluationPool(Evaluator("probes:Cases-v0"), processes=0)
     with pytest.raises(InputError, match="cannot be sent to another process"):

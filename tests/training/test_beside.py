@@ -160,6 +160,7 @@ def processes_of(directory: Path) -> set[float]:
 )
 def test_processes_are_used_where_they_pay(tmp_path, monkeypatch, cores, task, settings, here):
     monkeypatch.setattr("csac.training.scheduler.usable_cores", lambda: list(range(cores)))
+    monkeypatch.setattr("csac.training.scheduler.core_quota", lambda: None)
     told = run(
         tmp_path / "run", None, task, environment_arguments={"tell": True}, events=["process", "has_jax"], **settings
     )
@@ -183,6 +184,7 @@ def test_processes_are_used_where_they_pay(tmp_path, monkeypatch, cores, task, s
 )
 def test_processes_are_as_many_as_cores_are_to_spare(monkeypatch, cores, groups, episodes, processes):
     monkeypatch.setattr("csac.training.scheduler.usable_cores", lambda: list(range(cores)))
+    monkeypatch.setattr("csac.training.scheduler.core_quota", lambda: None)
     assert choose_evaluation_processes(groups, episodes) == processes
 
 

@@ -80,7 +80,7 @@ def save(place: Path, step: int, seeds=(0,), keep: int = 0, capacity: int = 50) 
         learnt = Snapshot({"weight": np.full((2, 2), step, np.float32)}, {"step": step})
         files |= SeedFiles(place, seed, known).write(step, learnt, ring(capacity, step))
     checkpoints = Checkpoints(place, keep)
-    checkpoints.commit(step, files, {})
+    checkpoints.commit(step, files, {"step": step, "told": "all that the run notes down"})
     return checkpoints
 
 
@@ -162,11 +162,11 @@ def test_any_flipped_bit_is_found_and_its_file_named(data):
     with folder() as place:
         save(place, 10)
         save(place, 20)
-        victim = data.draw(st.sampled_from(step_files(place)))
+        victim, before = data.draw(st.sampled_from(step_files(place))), Checkpoint.open(place, 20)
         content = bytearray(victim.read_bytes())
         content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
         victim.write_bytes(content)
-        check_found(place, victim)
+        check_found(place, victim, before)
 
 
 @few
@@ -175,12 +175,12 @@ def test_any_cut_is_found_and_its_file_named(data):
     with folder() as place:
         save(place, 10)
         save(place, 20)
-        victim = data.draw(st.sampled_from(step_files(place)))
+        victim, before = data.draw(st.sampled_from(step_files(place))), Checkpoint.open(place, 20)
         os.truncate(victim, data.draw(st.integers(0, victim.stat().st_size - 1)))
-        check_found(place, victim)
+        check_found(place, victim, before)
 
 
-def check_found(place: Path, victim: Path) -> None:
+def check_found(place: Path, victim: Path, before: Checkpoint) -> None:
     """The damaged checkpoint is refused and the one before it used, or what both share is mended."""
     checkpoint, complaints = newest_sound(place)
     assert checkpoint
@@ -188,11 +188,23 @@ def check_found(place: Path, victim: Path) -> None:
         assert victim.name in complaints[0]
         return
     if victim.suffix == ".json":  # which may say the same in other bytes: a space of another kind
+        assert (checkpoint.files, checkpoint.values) == (before.files, before.values)
         return
     assert checkpoint.mended == ({f"replay/{victim.name}"} if victim.suffix == ".safetensors" else set())
     rows = np.zeros((50, WIDTH), np.float32)
     checkpoint.memory(0, rows)
     np.testing.assert_array_equal(rows, ring(50, 20).rows)
+
+
+def test_a_list_with_a_flipped_bit_is_refused_or_says_the_same(tmp_path):
+    save(tmp_path, 20)
+    path, before = tmp_path / "step_20.json", Checkpoint.open(tmp_path, 20)
+    content = path.read_bytes()
+    for bit in range(8 * len(content)):
+        path.write_bytes((int.from_bytes(content) ^ 1 << bit).to_bytes(len(content)))
+        with suppress(Damaged):
+            again = Checkpoint.open(tmp_path, 20)
+            assert (again.files, again.values) == (before.files, before.values)
 
 
 def test_transitions_without_a_parity_are_refused_where_they_are_damaged(tmp_path):

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
+import os
 from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import plans
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
@@ -16,7 +21,17 @@ from resuming import SMALL, run
 from csac.algorithms import CSAC, SAC
 from csac.training import scheduler as scheduler_module
 from csac.training.checkpoint import Checkpoints, Damaged
-from csac.training.messages import Boundary, Ended, GroupCrashed, GroupRestarted, Noted, Refused, Saved
+from csac.training.messages import (
+    Boundary,
+    Ended,
+    GroupCrashed,
+    GroupMessage,
+    GroupRestarted,
+    Noted,
+    NotSaved,
+    Refused,
+    Saved,
+)
 from csac.training.scheduler import _Scheduler
 
 
@@ -103,25 +118,91 @@ def test_what_is_left_of_several_groups_keeps_its_number_of_cores(tmp_path, monk
     assert (told[-1], workers.cores) == (Ended(250, {}), [[0]])
 
 
+class MadeUpGroup:
+    """A group of one seed that has made so many steps by each of its boundaries, and then ends."""
+
+    def __init__(
+        self, *steps: int, pause: Callable[[], None] = lambda: None, saving: Callable[[], None] = lambda: None
+    ) -> None:
+        self.steps, self.pause, self.saving, self.step = steps, pause, saving, 0
+        self.environments = SimpleNamespace(alive=np.array([True]))
+
+    def __call__(self, *_: Any) -> MadeUpGroup:
+        """Be the group that is asked for."""
+        return self
+
+    def run(self, _: Any) -> Iterator[GroupMessage]:
+        *boundaries, last = self.steps
+        for self.step in boundaries:
+            self.pause()
+            yield Boundary(self.step)
+        self.step = last
+        yield Ended(last, {})
+
+    def settle(self) -> Iterator[GroupMessage]:
+        return iter(())
+
+    def save(self) -> Saved:
+        self.saving()
+        return Saved(self.step, {}, {})
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_run_in_one_process_is_saved_every_ten_minutes_and_at_its_end(tmp_path, monkeypatch):
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+
+    def pause() -> None:
+        clock.now += 400.0  # so that one is due at every other boundary
+
+    monkeypatch.setattr(scheduler_module, "time", clock)
+    monkeypatch.setattr(scheduler_module, "Group", MadeUpGroup(250, 500, 750, 1_000, 1_100, pause=pause))
+    settings = plans.settings(SAC(), "Hopper-v4", 100_000, tmp_path, checkpoint_interval=50_000)
+    told = [message for _, message in scheduler_module.run_groups(settings, [[0]], lambda: False)]
+    assert [message.step for message in told if isinstance(message, Saved)] == [500, 1_000, 1_100]
+
+
 # Workers that cannot go on.
+
+
+def worked(monkeypatch: pytest.MonkeyPatch, folder: Path, group: Any, *orders: Any) -> list[Any]:
+    """Return what a worker with this group says to its first turn and these orders."""
+    monkeypatch.setattr(scheduler_module, "Group", group)
+    for of_a_process_of_its_own in ("die_with_parent", "move_to"):
+        monkeypatch.setattr(scheduler_module, of_a_process_of_its_own, lambda *_: None)
+    settings = plans.settings(CSAC(), "Hopper-v4", 900, folder, checkpoint_interval=100)
+    ours, theirs = multiprocessing.Pipe()
+    with ours, theirs:
+        for order in ([0], *orders):  # the cores of its first turn
+            ours.send(order)
+        scheduler_module._work(theirs, settings, [0])
+        said = []
+        while ours.poll():
+            said.append(ours.recv())
+        return said
 
 
 def test_a_worker_that_meets_a_user_s_mistake_says_so(tmp_path, monkeypatch):
     def refuse(*_: Any) -> None:
         raise Damaged("the checkpoint does not fit")
 
-    monkeypatch.setattr(scheduler_module, "Group", refuse)
-    for of_a_process_of_its_own in ("die_with_parent", "move_to"):
-        monkeypatch.setattr(scheduler_module, of_a_process_of_its_own, lambda *_: None)
-    settings = plans.settings(CSAC(), "Hopper-v4", 900, tmp_path, checkpoint_interval=100)
-    ours, theirs = multiprocessing.Pipe()
-    with ours, theirs:
-        ours.send([0])  # the cores of its first turn
-        scheduler_module._work(theirs, settings, [0])
-        message = ours.recv()
+    (message,) = worked(monkeypatch, tmp_path, refuse)
     assert isinstance(message, Refused)
     assert isinstance(message.error, Damaged)
     assert str(message.error) == "the checkpoint does not fit"
+
+
+def test_a_worker_whose_disk_is_full_says_so_and_obeys(tmp_path, monkeypatch):
+    """As a failure of its own it would have been its seeds', which are well."""
+
+    def fill() -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    made, saved, ended = worked(monkeypatch, tmp_path, MadeUpGroup(100, 100, saving=fill), "save", "stop")
+    assert isinstance(saved, NotSaved)
+    assert saved.error.errno == errno.ENOSPC
+    assert (made, ended) == (Boundary(100), Ended(100, {}))
 
 
 class DeadWorker:
