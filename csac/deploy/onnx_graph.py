@@ -136,7 +136,10 @@ def _actor(
 
 
 def _most_valued(graph: _Graph, critics: Any, inputs: str, actions: list[str]) -> str:
-    """Add the critics; return the name of the action that its own critic values most, the first of equals."""
+    """Add the critics; return the name of the action that its own critic values most, the first of equals.
+
+    As for NumPy, a NaN is above all: what goes wrong is for the guards to see.
+    """
     best, best_value = actions[0], ""
     for layers, action in zip(critics, actions, strict=True):
         both = graph.add("Concat", [inputs, action], axis=1)
@@ -144,7 +147,10 @@ def _most_valued(graph: _Graph, critics: Any, inputs: str, actions: list[str]) -
         if not best_value:
             best_value = value
             continue
-        is_more = graph.add("Greater", [value, best_value])
+        is_first_nan = graph.add(
+            "And", [graph.add("IsNaN", [value]), graph.add("Not", [graph.add("IsNaN", [best_value])])]
+        )
+        is_more = graph.add("Or", [graph.add("Greater", [value, best_value]), is_first_nan])
         best = graph.add("Where", [is_more, action, best])
         best_value = graph.add("Where", [is_more, value, best_value])
     return best

@@ -290,6 +290,19 @@ def test_every_format_takes_no_action_that_is_no_number(tmp_path, format, given)
         np.testing.assert_allclose(artefact.act(observation), expected, atol=2e-5)
 
 
+@pytest.mark.parametrize("broken", [0, 1])
+def test_every_format_falls_back_where_one_of_two_actors_gives_no_number(tmp_path, format, broken):
+    policy = algorithm_policy("sd3")
+    policy.network.parameters.actors[broken][0].weight[0] *= 1e6
+    guards, state = make_guards(policy.contract, fallback="0.25,-0.5,2"), GuardState()
+    artefact = leave(tmp_path, policy, format, guards=guards)
+    far = np.array([3e38, 0, 0, 0, 0], np.float32)
+    action = policy.contract.to_environment(policy.act(far[None])[0])
+    expected = guarded(guards, state, policy.contract, far, action)
+    np.testing.assert_array_equal(expected, guards.fallback_action)
+    np.testing.assert_allclose(artefact.act(far), expected)
+
+
 @pytest.mark.parametrize(
     "given", [{"fallback": "0.25,-0.5,2"}, {"fallback": "last"}, {"fallback": "0.25,-0.5,2", "rate_limit": 1.0}]
 )
