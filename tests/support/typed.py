@@ -1,0 +1,100 @@
+"""Commands as they are typed, what they meet, and what they call."""
+
+from __future__ import annotations
+
+import inspect
+import shlex
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+
+from csac.cli import main
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
+from csac.record.manifest import Manifest
+from csac.record.run import RunDirectory
+from csac.types import Layer, PolicyNetwork, PolicyParameters
+
+NOTHING = Manifest(task="t", algorithm="csac", seeds=(0,), steps=1)
+SUPPORT = Path(__file__).parent
+COMMANDS = ("train", "resume", "evaluate", "play", "export", "latency", "runs", "report", "study", "tune")
+TINY = "--batch-size 8 --actor-hidden-sizes 8 --critic-hidden-sizes 8"
+
+
+def csac(line):
+    """Type `csac line` and return the exit code."""
+    return main(shlex.split(line))
+
+
+class Pictures(gymnasium.Env):
+    """Five steps of the same reward, and a picture of each."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    observation_space = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+    action_space = gymnasium.spaces.Box(-2, 2, (1,), np.float32)
+
+    def __init__(self, render_mode=None, reward=1.0):
+        self.render_mode, self.reward, self.steps = render_mode, reward, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(3, np.float32), self.reward, self.steps == 5, False, {}
+
+    def render(self):
+        return np.full((34, 48, 3), 40 * self.steps, np.uint8)
+
+
+if "Pictures-v0" not in gymnasium.registry:
+    gymnasium.register("Pictures-v0", entry_point=f"{__name__}:Pictures")
+
+
+def calls_of(monkeypatch, module, name, result=()):
+    """What a command calls a function with, by the names of its arguments, instead of running it."""
+    calls, signature = [], inspect.signature(getattr(module, name))
+
+    def called(*given, **named):
+        arguments = signature.bind(*given, **named).arguments
+        calls.append({name: value for name, value in arguments.items() if name not in ("reporter", "on_progress")})
+        return result
+
+    monkeypatch.setattr(module, name, called)
+    return calls
+
+
+def make_run(path, task, observation_size, low, high, seeds=(0, 1)):
+    """A finished run with a random linear policy for each seed."""
+    path = Path(path)
+    run = RunDirectory.create(
+        path, Manifest(task=task, algorithm="csac", seeds=tuple(seeds), steps=100, steps_done=100)
+    )
+    contract = Contract(
+        task=task,
+        algorithm="csac",
+        activation="relu",
+        head="tanh_gaussian",
+        observation_parts=((None, (observation_size,)),),
+        action_shape=(len(low),),
+        action_low=np.array(low, np.float32),
+        action_high=np.array(high, np.float32),
+    )
+    (path / "policy").mkdir()
+    contract.save(path / "policy" / "contract.json")
+    generator = np.random.default_rng(0)
+    for seed in seeds:
+        weight = generator.normal(size=(observation_size, 2 * len(low))).astype(np.float32)
+        network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * len(low), np.float32)),),)))
+        Policy(network, contract).save_layers(path / "policy" / f"seed_{seed}.safetensors")
+        rows = {"seed": seed, "step": 100, "episode": 0, "return": float(seed), "length": 5, "success": None}
+        run.append("evaluations", [rows])
+    run.update_manifest(state="finished")
+    return run
+
+
+def words(text):
+    return [" ".join(line.split()) for line in text.splitlines() if line.strip(" ─")]
