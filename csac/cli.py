@@ -356,10 +356,11 @@ def _runs(arguments: list[str]) -> int:
 def _report(arguments: list[str]) -> int:
     options = parse(Report, arguments, "csac report")
     from csac.studies import run_report as reports  # matplotlib is slow to import
+    from csac.studies.comparison import Comparison, read_runs
 
     place = options.place()
-    runs = reports.read_runs(options.runs, options.labels(), lambda error: print(f"damaged: {error}", file=sys.stderr))
-    comparison = reports.Comparison(runs, options.perturb, options.until)
+    runs = read_runs(options.runs, options.labels(), lambda error: print(f"damaged: {error}", file=sys.stderr))
+    comparison = Comparison(runs, options.perturb, options.until)
     reports.refuse_places(comparison, options.curve, options.out)
     if place:
         page, name = place

@@ -11,7 +11,7 @@ from made import make_run_of
 from csac.cli import main
 from csac.record import manifest as manifests
 from csac.record.manifest import EvaluationPlan
-from csac.studies.run_report import _times
+from csac.studies.comparison import _times
 
 ROWS = "seed,step,episode,return,length,success"
 
