@@ -80,6 +80,18 @@ def test_only_seeds_that_every_method_has_count_and_a_failed_one_has_nothing():
     assert compared[4].value == pytest.approx((1.0 + 0.5 + 0.0 + 0.0) / 4)  # falls 0 and ∞ against 3 and 0
 
 
+def test_a_failed_seed_makes_no_arm_steadier():
+    sac, csac = STUDY.methods
+    curves = {0: [1, 5, 2, 2, 2], 1: [1, 2, 3, 4, 4], 2: [3, 1, 1, 1, 1]}
+    arms = [arm(sac, curves), arm(csac, {seed: curves[seed] for seed in (0, 1)}, failed=(2,))]
+    table = EVIDENCE.task_table("Hopper-v4", EVIDENCE.measured(STUDY, arms)["Hopper-v4"])
+    place = table.headings.index("drawdown, mean")
+    whole, broken = (cells_of_row(table, label)[place : place + 2] for label in ("SAC, 0.2", "CSAC"))
+    # Falls of 3, 0 and 2; the quartiles of three seeds are 1, 2, 1, 1.5 and 1.5 apart at the five evaluations.
+    assert [cell.value for cell in whole] == pytest.approx([5 / 3, 7 / 5])
+    assert [cell.text for cell in broken] == ["", ""]
+
+
 def test_recovery_is_the_area_lost_as_a_share_of_the_return_before():
     # After step 20 the return 4 falls to 2 and comes back: losses 0, 2, 0, 0 at 20, 30, 40, 50 make 20 in area, over 4.
     condition = ("friction=2@20",)

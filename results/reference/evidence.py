@@ -341,7 +341,7 @@ def options(form: Method) -> list[Method]:
     is_explicit = told.get("relative_entropy_form", "explicit") == "explicit"
     base = form if told["reference_policy"] == "periodic" and is_explicit else PERIODIC
     two = _changed(base, "two references", {"critic_reference": "earlier"})
-    # Its target is meant for a copy of 1,000 updates before: within a shorter lag no policy moves as far.
+    # Its target is meant for a copy of 1,000 updates before: within the lag of `previous` no policy moves as far.
     learnt = form if (told["reference_policy"], told.get("reference_period")) == ("periodic", 1000) else PERIODIC
     weights = [_changed(form, f"tau {tau:g}", {"relative_entropy_weight": tau}) for tau in WEIGHTS]
     new = {words: changes for words, changes in OPTIONS.items() if {**told, **changes} != told}
