@@ -131,8 +131,8 @@ class Counting(Endless):
         super().__init__(length=4)
 
     def step(self, action: np.ndarray) -> Result:
-        _, *rest = super().step(action)
-        return np.array([self.steps], np.float32), *rest
+        _, reward, terminated, truncated, info = super().step(action)
+        return np.array([self.steps], np.float32), reward, terminated, truncated, info
 
 
 @pytest.mark.parametrize(("sigma", "tau"), [(0.0, 0.5), (0.2, 0.0)])

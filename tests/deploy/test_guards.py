@@ -124,7 +124,7 @@ def test_every_format_takes_no_action_that_is_no_number(tmp_path, format, given)
 
 
 @pytest.mark.parametrize("broken", [0, 1])
-def test_every_format_falls_back_where_one_of_two_actors_gives_no_number(tmp_path, format, broken):
+def test_every_format_falls_back_where_one_of_two_actors_gives_no_number(tmp_path, format, broken: int):
     policy = algorithm_policy("sd3")
     policy.network.parameters.actors[broken][0].weight[0] *= 1e6
     guards, state = make_guards(policy.contract, fallback="0.25,-0.5,2"), GuardState()
