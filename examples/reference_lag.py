@@ -70,17 +70,20 @@ def contraction(sigma: float, tau: float, discount: float) -> float:
     return float((distance[-1] / distance[middle]) ** (1.0 / (iterations - 1 - middle)))
 
 
+def longest_lag(choice: Choice) -> float:
+    """Return how many updates ago the policy was where its reference is; of a period, at its end."""
+    return {"algorithm1": 0.0, "previous": 1.0, "average": 1.0 / choice.rate, "periodic": choice.period}[choice.policy]
+
+
 def predicted_slow_down(choice: Choice, resistance: float) -> float:
     """Return how many times longer the same way takes; resistance = learning rate x τ / std².
 
     With the effective lag L of the reference, in updates, it is 1 + L x resistance: L is 0, 1, 1 / rate or, for periods
     of N, (N - 1) / 2 where the resistance of a period is small, and N where it is large.
     """
-    if choice.policy == "algorithm1":
-        return 1.0
     if choice.policy == "periodic":
         return choice.period * resistance / (1.0 - (1.0 - resistance) ** choice.period)
-    return 1.0 + resistance / (1.0 if choice.policy == "previous" else choice.rate)
+    return 1.0 + longest_lag(choice) * resistance
 
 
 def predicted_slow_down_with_adam(choice: Choice, tau: float, std: float, learning_rate: float, noise: float) -> float:
@@ -92,8 +95,7 @@ def predicted_slow_down_with_adam(choice: Choice, tau: float, std: float, learni
     """
     if noise:
         return predicted_slow_down(choice, learning_rate / noise * tau / std**2)
-    lag = {"algorithm1": 0.0, "previous": 1.0, "average": 1.0 / choice.rate, "periodic": choice.period}[choice.policy]
-    return max(1.0, learning_rate * lag * tau / std**2 / PULL)
+    return max(1.0, learning_rate * longest_lag(choice) * tau / std**2 / PULL)
 
 
 def measured_slow_down(

@@ -57,6 +57,7 @@ WEIGHTS: dict[str, dict[str, Any]] = {
     "average 0.005, tau 50": _arm("average", tau=50.0),
     "periodic 1000, tau 50": _arm("periodic", tau=50.0),
 }
+EVERY_ARM = {**ARMS, **WEIGHTS}
 TOLD_BY_WEIGHT = ("relative_entropy", "kl_gradient", "update", "churn", "churn_since_last_look", "std", "monte_carlo")
 BESIDE_WEIGHTS = ("algorithm1, closed_form", "previous, closed_form", "average, closed_form", "periodic, closed_form")
 INTERVAL = 137  # steps between two looks: seven of them are not quite a period of 1,000, which is seen at all ages
@@ -260,7 +261,7 @@ def critic_error(rollout: Rollout, discount: float) -> dict[str, float]:
 
 def run(name: str, task: str, steps: int, warmup_steps: int, seed: int, folder: Path) -> None:
     """Train one arm, look at it as it goes, and write its file into a folder."""
-    algorithm = CSAC(warmup_steps=warmup_steps, **ARMS.get(name) or WEIGHTS[name])
+    algorithm = CSAC(warmup_steps=warmup_steps, **EVERY_ARM[name])
     environments, aside = (SeedEnvironments(task, None, [label]) for label in (seed, 10_000 + seed))
     learner = Learner(algorithm, environments.spec, [seed], steps)
     observations = environments.reset()
@@ -309,7 +310,7 @@ def draw(rows: np.ndarray, count: int, spec: Spec, batch_size: int, generator: n
 
 def show() -> None:
     """Write the figure, and print tables of the arms' means over the second half of their runs."""
-    tables = {name: np.genfromtxt(_file(HERE, name), delimiter=",", names=True) for name in (*ARMS, *WEIGHTS)}
+    tables = {name: np.genfromtxt(_file(HERE, name), delimiter=",", names=True) for name in EVERY_ARM}
     _draw({name: tables[name] for name in ARMS})
     _print_means("second half of the run", {name: tables[name] for name in ARMS})
     print()
@@ -348,10 +349,9 @@ def _print_means(heading: str, tables: dict[str, np.ndarray]) -> None:
 def _print_by_weight(tables: dict[str, np.ndarray]) -> None:
     print("| arm | τ | τL | " + " | ".join(TOLD_BY_WEIGHT) + " |")
     print("| --- |" + " ---: |" * (2 + len(TOLD_BY_WEIGHT)))
-    arms = {**ARMS, **WEIGHTS}
-    for name in sorted(tables, key=lambda name: _weight_and_lag(arms[name])[1]):
+    for name in sorted(tables, key=lambda name: _weight_and_lag(EVERY_ARM[name])[1]):
         means = [np.nanmean(tables[name][column][len(tables[name]) // 2 :]) for column in TOLD_BY_WEIGHT]
-        weight, product = _weight_and_lag(arms[name])
+        weight, product = _weight_and_lag(EVERY_ARM[name])
         print("| " + " | ".join([name, f"{weight:g}", f"{product:,.4g}", *(f"{mean:.3g}" for mean in means)]) + " |")
 
 
@@ -380,7 +380,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("draw", help="write mechanism.png, and print the tables of docs/relative-entropy.md")
     running = commands.add_parser("run", help="train and look")
-    running.add_argument("arm", nargs="?", choices=(*ARMS, *WEIGHTS))
+    running.add_argument("arm", nargs="?", choices=tuple(EVERY_ARM))
     running.add_argument("--into", required=True, type=Path, metavar="FOLDER", help="of runs of one task and length")
     running.add_argument("--task", default="Hopper-v4")
     running.add_argument("--steps", type=int, default=5_000)
@@ -390,7 +390,7 @@ def main() -> None:
     if arguments.command == "draw":
         show()
         return
-    names = [arguments.arm] if arguments.arm else [*ARMS, *WEIGHTS]
+    names = [arguments.arm] if arguments.arm else list(EVERY_ARM)
     missing = [name for name in names if not _file(arguments.into, name).exists()]
     if not missing:
         sys.exit(f"every arm that is asked for has a file in {arguments.into}: nothing to run")
