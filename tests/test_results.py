@@ -150,6 +150,7 @@ def _value(text: str) -> Any:
         ("reference", "fresh", "CSAC, paper | **SAC, 0.2**", ["README.md"]),
         ("reference", "fresh", "CSAC, paper | SAC, automatic", ["README.md"]),
         ("reference", "fresh", "CSAC, previous | **SAC, 0.2**", ["README.md", "docs/design.md"]),
+        ("reference", "fresh", "CSAC, average 0.05 | **SAC, 0.2**", ["README.md", "docs/design.md"]),
     ],
 )
 def test_what_documents_tell_of_a_comparison_stands_in_its_table(name, mark, pair, documents):
