@@ -113,7 +113,7 @@ class SAC:
     def temperature_loss(
         self, log_temperature: Scalar, entropy: Scalar, *, target_entropy: float
     ) -> tuple[Scalar, Metrics]:
-        """Return log α (entropy - target): SAC's Eq. 18 with log α for α, the form that everyone runs."""
+        """Return log α (entropy - target): SAC's Eq. 18 with log α for α, as in the authors' code."""
         return log_temperature * (entropy - target_entropy), {}
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:

@@ -13,7 +13,16 @@ import pytest
 from equations import ONE, batch_of, linear, transition
 
 from csac.algorithms import CSAC, SAC, TD3
-from csac.algorithms.critics import Critics, make_critics, normalised_critic_loss, q_values, update_critics
+from csac.algorithms.critics import (
+    Critics,
+    least_q_value,
+    make_critics,
+    normalised_critic_loss,
+    q_value,
+    q_values,
+    update_critics,
+)
+from csac.algorithms.distributions import policy_at
 from csac.algorithms.networks import BATCH, init_optimiser, make_optimiser
 from csac.algorithms.normalisation import EPSILON, Moments, fold, fold_layer, moments_of, normalised_pass
 from csac.types import Layer, Spec, Transition
@@ -158,18 +167,50 @@ def update(algorithm, state, batch: Transition, key: int = 0):
     return algorithm.update(state, batch, jax.random.key(key), 0)
 
 
+@pytest.mark.parametrize("algorithm", NORMALISED, ids=NAMES)
+def test_an_actor_climbs_the_new_critics_by_the_moments_of_the_step(algorithm):
+    state, batch, key = algorithm.init(jax.random.key(0), SPEC, 100), transitions(1), jax.random.key(7)
+    after, metrics = update(algorithm, state, batch, 7)
+    if isinstance(algorithm, TD3):
+        noise = jax.random.normal(key, batch.action.shape)
+        next_actions = jax.vmap(partial(algorithm.smoothed_action, state.target_actor))(batch.next_observation, noise)
+    else:
+        noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
+        next_actions = jax.vmap(lambda seen, noise: policy_at(state.actor, seen).sample(noise))(
+            batch.next_observation, noise
+        )
+    inputs = pairs_of(batch, next_actions)
+    critics = []
+    for old, new in zip(state.critics, after.critics, strict=True):
+        passed = jax.vmap(partial(normalised_pass, old), axis_name=BATCH)([inputs[:16], inputs[16:]])
+        critics.append(fold(new, jax.tree.map(lambda leaf: leaf[0], passed.moments)))
+
+    def loss(observation, noise):
+        if isinstance(algorithm, TD3):
+            return -q_value(critics[0], observation, jnp.tanh(state.actor(observation)))
+        policy = policy_at(state.actor, observation)  # CSAC's reference as well, so far
+        weight = 1.0 if isinstance(algorithm, SAC) else algorithm.entropy_weight
+        return weight * policy.log_prob(noise) - least_q_value(
+            (critics[0], critics[1]), observation, policy.sample(noise)
+        )
+
+    expected = jax.vmap(loss)(batch.observation, noise if isinstance(algorithm, TD3) else actor_noise).mean()
+    np.testing.assert_allclose(metrics["actor_loss"], expected, rtol=1e-4, atol=1e-5)
+
+
 def test_a_linear_critic_by_hand():
-    # The actor's action is 0, without noise. Pairs (s, a): (1, 0.5), (3, -0.5) and next (1, 0), (3, 0).
-    # Of a last layer's inputs only the scale is normalised: their mean squares are 5 and 0.125. With Q = 2 ŝ + â - 1
-    # for both critics, ŝ = s / √5 and â = a / √0.125: Q = 1.308641 and 0.269067; Q' = -0.105573 at (1, 0). Targets
-    # with γ = 0.5: 1.947214 and 2 (terminal). Losses 2 (0.638572² + 1.730933²) / 2 = 3.403903, mean of Q 0.788854.
+    # The target actor's action is 0, without noise, and the actor's is another. Pairs (s, a): (1, 0.5), (3, -0.5) and
+    # next (1, 0), (3, 0). Of a last layer's inputs only the scale is normalised: their mean squares are 5 and 0.125.
+    # With Q = 2 ŝ + â - 1 for both critics, ŝ = s / √5 and â = a / √0.125: Q = 1.308641 and 0.269067; Q' = -0.105573
+    # at (1, 0). Targets with γ = 0.5: 1.947214 and 2 (terminal). Losses 2 (0.638572² + 1.730933²) / 2 = 3.403903, mean
+    # of Q 0.788854.
     critic = linear([[2.0], [1.0]], [-1.0])
     algorithm = TD3(
         critic_normalisation="batch", target_noise=0.0, discount=0.5, actor_hidden_sizes=(), critic_hidden_sizes=()
     )
     still = linear([[0.0]], [0.0])
     state = algorithm.init(jax.random.key(0), ONE, 100)
-    state = state._replace(critics=(critic, critic), actor=still, target_actor=still)
+    state = state._replace(critics=(critic, critic), actor=linear([[0.0]], [1.0]), target_actor=still)
     batch = batch_of(
         transition(observation=1.0, action=0.5, next_observation=1.0),
         transition(observation=3.0, action=-0.5, next_observation=3.0, terminated=1.0),

@@ -40,6 +40,7 @@ from csac.types import InputError
         # 2 + 0.9 (1.9242343 + 0.2·0.5 - 0.5·0.4431472) and 2 + 0.9 (1.9242343 + 0.2·0.5 - 0.5·0.5)
         ({"target_log_prob_bound": 0.5}, 3.6223946),
         ({"target_log_prob_bound": 0.5, "relative_entropy_estimator": "sampled"}, 3.5968109),
+        ({"target_log_prob_bound": 0.3}, 3.6508109),  # 2 + 0.9 (1.9242343 + 0.2·0.3 - 0.5·0.3)
         ({"target_log_prob_bound": 5.0}, 3.6770624),  # as without
         # 2 + 0.9 (1.9242343 + 0.2·0.8037095)
         ({"relative_entropy_form": "actor_only"}, 3.8764787),
@@ -135,6 +136,17 @@ def test_between_renewals_the_critics_of_two_references_do_not_hear_of_the_actor
     for step in (5, 7):
         np.testing.assert_array_equal(learnt(POLICY, step), learnt(gaussian(0.5, 0.1), step))
     assert not np.allclose(learnt(POLICY, 8), learnt(gaussian(0.5, 0.1), 8))
+
+
+def test_updates_keep_the_copy_before_the_last_one():
+    algorithm = CSAC(reference_policy="periodic", **(EARLIER_CRITIC | {"reference_period": 2}), **LINEAR)
+    state = algorithm.init(jax.random.key(0), ONE, 1000)
+    batch, actors = batch_of(transition(), transition(observation=-1.0, action=-0.5)), []
+    for step in range(5):
+        actors.append(state.actor)
+        state, _ = update(algorithm, state, batch, step)
+    jax.tree.map(np.testing.assert_array_equal, (state.reference, state.earlier_reference), (actors[4], actors[2]))
+    assert not np.allclose(actors[4].layers[0].bias, actors[2].layers[0].bias)
 
 
 def test_the_next_action_of_two_references_is_that_of_the_stored_policy():

@@ -174,6 +174,21 @@ def test_the_temperature_has_an_adam_of_its_own():
     assert float(state.log_temperature) == pytest.approx(0.1, abs=1e-5)
 
 
+def test_weights_that_csac_learns_have_an_adam_of_their_own():
+    algorithm = CSAC(
+        entropy_weight="auto",
+        target_entropy=100.0,
+        weight_learning_rate=0.1,
+        adam_momentum=0.5,
+        max_gradient_norm=1e-12,
+        **LINEAR,
+    )
+    state, _ = update(algorithm, algorithm.init(jax.random.key(0), ONE, 1000), batch_of(transition()))
+    (moments, _) = state.learnt_weights.entropy.optimiser
+    assert -11.0 < float(moments.mu) < -9.0  # a tenth of the slack of about -100
+    assert float(state.learnt_weights.entropy.log_weight) == pytest.approx(0.1, abs=1e-5)
+
+
 def test_a_temperature_that_was_fixed_at_zero_can_rise():
     fixed = SAC(temperature="fixed", entropy_weight=0.0, **LINEAR).init(jax.random.key(0), ONE, 1000)
     algorithm = SAC(target_entropy=100.0, temperature_learning_rate=0.1, **LINEAR)
