@@ -171,14 +171,15 @@ def update(algorithm, state, batch: Transition, key: int = 0):
 def test_an_actor_climbs_the_new_critics_by_the_moments_of_the_step(algorithm):
     state, batch, key = algorithm.init(jax.random.key(0), SPEC, 100), transitions(1), jax.random.key(7)
     after, metrics = update(algorithm, state, batch, 7)
-    if isinstance(algorithm, TD3):
-        noise = jax.random.normal(key, batch.action.shape)
-        next_actions = jax.vmap(partial(algorithm.smoothed_action, state.target_actor))(batch.next_observation, noise)
-    else:
-        noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
-        next_actions = jax.vmap(lambda seen, noise: policy_at(state.actor, seen).sample(noise))(
-            batch.next_observation, noise
-        )
+    noises = jax.random.normal(key, batch.action.shape if isinstance(algorithm, TD3) else (2, *batch.action.shape))
+    noise, actor_noise = (noises, noises) if isinstance(algorithm, TD3) else noises
+
+    def next_action(observation, noise):
+        if isinstance(algorithm, TD3):
+            return algorithm.smoothed_action(state.target_actor, observation, noise)
+        return policy_at(state.actor, observation).sample(noise)
+
+    next_actions = jax.vmap(next_action)(batch.next_observation, noise)
     inputs = pairs_of(batch, next_actions)
     critics = []
     for old, new in zip(state.critics, after.critics, strict=True):
@@ -194,7 +195,7 @@ def test_an_actor_climbs_the_new_critics_by_the_moments_of_the_step(algorithm):
             (critics[0], critics[1]), observation, policy.sample(noise)
         )
 
-    expected = jax.vmap(loss)(batch.observation, noise if isinstance(algorithm, TD3) else actor_noise).mean()
+    expected = jax.vmap(loss)(batch.observation, actor_noise).mean()
     np.testing.assert_allclose(metrics["actor_loss"], expected, rtol=1e-4, atol=1e-5)
 
 
