@@ -47,8 +47,9 @@ ARMS: dict[str, dict[str, Any]] = {
     for policy in ("algorithm1", "previous", "periodic", "average")
     for estimator in ("closed_form", "sampled")
 }
-# The same product of weight and lag, 100, which `average, closed_form` has as well; and a weight that is large.
+# CSAC's default; the same product of weight and lag, 100, that `average, closed_form` has; and a weight that is large.
 WEIGHTS: dict[str, dict[str, Any]] = {
+    "average 0.05, tau 0.5": _arm("average", rate=0.05),
     "previous, tau 100": _arm("previous", tau=100.0),
     "average 0.05, tau 5": _arm("average", tau=5.0, rate=0.05),
     "periodic 1000, tau 0.1": _arm("periodic", tau=0.1),
