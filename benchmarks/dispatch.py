@@ -8,6 +8,7 @@
 `evaluation`    whole intervals of 5,000 steps: no evaluation, in line, and beside
 `copies`        updates alone, with and without XLA's region analysis of what it need not copy
 `first`         several updates in one dispatch: what the first costs more than those that follow it
+`references`    updates alone, and training: CSAC with the preset `paper`, and as it is by default
 `critics`       updates alone, with plain critics, normalised ones, all five pieces, and (CSAC) the preset `strong`
 
 A ratio is that of two measurements of one round. Processes of one kind differ, so each repetition starts new ones.
@@ -36,6 +37,7 @@ WARMUP = 500
 NORMALISED = (("critic_normalisation", "batch"),)
 RATES = (("critic_learning_rate", 1e-3), ("actor_learning_rate", 1e-3))
 PIECES = (*NORMALISED, *RATES, ("policy_delay", 3), ("adam_momentum", 0.5), ("normalise_observations", True))
+AVERAGE = (("reference_policy", "average"), ("relative_entropy_estimator", "closed_form"), ("reference_rate", 0.05))
 STRONG = tuple((hyperparameters("strong", "csac", TASK) | {"warmup_steps": 0}).items())
 REGIONS = "--xla_cpu_copy_insertion_use_region_analysis=true"
 Rates = dict[str, list[float]]
@@ -81,6 +83,13 @@ def suites() -> dict[str, dict[str, list[Variant]]]:
         "first": {
             title: [Variant(f"{n} in one", *setting, interval=n) for n in (1, 2, 4, 8)]
             for title, setting in alone.items()
+        },
+        "references": {
+            title: [Variant("preset paper", *setting), Variant("default", *setting, changes=AVERAGE)]
+            for title, setting in {
+                **{f"updates, {len(cores)} cores": ("csac", cores) for cores in (both, (0,))},
+                "training, 2 cores": ("csac", both, True, 400, 1, 1, "off"),
+            }.items()
         },
         "critics": {
             title: [
