@@ -44,6 +44,9 @@ _PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "relative_entropy_weight": 0.5,
             "reference_policy": "algorithm1",
             "relative_entropy_estimator": "sampled",
+            # Not used with `algorithm1`; named because runs are known by every hyperparameter.
+            "reference_period": 1000,
+            "reference_rate": 0.005,
         },
         # PARL's SAC, on which the paper built: a fixed temperature.
         "sac": {**_PAPER_COMMON, "temperature": "fixed", "entropy_weight": 0.2},
@@ -123,6 +126,7 @@ _STRONG: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "relative_entropy_form": "actor_only",
             "reference_policy": "periodic",
             "reference_period": 1000,
+            "reference_rate": 0.005,  # not used with `periodic`; named as in the preset `paper`
             "relative_entropy_estimator": "closed_form",
             "critic_reference": "same",
             "target_log_prob_bound": 0.0,

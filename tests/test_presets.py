@@ -9,6 +9,7 @@ from csac.studies.cells import complete
 from csac.studies.study import read_study
 from csac.types import InputError
 
+RESULTS = Path(__file__).parents[1] / "results"
 PAPER_TABLE = {
     "actor_learning_rate": 3e-4,
     "critic_learning_rate": 3e-4,
@@ -111,7 +112,7 @@ def test_paper_ppo_has_the_papers_table_and_parls_example_which_are_the_defaults
 @pytest.mark.parametrize("task", ["Walker2d-v4", "Ant-v4", "PyFlyt/QuadX-Waypoints-v1"])
 @pytest.mark.parametrize("algorithm", ["csac", "sac"])
 def test_strong_is_the_candidate_of_its_protocol_on_every_task(algorithm, task):
-    study = read_study(Path(__file__).parents[1] / "results" / "strong" / "confirm.toml")
+    study = read_study(RESULTS / "strong" / "confirm.toml")
     candidate = next(method for method in study.methods if method.label == f"{algorithm.upper()}, candidate")
 
     given = presets.hyperparameters("strong", algorithm, task)
@@ -119,9 +120,7 @@ def test_strong_is_the_candidate_of_its_protocol_on_every_task(algorithm, task):
     assert complete(algorithm, given) == candidate.hyperparameters_on(task)
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "unused"), [("csac", {"reference_rate", "target_relative_entropy"}), ("sac", set())]
-)
+@pytest.mark.parametrize(("algorithm", "unused"), [("csac", {"target_relative_entropy"}), ("sac", set())])
 def test_strong_names_all_that_a_later_default_could_change(algorithm, unused):
     given = presets.hyperparameters("strong", algorithm, "Ant-v4")
 
@@ -142,6 +141,12 @@ def test_an_unknown_preset_is_named_with_those_there():
 def test_an_algorithm_without_the_preset_is_named():
     with pytest.raises(InputError, match=r"'paper' has no 'dqn': it has csac and sac"):
         presets.hyperparameters("paper", "dqn", "Ant-v4")
+
+
+def test_csac_is_by_default_the_form_that_the_protocol_chose():
+    methods = {method.label: method for method in read_study(RESULTS / "reference" / "confirm.toml").methods}
+
+    assert complete("csac", {}) == methods["CSAC, average 0.05"].hyperparameters_on("Hopper-v4")
 
 
 def test_strong_is_of_csac_and_sac_alone():

@@ -60,7 +60,10 @@ INCOMPATIBLE = (
     ),
     ({"relative_entropy_weight": ["auto"], "relative_entropy_form": ["implicit"]}, "there is no reference"),
     ({"critic_reference": ["earlier"], "relative_entropy_form": ["actor_only", "implicit"]}, "the target has none"),
-    ({"critic_reference": ["earlier"], "reference_policy": ["previous", "average"]}, "no copy replaces another"),
+    (
+        {"critic_reference": ["earlier"], "reference_policy": ["previous", "average"]},
+        "no copy replaces another; with reference_policy periodic one does",
+    ),
 )
 
 
@@ -72,16 +75,16 @@ class CSAC:
     """Weight of the entropy (the paper's sigma); `auto` learns it, to keep the entropy at its target as SAC does."""
     relative_entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.5
     """Weight of the relative entropy towards the reference (the paper's tau); 0 is SAC, `auto` learns it."""
-    reference_policy: ReferencePolicy = "algorithm1"
+    reference_policy: ReferencePolicy = "average"
     """The actor before this update's gradients, the actor one update ago, a periodic copy, or a running average."""
     reference_period: Annotated[int, COUNT] = 1000
     """Updates between copies of the actor, with `periodic`."""
-    reference_rate: Annotated[float, RATE] = 0.005
+    reference_rate: Annotated[float, RATE] = 0.05
     """Step size of the running average towards the actor, with `average`."""
     critic_reference: Literal["same", "earlier"] = "same"
     """Policies in the critic's target: the actor and its reference, or (CVI) the reference pi_k and its predecessor."""
-    relative_entropy_estimator: Literal["closed_form", "sampled"] = "sampled"
-    """The paper's log-ratio at the sampled action, or the exact KL of the two policies (0 with `algorithm1`)."""
+    relative_entropy_estimator: Literal["closed_form", "sampled"] = "closed_form"
+    """The exact KL of the two policies (0 with `algorithm1`), or the paper's log-ratio at the sampled action."""
     relative_entropy_form: Literal["explicit", "actor_only", "implicit"] = "explicit"
     """In target and actor's loss, in the actor's loss alone, or as tau log pi in the reward (Munchausen)."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0

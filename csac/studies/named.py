@@ -15,11 +15,13 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-CSAC_PAPER = Method("CSAC (paper)", "csac", "paper", published="CSAC")
-PERIODIC = MappingProxyType(
-    {"reference_policy": "periodic", "reference_period": 1000, "relative_entropy_estimator": "closed_form"}
+# A cell is known by every hyperparameter: these name what they do not use as well, as it was when their cells ran.
+EXACT = MappingProxyType(
+    {"relative_entropy_estimator": "closed_form", "reference_period": 1000, "reference_rate": 0.005}
 )
-CSAC_PERIODIC = Method("CSAC (periodic)", "csac", hyperparameters=PERIODIC)
+
+CSAC_PAPER = Method("CSAC (paper)", "csac", "paper", published="CSAC")
+CSAC_PERIODIC = Method("CSAC (periodic)", "csac", hyperparameters={**EXACT, "reference_policy": "periodic"})
 SAC = Method("SAC", "sac", "paper", published="SAC")
 PPO = Method("PPO", "ppo", "paper", published="PPO")
 TD3 = Method("TD3", "td3", "paper", published="TD3")
@@ -94,11 +96,7 @@ REFERENCE = replace(
             Method(
                 f"CSAC, {label}",
                 "csac",
-                hyperparameters={
-                    "relative_entropy_weight": 0.5,
-                    "relative_entropy_estimator": "closed_form",
-                    **hyperparameters,
-                },
+                hyperparameters={"relative_entropy_weight": 0.5, **EXACT, **hyperparameters},
             )
             for label, hyperparameters in (
                 ("previous", {"reference_policy": "previous"}),

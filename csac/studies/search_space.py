@@ -132,7 +132,7 @@ SPACES: Mapping[str, Mapping[str, Dimension]] = MappingProxyType(
                 100, 10_000, "logarithmic", "a factor of ten around the default", ("reference_policy", "periodic")
             ),
             "reference_rate": Range(
-                0.0005, 0.05, "logarithmic", "a factor of ten around the default", ("reference_policy", "average")
+                0.005, 0.5, "logarithmic", "a factor of ten around the default", ("reference_policy", "average")
             ),
             **_NORMALISABLE,
         },

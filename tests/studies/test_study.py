@@ -144,7 +144,7 @@ def test_a_sweep_is_a_method_for_each_combination(tmp_path):
 def test_what_methods_have_in_common_gives_way_to_presets_and_to_their_own(tmp_path):
     text = """
         tasks = ["Hopper-v4"]
-        common.csac = { relative_entropy_weight = 7, entropy_weight = 3, reference_rate = 1, critic_learning_rate = 1 }
+        common.csac = { relative_entropy_weight = 7, entropy_weight = 3, policy_delay = 5, critic_learning_rate = 1 }
         [[methods]]
         algorithm = "csac"
         preset = "paper"
@@ -154,7 +154,7 @@ def test_what_methods_have_in_common_gives_way_to_presets_and_to_their_own(tmp_p
     """
     csac, sac = read_study(write(tmp_path / "mine.toml", text)).methods
     told = csac.hyperparameters_on("Hopper-v4")
-    assert (told["entropy_weight"], told["relative_entropy_weight"], told["reference_rate"]) == (2.0, 0.5, 1.0)
+    assert (told["entropy_weight"], told["relative_entropy_weight"], told["policy_delay"]) == (2.0, 0.5, 5)
     assert sac.hyperparameters_on("Hopper-v4")["critic_learning_rate"] == 3e-4
 
 

@@ -366,8 +366,8 @@ def test_what_means_nothing_or_is_given_is_not_searched():
 
     assert "reference_period" in names(CSAC(reference_policy="periodic"))
     assert "reference_period" not in names(CSAC())
-    assert "reference_rate" not in names(CSAC())
-    assert "reference_rate" in names(CSAC(reference_policy="average"))
+    assert "reference_rate" in names(CSAC())
+    assert "reference_rate" not in names(CSAC(reference_policy="previous"))
     assert "entropy_weight" not in names(SAC())
     assert "entropy_weight" in names(SAC(temperature="fixed"))
     assert "discount" not in names(CSAC(), given=("discount", "steps"))
@@ -435,7 +435,7 @@ def test_a_trial_is_trained_as_the_command_says(monkeypatch):
 @pytest.mark.parametrize(
     "algorithm",
     [
-        CSAC(reference_policy="average", actor_hidden_sizes=(64, 32)),
+        CSAC(reference_policy="periodic", actor_hidden_sizes=(64, 32)),
         CSAC(**hyperparameters("strong", "csac", "Hopper-v4")),
         SAC(temperature="fixed", target_entropy=-2.5),
         TD3(),

@@ -132,7 +132,9 @@ def test_means_begin_anew_where_other_things_are_told(before, after):
     assert again.metrics()[0].keys() == alone.metrics()[0].keys()
 
 
-SETTINGS = [(name, {}) for name in ALGORITHMS] + [("csac", {"reference_policy": "periodic"})]
+SETTINGS = [(name, {}) for name in ALGORITHMS] + [
+    ("csac", {"reference_policy": choice}) for choice in ("algorithm1", "periodic")
+]
 
 
 @pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=str)
