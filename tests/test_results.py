@@ -28,7 +28,7 @@ def commands(page: Path) -> list[list[str]]:
 
 # The tables that evidence.py writes, by the folders of their pages.
 EVIDENCE = {
-    "reference": ["fresh", "screen", "stage-0", "stage-0-fresh"],
+    "reference": ["fresh", "ant", "screen", "stage-0", "stage-0-fresh"],
     "strong": ["primary", "whose", "stage-1", "aims"],
 }
 WITH_COMMANDS = [page for page in PAGES if commands(page)]
@@ -152,6 +152,9 @@ def _value(text: str) -> Any:
         ("reference", "fresh", "CSAC, previous | **SAC, 0.2**", ["README.md", "docs/design.md"]),
         ("reference", "fresh", "CSAC, average 0.05 | **SAC, 0.2**", ["README.md", "docs/design.md"]),
         ("reference", "fresh", "CSAC, average 0.05 | SAC, automatic", ["README.md"]),
+        ("reference", "ant", "CSAC, paper | **SAC, 0.2**", ["README.md"]),
+        ("reference", "ant", "CSAC, previous | **SAC, 0.2**", ["README.md"]),
+        ("reference", "ant", "CSAC, average 0.05 | **SAC, 0.2**", ["README.md"]),
     ],
 )
 def test_what_documents_tell_of_a_comparison_stands_in_its_table(name, mark, pair, documents):
