@@ -92,7 +92,7 @@ class CSAC:
     target_entropy: float | None = None
     """Entropy that `auto` aims at, in nats; by default minus the number of action dimensions."""
     target_relative_entropy: Annotated[float, POSITIVE] = 0.01
-    """Relative entropy per refresh of the reference that `auto` aims at, in nats per action dimension."""
+    """Relative entropy per refresh that `auto` aims at, in nats per action dimension; with a short lag, use less."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of weights that are `auto`."""
     discount: Annotated[float, DISCOUNT] = 0.99

@@ -82,6 +82,10 @@ def write_between(page: Path, name: str, text: str) -> None:
     try:
         new = between_markers(page.read_text(encoding="utf-8"), name, text)
         write_atomically(page, new.encode())
+    except FileNotFoundError:
+        raise InputError(
+            f"cannot write into {page}: there is no such page; make it, with the marks of {name}"
+        ) from None
     except OSError as error:
         raise InputError(f"cannot write into {page}: {error.strerror or error}") from None
     except UnicodeDecodeError:
