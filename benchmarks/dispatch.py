@@ -37,7 +37,7 @@ WARMUP = 500
 NORMALISED = (("critic_normalisation", "batch"),)
 RATES = (("critic_learning_rate", 1e-3), ("actor_learning_rate", 1e-3))
 PIECES = (*NORMALISED, *RATES, ("policy_delay", 3), ("adam_momentum", 0.5), ("normalise_observations", True))
-AVERAGE = (("reference_policy", "average"), ("relative_entropy_estimator", "closed_form"), ("reference_rate", 0.05))
+DEFAULT = (("reference_policy", "average"), ("relative_entropy_estimator", "closed_form"), ("reference_rate", 0.05))
 STRONG = tuple((hyperparameters("strong", "csac", TASK) | {"warmup_steps": 0}).items())
 REGIONS = "--xla_cpu_copy_insertion_use_region_analysis=true"
 Rates = dict[str, list[float]]
@@ -85,7 +85,7 @@ def suites() -> dict[str, dict[str, list[Variant]]]:
             for title, setting in alone.items()
         },
         "references": {
-            title: [Variant("preset paper", *setting), Variant("default", *setting, changes=AVERAGE)]
+            title: [Variant("preset paper", *setting), Variant("default", *setting, changes=DEFAULT)]
             for title, setting in {
                 **{f"updates, {len(cores)} cores": ("csac", cores) for cores in (both, (0,))},
                 "training, 2 cores": ("csac", both, True, 400, 1, 1, "off"),

@@ -114,10 +114,10 @@ def show(options: Show) -> int:
 def _predictions(cells: Sequence[Cell], store: Store, measure: bool, console: Console) -> dict[str, Prediction]:
     """Return what each cell will take, of those whose kind was measured or can be."""
     calibration, predictions, refused = Calibration(), {}, set()
-    unknown = {f"{cell.algorithm} on {cell.task}" for cell in cells if calibration.cost(cell) is None}
-    if unknown and measure:
-        kinds = f"{len(unknown)} kinds of cells" if len(unknown) > 1 else "one kind of cell"
-        _say(console, f"measuring {kinds}, for some seconds each and longer on a busy machine; --no-measure skips it")
+    if measure and any(calibration.cost(cell) is None for cell in cells):
+        _say(
+            console, "measuring each kind of cell once: some seconds, longer on a busy machine (--no-measure skips it)"
+        )
     for cell in cells:
         cost, kind = calibration.cost(cell), f"{cell.algorithm} on {cell.task}"
         if cost is None and measure and kind not in refused:

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 # A cell is known by every hyperparameter: these name what they do not use as well, as it was when their cells ran.
-EXACT = MappingProxyType(
+PINNED = MappingProxyType(
     {"relative_entropy_estimator": "closed_form", "reference_period": 1000, "reference_rate": 0.005}
 )
 
 CSAC_PAPER = Method("CSAC (paper)", "csac", "paper", published="CSAC")
-CSAC_PERIODIC = Method("CSAC (periodic)", "csac", hyperparameters={**EXACT, "reference_policy": "periodic"})
+CSAC_PERIODIC = Method("CSAC (periodic)", "csac", hyperparameters={**PINNED, "reference_policy": "periodic"})
 SAC = Method("SAC", "sac", "paper", published="SAC")
 PPO = Method("PPO", "ppo", "paper", published="PPO")
 TD3 = Method("TD3", "td3", "paper", published="TD3")
@@ -96,7 +96,7 @@ REFERENCE = replace(
             Method(
                 f"CSAC, {label}",
                 "csac",
-                hyperparameters={"relative_entropy_weight": 0.5, **EXACT, **hyperparameters},
+                hyperparameters={"relative_entropy_weight": 0.5, **PINNED, **hyperparameters},
             )
             for label, hyperparameters in (
                 ("previous", {"reference_policy": "previous"}),

@@ -13,6 +13,8 @@ from benchmarks.measuring import ROOT, Process, run, surroundings
 from benchmarks.parts import Options, Part
 from benchmarks.suites import growth
 from benchmarks.tables import formatted, read_rows, write_rows
+from csac import CSAC
+from csac.presets import hyperparameters
 from csac.processes import usable_cores
 from csac.record.rendering import between_markers
 from csac.types import InputError
@@ -202,6 +204,11 @@ def test_every_part_runs(arguments, capsys):
     assert "| --- |" in printed
     assert "one core multiplies 256 x 256 x 256 at" in printed
     assert f"not written: only a part of {arguments[0]} was measured" in printed
+
+
+def test_the_default_that_is_compared_is_csac_s():
+    paper = hyperparameters("paper", "csac", "HalfCheetah-v4")
+    assert CSAC(**paper | dict(dispatch.DEFAULT)) == CSAC()
 
 
 def test_one_measurement_is_too_few_for_a_middle_half(capsys):

@@ -258,6 +258,20 @@ def test_show_counts_as_run_does(engine, capsys):
     assert [job.cell for job in engine] == [other]
 
 
+def test_show_says_that_it_measures_before_it_does(engine, monkeypatch, capsys):
+    told = []
+
+    def measure(self, cell):
+        told.append(capsys.readouterr().out)
+        raise RuntimeError("this cell has no environment")
+
+    monkeypatch.setattr(Calibration, "cost", lambda self, cell: None)
+    monkeypatch.setattr(Calibration, "measure", measure)
+    assert csac("study show tiny.toml") == 0
+    assert "--no-measure" in told[0]
+    assert "cannot be measured: this cell has no environment" in capsys.readouterr().out
+
+
 def test_a_killed_cell_is_told_from_where_it_goes_on(engine, capsys):
     (one,) = cells_of([read_study("tiny.toml")])[:1]
     make_run(Store(), one, steps_done=290, last_checkpoint=200)

@@ -396,7 +396,7 @@ def test_returns_by_seed_and_step_are_enough():
         ("report --label a=a.csv,a.csv", "a: a.csv and a.csv both hold seed 0; label them apart"),
         ("report --label a=a.csv --into page.md", "--into is written FILE.md#NAME, not 'page.md'"),
         ("report --label a=a.csv --into page.md#x", "the page lacks the lines <!-- x: begin -->"),
-        ("report --label a=a.csv --into none.md#x", "cannot write into none.md"),
+        ("report --label a=a.csv --into none.md#x", "cannot write into none.md: there is no such page; make it"),
         ("report --label a=a.csv --into page.md#it --table cases", "these runs have no table of cases"),
         ("report --label a=a.csv --into page.md#it --curve a.gif", "a picture is a .png, .pdf or .svg file, not a.gif"),
         ("report --label a=a.csv --into page.md#it --out a.pdf", "the report is a page: name it a.html"),
