@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -207,8 +207,8 @@ def test_every_part_runs(arguments, capsys):
 
 
 def test_the_default_that_is_compared_is_csac_s():
-    paper = hyperparameters("paper", "csac", "HalfCheetah-v4")
-    assert CSAC(**paper | dict(dispatch.DEFAULT)) == CSAC()
+    compared: dict[str, Any] = hyperparameters("paper", "csac", "HalfCheetah-v4") | dict(dispatch.DEFAULT)
+    assert CSAC(**compared) == CSAC()
 
 
 def test_one_measurement_is_too_few_for_a_middle_half(capsys):
