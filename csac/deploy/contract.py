@@ -207,7 +207,8 @@ def read_file(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+        advice = ": restore it from a copy" if isinstance(error, FileNotFoundError) else ""
+        raise InputError(f"{path} cannot be read: {error.strerror}{advice}") from error
 
 
 def read_json(path: Path) -> Any:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from csac.algorithms import ALGORITHMS
 from csac.checks import check_arguments, check_whole
 from csac.presets import matching_preset
@@ -18,6 +20,7 @@ from csac.tasks.environment import Environment
 from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.seeds import EVALUATION_SEED, FIRST_TRAINING_SEED
+from csac.tasks.spaces import EnvironmentFailure
 from csac.tasks.trust import remember
 from csac.training.checkpoint import steps_in
 from csac.training.devices import choose_device
@@ -27,7 +30,7 @@ from csac.training.scheduler import choose_evaluation_processes, choose_groups, 
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from csac.tasks.making import Task
     from csac.training.options import PlanOptions
@@ -143,6 +146,8 @@ def make_plan(
     continued = before.run.manifest if before.run else None
     with closing(Environment(task, arguments)) as environment:
         spec, task_name = environment.spec, environment.task_name
+        if arguments:
+            _try_arguments(environment, arguments)
         remember(task)
         changes = planned_perturbations(asked, before.existing, before.source)
         if not before.existing:  # whose number of steps has its own refusal
@@ -177,6 +182,20 @@ def make_plan(
 
 
 _SEVERAL = ("several groups need", "groups=1")
+
+
+def _try_arguments(environment: Environment, arguments: Mapping[str, Any]) -> None:
+    """Make one step, as some tasks take an argument of any type and fail where they first use it. Raises InputError.
+
+    Any other failure is left to the run, whose log has the traceback that the author of a task looks for.
+    """
+    try:
+        environment.reset(0)
+        environment.step(np.zeros(environment.spec.action_size, np.float32))
+    except EnvironmentFailure as error:
+        if isinstance(error.__cause__, TypeError):
+            message = f"{environment.task_name} does not work with the arguments {dict(arguments)}: {error}"
+            raise InputError(message) from error
 
 
 def _choose_events(task: Task, given: Sequence[str] | None, before: Manifest | None) -> tuple[str, ...]:

@@ -140,7 +140,8 @@ def roll_back(run: RunDirectory) -> Restart:
     """
     checkpoint, complaints = newest_sound(run.checkpoints)
     if checkpoint is None and complaints:
-        raise InputError(f"no checkpoint of {run.path} is sound: {'; '.join(complaints)}")
+        advice = "restore one from a copy, or train in another directory"
+        raise InputError(f"no checkpoint of {run.path} is sound ({'; '.join(complaints)}): {advice}")
     if checkpoint is None and run.manifest.forked_from:
         raise InputError(
             f"{run.path} was stopped before its first checkpoint: repeat its command, --from included, with --resume"

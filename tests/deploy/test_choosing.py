@@ -126,7 +126,7 @@ def test_a_seed_is_a_whole_number(tmp_path):
 def test_a_contract_that_is_gone_is_told_as_gone(tmp_path):
     save_run(tmp_path, EVALUATIONS)
     (tmp_path / "policy" / "contract.json").unlink()
-    with pytest.raises(InputError, match=r"contract\.json cannot be read: No such file"):
+    with pytest.raises(InputError, match=r"contract\.json cannot be read: No such .*: restore it from a copy$"):
         load(tmp_path)
 
 

@@ -391,7 +391,7 @@ def test_a_run_without_a_sound_checkpoint_is_refused_and_kept(tmp_path, finished
     for path in (tmp_path / "run" / "checkpoint").glob("step_*.json"):
         path.write_text("{}")
     before = contents(tmp_path / "run")
-    with pytest.raises(InputError, match=r"no checkpoint of .*run is sound"):
+    with pytest.raises(InputError, match=r"no checkpoint of .*run is sound \(.*\): restore one from a copy, or "):
         resume(tmp_path / "run", steps=260)
     assert contents(tmp_path / "run") == before
 
