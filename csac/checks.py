@@ -31,6 +31,8 @@ def check_path(name: str, value: object) -> None:
     """Raise InputError for what names no file or directory."""
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{name} is a path such as 'runs/first', not {value!r:.40}")
+    if not str(value) or "\0" in str(value):
+        raise InputError(f"{name} cannot be {value!r:.40}: give a path such as 'runs/first'")
 
 
 def check_arguments(name: str, value: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import faulthandler
 import io
 import os
@@ -65,13 +66,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The user's own modules, as `python -m csac` finds them; last, so that they hide nothing of csac's.
         sys.path += [os.getcwd()] if os.getcwd() not in sys.path else []
     try:
+        code = _answer(arguments)
+    finally:
+        failure = _settle_output()
+    return _full(failure) if failure and not code else code
+
+
+def _answer(arguments: list[str]) -> int:
+    try:
         return _dispatch(arguments)
     except InputError as error:
         return _complain(error, 2)
     except KeyboardInterrupt as interruption:
-        return 143 if signal.SIGTERM in interruption.args else 130
-    finally:
-        _settle_output()
+        return _code(interruption)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        return _full(error)
+
+
+def _full(error: OSError) -> int:
+    return _complain(f"not all of the output could be written: {error.strerror}", 1)
+
+
+def _code(interruption: KeyboardInterrupt) -> int:
+    return 143 if signal.SIGTERM in interruption.args else 130
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -168,13 +187,17 @@ def _exit_code(training: Callable[[], RunDirectory]) -> int:
     """Train, and turn how it ended into an exit code and, where it did not reach its end, the line to type next."""
     from csac.console.tables import program
     from csac.record.run import StorageFailure
-    from csac.training.interruptions import Interrupted
+    from csac.training.interruptions import Interrupted, StoppedAtOnce
 
     try:
         run = training()
-    except Interrupted as interruption:
-        line = f"; to go on, type: {program()} resume {shlex.quote(str(interruption.run.path))}"
-        return _complain(f"{interruption}{line if interruption.is_saved else ''}", 128 + interruption.signal_number)
+    except (Interrupted, StoppedAtOnce) as stop:
+        line = f"; to go on, type: {program()} resume {shlex.quote(str(stop.run.path))}" if stop.can_go_on else ""
+        if isinstance(stop, Interrupted):
+            return _complain(f"{stop}{line}", 128 + stop.signal_number)
+        return _complain(
+            f"stopped at once: what {stop.run.path} did since its last checkpoint is lost{line}", _code(stop)
+        )
     except StorageFailure as failure:
         return _complain(f"{failure}; the run can go on from its last checkpoint (csac resume) once that is mended", 1)
     return 3 if run.manifest.state == "failed" else 0
@@ -404,7 +427,8 @@ def _tune(arguments: list[str]) -> int:
     from csac.studies.tune_command import run_tune
     from csac.training.options import Options
 
-    wanted = None if options.search is None else options.search.replace("-", "_").split(",")
+    words = None if options.search is None else options.search.replace("-", "_").split(",")
+    wanted = words and [word.strip() for word in words]
     question = Question(
         **{item.name: getattr(options, item.name) for item in dataclasses.fields(Options)},
         task=options.task,
@@ -437,9 +461,11 @@ def _open_standard_streams() -> None:
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
 
 
-def _settle_output() -> None:
-    """Write what waits; where nobody reads it any more (`csac runs | head`), leave without a fuss."""
+def _settle_output() -> OSError | None:
+    """Write what waits, or return why that fails; where nobody reads it any more (`csac runs | head`), that is none."""
     try:
         sys.stdout.flush()
-    except OSError:
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return None if isinstance(error, BrokenPipeError) else error
+    return None

@@ -146,7 +146,7 @@ class Reporter:
         lines = [("why", f"the traceback is in {log}")] if one.failures and _has_traceback(log) else []
         lines += [("curve", str(run.path / "curve.png"))] if has_curve else []
         # A failed seed that was never evaluated would fail in a test as well: its task does not run.
-        if run.seeds_with_policies() and (is_sound or has_curve):
+        if one.steps_done and run.seeds_with_policies() and (is_sound or has_curve):
             if one.task_is_callable:  # which no command line can name
                 task = one.task if one.task.isidentifier() else "your_task"
                 more = f", environment_arguments={one.environment_arguments}" if one.environment_arguments else ""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from csac.checks import check_path
 from csac.deploy.artefact_contract import CONTRACT, POLICY_FILES, ArtefactContract
 from csac.deploy.c_source import is_header
 from csac.deploy.contract import read_file
@@ -116,6 +117,7 @@ def open_artefact(path: str | Path) -> Artefact:
     Raises:
         InputError: no artefact there, a damaged or a foreign one, or nothing here to run it with.
     """
+    check_path("the folder of an artefact", path)
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path} does not exist; give the folder of an artefact (csac export writes one)")

@@ -196,7 +196,7 @@ def _bounds(numbers: Any) -> np.ndarray:
 def _as_float32(value: Any, name: str) -> np.ndarray:
     try:
         return np.asarray(value, dtype=np.float32)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         if isinstance(value, tuple) and len(value) == 2 and isinstance(value[1], dict):
             raise InputError(f"{name} is all that reset() returns: write observation, info = env.reset()") from None
         raise InputError(f"{name} is not an array of numbers: {error}") from error

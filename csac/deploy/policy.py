@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from csac.checks import check_path
 from csac.deploy import tensors
 from csac.deploy.contract import Activation, Contract, read_file
 from csac.deploy.parameters import check_network, copied, from_tensors, to_tensors
@@ -54,6 +55,7 @@ class Policy:
 
         Deterministic unless told otherwise, as a controller is; Stable-Baselines3's `predict` draws unless told.
         One observation gives float32 [*action_shape], a batch of n (or a dict of such batches) [n, *action_shape].
+        One that is not finite gives an action that is not: `csac export` builds in guards that replace it.
 
         Raises:
             InputError: an observation that is not of the task's shape.
@@ -113,6 +115,7 @@ class Policy:
         Raises:
             InputError: the folder holds a run or an artefact, or cannot be written.
         """
+        check_path("the folder of a policy", directory)
         folder = Path(directory)
         strangers = {"manifest.json", "policy.py", "policy.onnx", "policy.h"}
         try:

@@ -13,7 +13,7 @@ from csac.checks import check_whole
 from csac.deploy.policy import Policy, noise_generator
 from csac.record.manifest import SEED_LIMIT
 from csac.tasks.environment import Environment
-from csac.tasks.known import events_of
+from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import constant_perturbations, values_at
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.spaces import EnvironmentFailure
@@ -286,6 +286,8 @@ def evaluate_episodes(
         EvaluationFailure: as `Evaluator.run`.
     """
     perturbed = values_at(constant_perturbations(perturbations), 0)
+    if events is not None:
+        check_events(events)
     events = events_of(task) if events is None else tuple(events)
     if isinstance(policy, Policy):
         evaluator = Evaluator(task, environment_arguments, episodes, first_seed, events)
@@ -296,6 +298,8 @@ def evaluate_episodes(
             evaluator.close()
         _warn_of_another_task(policy.contract.task, task)
         return played
+    if isinstance(policy, type):
+        raise InputError(f"{policy.__name__} is a class: give a policy as csac.load returns it")
     if not callable(getattr(policy, "predict", None)):
         raise InputError(f"a {type(policy).__name__} has no predict: give a policy as csac.load returns it")
     _check_episodes(episodes, first_seed)
@@ -318,9 +322,12 @@ def _play(policy: Any, episode: _Episode, deterministic: bool, events: Sequence[
     episode.start()
     state, start = None, np.ones(1, bool)
     while not episode.ended:
-        action, state = policy.predict(
+        answer = policy.predict(
             episode.environment.raw_observation, state=state, episode_start=start, deterministic=deterministic
         )
+        if not isinstance(answer, tuple) or len(answer) != 2:
+            raise InputError(f"predict of a {type(policy).__name__} must return (action, state), not {answer!r:.40}")
+        action, state = answer
         episode.step(action)
         start = np.zeros(1, bool)
     return episode.result(events)

@@ -34,15 +34,36 @@ _CANNOT_WRITE = (
 class Interrupted(Exception):
     """Training was stopped by a signal.
 
-    `is_saved` says whether there is a checkpoint to go on from, `steps_lost` how many of the last steps lie beyond it.
+    `is_saved` says whether there is a checkpoint to go on from, `steps_lost` how many of the last steps lie beyond it,
+    `begins_anew` whether, where there is none, the run begins anew when it is resumed.
     """
 
-    def __init__(self, run: RunDirectory, signal_number: int, is_saved: bool, steps_lost: int = 0) -> None:
+    def __init__(
+        self,
+        run: RunDirectory,
+        signal_number: int,
+        is_saved: bool,
+        steps_lost: int = 0,
+        begins_anew: bool = False,
+    ) -> None:
         where = f"saved in {run.path}" if is_saved else f"{run.path} has its results and no checkpoint to go on from"
         if is_saved and steps_lost:
             where = f"{run.path} is saved but for its last {steps_lost:,} steps"
+        if begins_anew:
+            where = f"{run.path} has no checkpoint yet and will begin anew"
         super().__init__(f"stopped by {signal.Signals(signal_number).name}; {where}")
-        self.run, self.signal_number, self.is_saved = run, signal_number, is_saved
+        self.run, self.signal_number, self.can_go_on = run, signal_number, is_saved or begins_anew
+
+
+class StoppedAtOnce(KeyboardInterrupt):
+    """A second signal came while a run was being saved: what it did after its last checkpoint is lost.
+
+    `can_go_on` says whether `resume` takes it up; its arguments are those of the KeyboardInterrupt.
+    """
+
+    def __init__(self, run: RunDirectory, can_go_on: bool, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.run, self.can_go_on = run, can_go_on
 
 
 @contextmanager

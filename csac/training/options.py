@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from csac.tasks.perturbations import Perturbation
+    from csac.types import Algorithm
 
 MOST_SEEDS = 10_000
 MOST_EPISODES = 1_000_000  # as many as there are reset seeds between those of training's evaluations and of later ones
@@ -89,21 +90,25 @@ class PlanOptions(TypedDict, total=False):
     evaluation_processes: int | None
 
 
-def checked_options(given: PlanOptions) -> tuple[Options, dict[str, Any]]:
+def checked_options(given: PlanOptions, algorithm: Algorithm | None = None) -> tuple[Options, dict[str, Any]]:
     """Return the options that are numbers, checked, and the others as they were given.
+
+    A hyperparameter of `algorithm` among them is told as one.
 
     Raises:
         InputError: there is no option of that name, or a number outside its range.
     """
     if unknown := given.keys() - PlanOptions.__annotations__.keys():
-        raise InputError(f"train takes no {min(unknown)}{_hint(min(unknown))}")
+        raise InputError(f"train takes no {min(unknown)}{_hint(min(unknown), algorithm)}")
     names = {item.name for item in dataclasses.fields(Options)}
     simple: Any = {name: value for name, value in given.items() if name in names}
     return Options(**simple), {name: value for name, value in given.items() if name not in names}
 
 
-def _hint(name: str) -> str:
+def _hint(name: str, algorithm: Algorithm | None) -> str:
     """Return ": ..." with what an option is called here, or what is most like it, or nothing."""
     known = PlanOptions.__annotations__
+    if algorithm and name in (item.name for item in dataclasses.fields(algorithm)):  # pyright: ignore[reportArgumentType]
+        return f": it is a hyperparameter, as in train({type(algorithm).__name__}({name}=...), ...)"
     hint = called_in_python(name, known) or did_you_mean(name, known)
     return f": {hint}" if hint else ""

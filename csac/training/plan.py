@@ -24,8 +24,8 @@ from csac.tasks.spaces import EnvironmentFailure
 from csac.tasks.trust import remember
 from csac.training.checkpoint import steps_in
 from csac.training.devices import choose_device
-from csac.training.options import Options, checked_options
-from csac.training.resume import Source, planned_perturbations
+from csac.training.options import MOST_SEEDS, Options, checked_options
+from csac.training.resume import Source, planned_perturbations, refuse_other_source
 from csac.training.scheduler import choose_evaluation_processes, choose_groups, split_seeds
 from csac.types import InputError
 
@@ -94,7 +94,11 @@ class Before(NamedTuple):
         """Look for what is to be continued. Raises InputError where it cannot be."""
         path = None if directory is None else Path(directory)
         existing = RunDirectory.open(path) if path and resume and is_run(path) else None
-        if start_from is None or (existing and _has_begun(existing)):
+        if existing and _has_begun(existing):
+            if start_from is not None:
+                refuse_other_source(existing, start_from)
+            return cls(path, existing, None)
+        if start_from is None:
             return cls(path, existing, None)
         return cls(path, None, Source.find(start_from), existing)
 
@@ -136,7 +140,7 @@ def make_plan(
     Raises:
         InputError: a mistake in the options, or a task that csac cannot learn.
     """
-    options, others = checked_options(given)
+    options, others = checked_options(given, algorithm)
     choose_device(options.device)
     if others.get("evaluation_processes") and not may_evaluate_beside:
         raise InputError("stop_when is asked before training goes on: leave out evaluation_processes")
@@ -221,7 +225,9 @@ def _choose_parts(
         groups = len(existing.groups) or 1  # so that the numbers stay the same to the last bit
     if groups is None:
         groups = choose_groups(options.seeds, options.device) if can_be_sent else 1
-    check_whole("groups", groups, 1, options.seeds)
+    check_whole("groups", groups, 1, MOST_SEEDS)
+    if groups > options.seeds:
+        raise InputError(f"groups must be at most as many as seeds, {options.seeds}, not {groups}: each needs one")
     return tuple(tuple(part) for part in split_seeds(options.labels, groups))
 
 

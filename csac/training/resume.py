@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 from csac.record.manifest import Continuation, Origin, differences
 from csac.record.run import RunDirectory, Table, now
 from csac.tasks.perturbations import continued, perturbations_of
-from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, sound_at, taken_back
+from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, sound_at, steps_in, taken_back
 from csac.training.restore import copy, restore
 from csac.types import InputError, Snapshot
 
@@ -90,9 +90,12 @@ def refuse_differences(run: RunDirectory, wanted: Manifest, has_schedule: bool, 
 
     `defaults` are those of the hyperparameters: what a run did that was made before there was one of them.
     """
-    found = differences(_fixed(run.manifest, defaults), _fixed(wanted, defaults))
-    if found:
-        raise InputError(f"{run.path} was trained otherwise: {'; '.join(found)}. Choose another directory")
+    made, asked = _fixed(run.manifest, defaults), _fixed(wanted, defaults)
+    if made["algorithm"] != asked["algorithm"]:  # whose hyperparameters are others
+        made, asked = ({"algorithm": each["algorithm"]} for each in (made, asked))
+    if found := differences(made, asked):
+        advice = f"Choose another directory; 'csac resume {run.path}' goes on as it was"
+        raise InputError(f"{run.path} was trained otherwise: {'; '.join(found)}. {advice}")
     before = run.manifest.steps
     if wanted.steps < before:
         raise InputError(
@@ -179,7 +182,7 @@ class Source(NamedTuple):
         name, at, step = str(where).rpartition("@")
         if at and not os.path.exists(where):
             run = RunDirectory.open(name)
-            if not (step.isascii() and re.fullmatch(r"\d+(_\d+)*", step) and len(step) <= 20):
+            if not _is_step(step):
                 raise InputError(f"{where}: {step!r} is not a step; write DIRECTORY@STEP")
             return cls(run, sound_at(run.checkpoints, int(step)))
         run = RunDirectory.open(where)
@@ -255,6 +258,23 @@ class Source(NamedTuple):
         Checkpoints(run.checkpoints, keep).commit(self.checkpoint.step, files, values)
 
 
+def refuse_other_source(run: RunDirectory, where: str | Path) -> None:
+    """Raise InputError where a run that goes on did not begin with `where`, which may have trained on or be gone."""
+    origin = run.manifest.forked_from
+    if origin is None:
+        raise InputError(f"{run.path} goes on and began with no other run: leave {where} out, or train elsewhere")
+    name, _, step = str(where).rpartition("@")
+    places = [where, *([name] if name and _is_step(step) and int(step) == origin.step else [])]
+    if Path(origin.directory).resolve() not in [Path(place).resolve() for place in places]:
+        began = f"{origin.directory}@{origin.step}"
+        raise InputError(f"{run.path} goes on and began with {began}: leave {where} out, or train elsewhere")
+
+
+def can_go_on(run: RunDirectory) -> bool:
+    """Whether there is a checkpoint to go on from, or nothing to lose where the run begins anew."""
+    return bool(steps_in(run.checkpoints)) or not (run.manifest.forked_from or _would_lose_results(run))
+
+
 def _would_lose_results(run: RunDirectory) -> bool:
     """Whether a run without a checkpoint has rows that it would not make again by itself.
 
@@ -274,6 +294,10 @@ def _fixed(manifest: Manifest, defaults: Mapping[str, Any]) -> dict[str, Any]:
     fixed["evaluation"] = vars(manifest.evaluation)
     fixed["hyperparameters"] = {**defaults, **manifest.hyperparameters}
     return fixed
+
+
+def _is_step(text: str) -> bool:
+    return bool(text.isascii() and re.fullmatch(r"\d+(_\d+)*", text) and len(text) <= 20)
 
 
 def _normalises(manifest: Manifest, defaults: Mapping[str, Any]) -> bool:

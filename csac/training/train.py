@@ -21,13 +21,19 @@ from csac.tasks.trust import refuse_untrusted
 from csac.training.checkpoint import Checkpoints, steps_in
 from csac.training.compilation import tidy_programs
 from csac.training.footprint import memory_needed
-from csac.training.interruptions import Interrupted, callers_own, caught_signals, storage_failures_told
+from csac.training.interruptions import (
+    Interrupted,
+    StoppedAtOnce,
+    callers_own,
+    caught_signals,
+    storage_failures_told,
+)
 from csac.training.learner import misfit
 from csac.training.messages import Settings
 from csac.training.plan import Before, Plan, algorithm_of, check_algorithm, make_plan, options_of
 from csac.training.provenance import provenance
 from csac.training.recorder import Recorder
-from csac.training.resume import BEGINNING, Restart, refuse_differences, roll_back
+from csac.training.resume import BEGINNING, Restart, can_go_on, refuse_differences, roll_back
 from csac.training.scheduler import run_groups
 from csac.types import InputError
 
@@ -114,7 +120,7 @@ def train(
         raise InputError(
             "resume goes on with the run in `directory`: give one (csac.resume(directory) does without task)"
         )
-    if reporter is not None and not callable(getattr(reporter, "note", None)):
+    if reporter is not None and (isinstance(reporter, type) or not callable(getattr(reporter, "note", None))):
         raise InputError(f"reporter is an object such as csac.console.progress.Reporter(), not {reporter!r:.40}")
     if wandb:
         import_wandb()
@@ -254,11 +260,15 @@ def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, re
     """Train until the last step or a signal, from the first preparation to the last picture."""
     reporter = watchers.reporter
     told = functools.partial(reporter.note, _STOPPING) if reporter else None
-    with caught_signals(told) as (stop, received):
-        recorder = _follow(run, plan, notes, watchers, restart, stop, received)
+    try:
+        with caught_signals(told) as (stop, received):
+            recorder = _follow(run, plan, notes, watchers, restart, stop, received)
+    except KeyboardInterrupt as second:
+        raise StoppedAtOnce(run, can_go_on(run), *second.args) from second
     if run.manifest.state == "interrupted":
         newest = recorder.checkpoints.newest if recorder.checkpoints else None
-        raise Interrupted(run, received[0], newest is not None, run.manifest.steps_done - (newest or 0))
+        lost = run.manifest.steps_done - (newest or 0)
+        raise Interrupted(run, received[0], newest is not None, lost, begins_anew=newest is None and can_go_on(run))
     return run
 
 

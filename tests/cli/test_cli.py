@@ -19,7 +19,9 @@ import csac.training.train as training
 from csac.cli import main
 from csac.commands import Chosen
 from csac.record.csv_tables import read_rows
+from csac.record.manifest import Origin
 from csac.record.run import RunDirectory
+from csac.training import interruptions
 
 
 @pytest.fixture(scope="module")
@@ -199,17 +201,33 @@ def test_an_interrupted_run_says_what_is_not_saved():
     )
 
 
+@pytest.mark.parametrize(("can_go_on", "line"), [(True, "; to go on, type: csac resume 'my run'"), (False, "")])
+def test_a_second_signal_says_what_is_lost(monkeypatch, capsys, can_go_on, line):
+    def train(*_, **__):
+        raise interruptions.StoppedAtOnce(RunDirectory(Path("my run"), NOTHING), can_go_on, signal.SIGTERM)
+
+    monkeypatch.setattr(training, "train", train)
+
+    assert csac("train Hopper-v4") == 143
+    lost = "csac: stopped at once: what my run did since its last checkpoint is lost"
+    assert capsys.readouterr().err == f"{lost}{line}\n"
+
+
 def test_a_run_that_is_there_needs_no_source_any_more(tmp_path):
     """A scheduler types the same line again; meanwhile the source has trained on, or is gone."""
     run = make_run(tmp_path / "fork", "Hopper-v4", 3, [-1.0], [1.0])
+    run.update_manifest(forked_from=Origin(str(tmp_path / "gone"), 400))
+    run.checkpoints.mkdir()
+    (run.checkpoints / "step_400.json").write_text("{}")
     chosen = Chosen.among(["--from", str(tmp_path / "gone@400"), "--directory", str(run.path), "--resume"])
     assert chosen.source == run.manifest
 
 
+@pytest.mark.parametrize("state", [{"is_saved": True}, {"is_saved": False, "begins_anew": True}])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interrupted_run_says_what_to_type(monkeypatch, capsys, number, code):
+def test_an_interrupted_run_says_what_to_type(monkeypatch, capsys, number, code, state):
     def train(*_, **__):
-        raise training.Interrupted(RunDirectory(Path("my run"), NOTHING), number, is_saved=True)
+        raise training.Interrupted(RunDirectory(Path("my run"), NOTHING), number, **state)
 
     monkeypatch.setattr(training, "train", train)
 
@@ -273,6 +291,15 @@ def test_too_few_file_handles_are_told_and_the_run_goes_on_with_enough(tmp_path)
     )
     assert csac(f"resume {tmp_path / 'run'}") == 0
     assert RunDirectory.open(tmp_path / "run").manifest.steps_done == 120
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full is Linux's")
+def test_a_full_disk_behind_the_output_is_an_error():
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "csac", "--help"]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert ended.stderr == "csac: not all of the output could be written: No space left on device\n"
+    assert ended.returncode == 1
 
 
 def test_nobody_reading_is_no_error():

@@ -158,6 +158,11 @@ def test_a_saved_policy_has_no_seeds_and_replaces_no_run(tmp_path):
         load(tmp_path / "kept", which="best")
     with pytest.raises(InputError, match="holds a run or an artefact: choose another folder"):
         policies[0].save(tmp_path / "run")
+    for nothing in (None, 5, "", "a\0b"):
+        with pytest.raises(
+            InputError, match=r"the folder of a policy (is a path such as|cannot be .*: give a path such as)"
+        ):
+            policies[0].save(nothing)  # pyright: ignore[reportArgumentType]
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
         policies[0].save(tmp_path / "file")

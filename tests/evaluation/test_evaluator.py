@@ -418,6 +418,27 @@ def test_what_cannot_predict_is_refused():
         evaluate({}, Lottery)
 
 
+def test_a_class_is_no_policy():
+    with pytest.raises(InputError, match=r"Policy is a class: give a policy as csac\.load returns it"):
+        evaluate(Policy, Lottery)
+
+
+@pytest.mark.parametrize("answer", [np.zeros(2), [0.0, 0.0], (np.zeros(2), None, None)])
+def test_what_predict_must_return_is_told(answer):
+    class Other:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return answer
+
+    with pytest.raises(InputError, match=r"predict of a Other must return \(action, state\), not "):
+        evaluate(Other(), Lottery)
+
+
+@pytest.mark.parametrize("events", ["hit", 5, [5], ["return"]])
+def test_events_are_names_as_in_training(events: Any):
+    with pytest.raises(InputError, match=r"events are a list|cannot name an event"):
+        evaluate_episodes(policy_for(Lottery), Lottery, episodes=1, events=events)
+
+
 def test_reports_use_other_episodes_than_training():
     policy = policy_for(Lottery)
     training = [episode.episode_return for episode in Evaluator(Lottery, first_seed=FRESH_EVALUATION_SEED).run(policy)]

@@ -13,6 +13,7 @@ import pytest
 
 from csac import PPO, SAC, train
 from csac.algorithms.memory import row_width
+from csac.console.progress import Reporter
 from csac.record.manifest import Manifest
 from csac.training import provenance
 from csac.training.footprint import memory_needed
@@ -83,6 +84,12 @@ def test_a_name_or_a_class_is_no_algorithm(tmp_path, algorithm: Any, message):
         ({"on_evaluation": 3}, "on_evaluation is a function that is called, not 3"),
         ({"events": 3}, r"events are a list of names such as \('collision',\), not 3"),
         ({"reporter": True}, r"reporter is an object such as csac.console.progress.Reporter\(\), not True"),
+        ({"reporter": Reporter}, r"reporter is an object such as csac.console.progress.Reporter\(\), not <class"),
+        (
+            {"discount": 0.9},
+            r"train takes no discount: it is a hyperparameter, as in train\(SAC\(discount=...\), ...\)",
+        ),
+        ({"groups": 2}, "groups must be at most as many as seeds, 1, not 2"),
         ({"stop_when": "never"}, "stop_when is a function that is called, not 'never'"),
     ],
 )

@@ -26,6 +26,7 @@ from csac.record.run import RunDirectory
 from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, steps_in
 from csac.training.group import Group
+from csac.training.interruptions import Interrupted, StoppedAtOnce, signals_noted
 from csac.training.learner import Learner
 from csac.training.resume import Restart, Source
 from csac.training.scheduler import run_groups
@@ -172,6 +173,32 @@ def test_a_signal_that_comes_too_late_stops_nothing(tmp_path, uninterrupted):
 
     assert run(tmp_path / "run", on_evaluation=send).manifest.state == "finished"
     assert contents(tmp_path / "run") == uninterrupted
+
+
+def test_a_run_that_is_stopped_before_its_first_step_begins_anew_and_says_so(tmp_path, uninterrupted):
+    with signals_noted() as received:
+        received.append(signal.SIGINT)
+        with pytest.raises(Interrupted, match=r"run has no checkpoint yet and will begin anew$") as stopped:
+            run(tmp_path / "run")
+    assert stopped.value.can_go_on
+    assert resume(tmp_path / "run").manifest.history[0].step == 0
+    assert contents(tmp_path / "run") == uninterrupted
+
+
+@pytest.mark.parametrize(("interval", "can_go_on"), [(120, True), (0, False)])
+def test_a_second_signal_leaves_a_run_as_sound_as_a_kill(tmp_path, uninterrupted, interval, can_go_on):
+    def send_two(step: int, _: Any) -> None:
+        if step == 300:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(StoppedAtOnce) as stopped:
+        run(tmp_path / "run", on_evaluation=send_two, checkpoint_interval=interval)
+    assert (stopped.value.args, stopped.value.run.path) == ((signal.SIGTERM,), tmp_path / "run")
+    assert stopped.value.can_go_on == can_go_on
+    if can_go_on:
+        assert resume(tmp_path / "run").manifest.history[0].step == 240
+        assert contents(tmp_path / "run") == uninterrupted
 
 
 def test_a_run_that_crashed_before_its_first_checkpoint_begins_anew(tmp_path, uninterrupted):
@@ -518,6 +545,21 @@ def test_a_fork_without_a_change_is_the_same_run(tmp_path, uninterrupted):
     ours, theirs = contents(forked.path), uninterrupted
     assert {name: ours[name] for name in theirs} == theirs
     assert forked.manifest.forked_from == Origin(str(tmp_path / "first"), 240)
+
+
+def test_a_run_goes_on_only_with_the_source_that_it_began_with(tmp_path):
+    """The same line may be repeated; with another source it would be another run."""
+    first = run(tmp_path / "first", steps=300, keep_checkpoints=0).path
+    forked = run(tmp_path / "second", steps=400, start_from=f"{first}@240").path
+    before = contents(forked)
+    for other in (f"{first}@120", tmp_path / "third", f"{tmp_path / 'third'}@240"):
+        with pytest.raises(InputError, match=r"second goes on and began with .*first@240: leave .* out"):
+            run(forked, steps=500, start_from=other, resume=True)
+    with pytest.raises(InputError, match=r"first goes on and began with no other run: leave .* out"):
+        run(first, steps=500, start_from=forked, resume=True)
+    assert contents(forked) == before
+    shutil.rmtree(first)
+    assert run(forked, steps=410, start_from=f"{first}@240", resume=True).manifest.steps_done == 410
 
 
 def test_a_fork_may_change_hyperparameters_and_says_so(tmp_path):
