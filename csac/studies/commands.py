@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import shlex
 import signal
 import sys
@@ -27,6 +25,7 @@ from csac.studies.job import Ended, Job, Message, Stopped, is_over
 from csac.studies.named import NAMED
 from csac.studies.options import List, Report, Run, Show
 from csac.studies.progress import StudyProgress
+from csac.studies.refusals import refuse_as_results, refuse_file, refuse_unwritable
 from csac.studies.results import Results, Runs, collect
 from csac.studies.study import Study, cells_of
 from csac.types import InputError
@@ -161,13 +160,17 @@ def run(options: Run) -> int:
             raise InputError(f"--cell counts from 0 to {len(cells) - 1}, not {options.cell}")
         cells = [cells[options.cell]]
     every = _jobs(studies, cells, store, options)
+    refuse_file(options.directory)
     if options.results:
-        _refuse_as_results(options.results, store)
-        _collect_over(every, store, options.results, labels)
+        refuse_as_results(options.results, store)
     collected = _collected(studies, cells, options.results)
+    jobs = [job for job in every if job.cell.key not in collected and not is_over(job)]
+    if jobs:
+        refuse_unwritable(options.directory)
+    if options.results:
+        _collect_over(every, store, options.results, labels)
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     _say(console, _intention(studies, cells, statuses.values()), "bold")
-    jobs = [job for job in every if job.cell.key not in collected and not is_over(job)]
     by_key = {cell.key: cell for cell in cells}
     done = {job.cell.key: store.first_step(job.cell) for job in jobs}
     progress = StudyProgress([job.cell for job in jobs], labels, done, console)
@@ -195,21 +198,9 @@ def run(options: Run) -> int:
         progress.close()
         for key, reason in not_collected.items():
             _say(console, f"not copied to {options.results}: {labels[key]}: {reason}; the same line copies it", "red")
-    code = _conclude({cell.key: store.status(cell) for cell in cells} | collected, labels, console)
+    statuses = {cell.key: store.status(cell) for cell in cells} | collected
+    code = _conclude(_with_failures(statuses, progress.outcomes), labels, console)
     return 3 if not_collected else code
-
-
-def _refuse_as_results(directory: Path, store: Store) -> None:
-    """Raise InputError where results cannot lie, before hours are spent on them."""
-    cells = directory / "cells"
-    if cells.resolve() == store.root.resolve():
-        raise InputError(f"--results {directory} is where the runs themselves lie: choose another directory")
-    try:
-        cells.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {directory}: {error.strerror}; choose another directory") from None
-    if not os.access(cells, os.W_OK | os.X_OK):  # it was there already
-        raise InputError(f"cannot write to {directory}: {os.strerror(errno.EACCES)}; choose another directory")
 
 
 def _collect_over(jobs: Iterable[Job], store: Store, directory: Path, labels: Mapping[str, str]) -> None:
@@ -328,6 +319,12 @@ def _jobs(studies: Sequence[Study], cells: Sequence[Cell], store: Store, options
 def _intention(studies: Sequence[Study], cells: Sequence[Cell], statuses: Iterable[Status]) -> str:
     scale = f", at {studies[0].scale:g} of the steps" if studies[0].scale < 1 else ""
     return f"{', '.join(study.name for study in studies)}{scale}: {len(cells)} cells, {_counted(statuses)}"
+
+
+def _with_failures(statuses: Mapping[str, Status], outcomes: Mapping[str, Ended]) -> dict[str, Status]:
+    """Return how the cells are, those that have just failed as failed: a full disk may not hold that they did."""
+    failed = {key: ended.reason for key, ended in outcomes.items() if ended.outcome == "failed"}
+    return {**statuses, **{key: statuses[key]._replace(state="failed", reason=failed[key]) for key in failed}}
 
 
 def _conclude(statuses: Mapping[str, Status], labels: Mapping[str, str], console: Console) -> int:

@@ -174,6 +174,44 @@ def test_results_that_cannot_lie_there_are_refused_before_anything_runs(engine, 
     assert not engine
 
 
+@pytest.mark.parametrize("options", ["", "--engine processes", "--cell 0"])
+@pytest.mark.parametrize(
+    ("place", "complaint"),
+    [
+        ("tiny.toml", "tiny.toml is a file; choose another directory"),
+        ("tiny.toml/cells", "cannot write to tiny.toml/cells: Not a directory; choose another directory"),
+        ("/proc/cells", "cannot write to /proc/cells: No such file or directory; choose another directory"),
+    ],
+)
+def test_a_directory_that_cannot_be_written_is_refused_before_anything_runs(engine, capsys, place, complaint, options):
+    assert csac(f"study run tiny.toml --directory {place} {options}") == 2
+    assert capsys.readouterr().err == f"csac: {complaint}\n"
+    assert not engine
+
+
+def test_a_directory_that_nobody_may_write_is_refused_only_where_a_cell_is_left(engine, capsys, monkeypatch):
+    finished(Store(), cells_of([read_study("tiny.toml")])[0])
+    monkeypatch.setattr("os.access", lambda *_: False)  # root may write anywhere
+    assert csac("study run tiny.toml --seeds 1") == 0
+    assert csac("study run tiny.toml") == 2
+    assert capsys.readouterr().err == f"csac: cannot write to {HOME}: Permission denied; choose another directory\n"
+    assert not engine
+
+
+def test_a_cell_that_failed_where_nothing_can_be_written_is_an_exit_code(monkeypatch, capsys):
+    def fail(jobs, tell):
+        for job in jobs:
+            tell(Ended(job.cell.key, "failed", "No space left on device"))
+
+    monkeypatch.setattr(commands, "run_here", fail)
+    assert csac("study run tiny.toml --engine local") == 3
+    assert capsys.readouterr().out.splitlines()[-3:] == [
+        "failed: SAC on Hopper-v4, seed 0: No space left on device",
+        "failed: SAC on Hopper-v4, seed 1: No space left on device",
+        "2 cells: 2 failed",
+    ]
+
+
 def test_results_that_nobody_may_write_are_refused_before_anything_runs(engine, capsys, monkeypatch):
     Path("out/cells").mkdir(parents=True)
     monkeypatch.setattr("os.access", lambda *_: False)  # root may write anywhere
