@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import tomllib
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +18,7 @@ from csac.studies.cells import Cell, complete, similar
 from csac.tasks.known import adapter_of, check_events
 from csac.tasks.making import registered
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
+from csac.training.options import LONGEST_INTERVAL, MOST_EPISODES
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 ANALYSES = ("curves", "returns", "efficiency", "robustness", "cases", "success")
 FEWEST_POINTS = 20  # evaluations of a shortened run: it is evaluated more often once it would have fewer
 WARMUP_SHARE = 0.1  # of a shortened run that is warm-up at most
+MOST_CELLS = 100_000
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,11 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Study:
-    """What is trained to answer a question. Steps are environment steps per seed; nothing here is shortened yet."""
+    """What is trained to answer a question. Steps are environment steps per seed; nothing here is shortened yet.
+
+    Raises:
+        InputError: more cells than anybody runs, or seeds with labels that there are not.
+    """
 
     name: str
     title: str
@@ -80,6 +87,16 @@ class Study:
     """Whether the paper's claims are held against it."""
     scale: float = 1.0
 
+    def __post_init__(self) -> None:
+        if (last := self.first_seed + self.seeds - 1) >= SEED_LIMIT:
+            raise InputError(f"the last seed would be {last:,}: seeds are below {SEED_LIMIT:,}")
+        cells = math.prod([len(self.tasks), len(self.methods), len(self.conditions), self.seeds])
+        if cells > MOST_CELLS:
+            raise InputError(
+                f"{self.name} would have {cells:,} cells, and {MOST_CELLS:,} is the most: "
+                "give fewer seeds, tasks, methods or conditions"
+            )
+
     def shortened(self, scale: float) -> Study:
         """Return the study with every run shortened to this share of its steps."""
         if not 0 < scale <= 1:
@@ -95,7 +112,7 @@ class Study:
         """Return the study on some of its tasks, with some of its algorithms or methods, with another number of seeds.
 
         Raises:
-            InputError: one that the study does not have.
+            InputError: one that the study does not have, or too many seeds.
         """
         if seeds is not None and seeds < 1:
             raise InputError(f"seeds must be at least 1, not {seeds}")
@@ -139,11 +156,12 @@ class Study:
 
     def entries(self) -> list[Entry]:
         """Return every cell: seed by seed, so that an unfinished study compares all methods on fewer seeds."""
+        parts = itertools.product(self.tasks, self.conditions_for(), self.methods)
+        firsts = [Entry(method, part, self._first_cell(task, method, part)) for task, part, method in parts]
         seeds = range(self.first_seed, self.first_seed + self.seeds)
-        parts = itertools.product(seeds, self.tasks, self.conditions_for(), self.methods)
-        return [Entry(method, part, self._cell(task, method, part, seed)) for seed, task, part, method in parts]
+        return [one._replace(cell=replace(one.cell, seed=seed)) for seed in seeds for one in firsts]
 
-    def _cell(self, task: str, method: Method, condition: tuple[str, ...], seed: int) -> Cell:
+    def _first_cell(self, task: str, method: Method, condition: tuple[str, ...]) -> Cell:
         steps = self.steps_for(task)
         refuse_late(map(Perturbation.parse, condition), steps)
         hyperparameters = method.hyperparameters_on(task)
@@ -155,7 +173,7 @@ class Study:
             method.algorithm,
             hyperparameters,
             steps=steps,
-            seed=seed,
+            seed=self.first_seed,
             evaluation_interval=self.interval_for(task),
             evaluation_episodes=self.evaluation_episodes,
             perturbations=condition,
@@ -180,7 +198,7 @@ def read_study(path: str | Path) -> Study:
         told = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of the text, of TOML, of numbers and nests that are too long
         raise InputError(f"{path} is not TOML: {error}") from None
     try:
         study = _study(path.stem, told)
@@ -200,15 +218,9 @@ def _study(name: str, told: dict[str, Any]) -> Study:
     for algorithm, hyperparameters in common.items():
         complete(algorithm, hyperparameters)
     values["methods"] = tuple(replace(one, common=common.get(one.algorithm, {})) for one in values["methods"])
-    for key in ("seeds", "evaluation_interval", "evaluation_episodes"):
-        if key in values and values[key] < 1:
-            raise InputError(f"{key} must be at least 1, not {values[key]}")
-    for key in ("first_seed", "rollouts"):
-        if values.get(key, 0) < 0:
-            raise InputError(f"{key} must be 0 or more, not {values[key]}")
-    _check_steps("steps", values.get("steps", Study.steps))
-    if (last := values.get("first_seed", 0) + values.get("seeds", Study.seeds) - 1) >= SEED_LIMIT:
-        raise InputError(f"the last seed would be {last:,}: seeds are below {SEED_LIMIT:,}")
+    for key, (least, most) in _RANGES.items():
+        if key in values:
+            _check_range(key, values[key], least, most)
     written = [tuple(map(str, perturbations_of(one))) for one in values.get("conditions", ())]
     for key, items in (("tasks", values["tasks"]), ("conditions", written)):
         if twice := _twice(items):
@@ -219,7 +231,7 @@ def _study(name: str, told: dict[str, Any]) -> Study:
             registered(task)
     for task, steps in values.get("steps_on", {}).items():
         _some([task], values["tasks"], "steps_on: the study has no task")
-        _check_steps(f"steps_on.{task}", steps)
+        _check_range(f"steps_on.{task}", steps, 1, STEPS_LIMIT)
     _some(values.get("analyses", ()), ANALYSES, "analyses: there is no")
     labels = [method.label for method in values["methods"]]
     if twice := _twice(labels):
@@ -229,14 +241,14 @@ def _study(name: str, told: dict[str, Any]) -> Study:
 
 def _twice(items: Sequence[Any]) -> str | None:
     """Return the first of the items that is there again, as Python writes it."""
-    return next((repr(item) for item in items if items.count(item) > 1), None)
+    return next((repr(item) for item, count in Counter(items).items() if count > 1), None)
 
 
-def _check_steps(key: str, steps: int) -> None:
-    if steps < 1:
-        raise InputError(f"{key} must be at least 1, not {steps}")
-    if steps > STEPS_LIMIT:
-        raise InputError(f"{key} must be at most {STEPS_LIMIT:,}, not {steps:,}")
+def _check_range(key: str, value: int, least: int, most: int) -> None:
+    if value < least:
+        raise InputError(f"{key} must be {'at least 1' if least else '0 or more'}, not {value}")
+    if value > most:
+        raise InputError(f"{key} must be at most {most:,}, not {value:,}")
 
 
 def _methods(key: str, told: Any) -> tuple[Method, ...]:
@@ -257,6 +269,8 @@ def _swept(told: dict[str, Any]) -> list[Method]:
     for name, several in sweep.items():
         if not isinstance(several, list) or not several:
             raise InputError(f"sweep.{name} is a list of values, not {several!r}")
+    if (count := math.prod(map(len, sweep.values()))) > MOST_CELLS:
+        raise InputError(f"a sweep would be {count:,} methods, and a study has at most {MOST_CELLS:,} cells")
     complete(values["algorithm"], {**given, **{name: several[0] for name, several in sweep.items()}})
     methods = []
     for combination in itertools.product(*sweep.values()):
@@ -336,6 +350,15 @@ _KEYS: Mapping[str, Callable[[str, Any], Any]] = {
     "events": _texts,
     "rollouts": _of(int, "a whole number"),
     "analyses": _texts,
+}
+
+_RANGES: Mapping[str, tuple[int, int]] = {
+    "seeds": (1, SEED_LIMIT),
+    "first_seed": (0, SEED_LIMIT - 1),
+    "steps": (1, STEPS_LIMIT),
+    "evaluation_interval": (1, LONGEST_INTERVAL),
+    "evaluation_episodes": (1, MOST_EPISODES),
+    "rollouts": (0, MOST_EPISODES),
 }
 
 _METHOD_KEYS: Mapping[str, Callable[[str, Any], Any]] = {

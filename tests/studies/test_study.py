@@ -62,6 +62,11 @@ def test_narrowed_studies_share_their_cells_with_the_whole_one():
         ({"tasks": ["Hoper-v4"]}, "here has no task 'Hoper-v4'; did you mean Hopper-v4?"),
         ({"algorithms": ["td3"]}, "here has no algorithm or method 'td3': there is sac, SAC, csac, CSAC (paper), ppo"),
         ({"seeds": 0}, "seeds must be at least 1, not 0"),
+        ({"seeds": 5_000_000_000}, "the last seed would be 4,999,999,999: seeds are below 4,294,967,296"),
+        (
+            {"seeds": 8_334},
+            "here would have 100,008 cells, and 100,000 is the most: give fewer seeds, tasks, methods or conditions",
+        ),
     ],
 )
 def test_narrowing_to_what_there_is_not(arguments, message):
@@ -191,6 +196,18 @@ def test_what_methods_have_in_common_gives_way_to_presets_and_to_their_own(tmp_p
         ),
         (("seeds = 2", "steps_on = {'Hopper-v4' = 5_000_000_000}"), "steps_on.Hopper-v4 must be at most"),
         (("seeds = 2", "seeds = 2\nfirst_seed = 4294967295"), "the last seed would be 4,294,967,296"),
+        (("seeds = 2", "seeds = 100_001"), "mine would have 100,001 cells, and 100,000 is the most: give fewer seeds"),
+        (
+            ("replay_size = 150", f"[methods.sweep]\nbatch_size = {[*range(400)]}\nreplay_size = {[*range(400)]}"),
+            "a sweep would be 160,000 methods, and a study has at most 100,000 cells",
+        ),
+        (("evaluation_interval = 100", f"evaluation_interval = {10**23}"), "evaluation_interval must be at most"),
+        (
+            ("evaluation_episodes = 2", "evaluation_episodes = 1_000_001"),
+            "evaluation_episodes must be at most 1,000,000, not 1,000,001",
+        ),
+        (("seeds = 2", "rollouts = 1_000_001"), "rollouts must be at most 1,000,000, not 1,000,001"),
+        (("seeds = 2", f"rollouts = {'9' * 5_000}"), "is not TOML: "),
         (("seeds = 2", "environment_arguments = {d = 2020-01-01}"), "environment_arguments holds numbers, texts"),
     ],
 )
