@@ -15,7 +15,7 @@ import numpy as np
 
 from csac.record.csv_tables import drop_torn_line
 from csac.record.manifest import differences
-from csac.record.run import is_locked
+from csac.record.run import is_locked, is_run
 from csac.tasks.seeds import TUNING_EVALUATION_SEED
 from csac.training.options import Options
 from csac.types import InputError
@@ -245,8 +245,12 @@ class SharedStudy:
                 f"{path} is damaged: {' '.join(str(error).split()):.100}; restore it, or remove it"
             ) from None
         told = self.question.told()
-        if found := differences(study.user_attrs.get("question", told), told):
+        found = differences(study.user_attrs.get("question", told), told)
+        if found and self._has_begun(study):
             raise InputError(f"{self.directory} tunes another question: {'; '.join(found)}. Choose another --directory")
+        if found:
+            optuna.delete_study(study_name=NAME, storage=options["storage"])
+            study = optuna.create_study(direction="maximize", **options)
         if "question" not in study.user_attrs:
             study.set_user_attr("question", told)
         if not study.get_trials(deepcopy=False):
@@ -258,6 +262,13 @@ class SharedStudy:
             }
             study.enqueue_trial(fitting)
         return study
+
+    def _has_begun(self, study: optuna.Study) -> bool:
+        """Whether a trial was ever run, or is: one that could not begin leaves no run."""
+        return any(map(is_run, (self.directory / "trials").iterdir())) or any(
+            trial.state.name in ("COMPLETE", "PRUNED") or (trial.state.name == "RUNNING" and self._is_run(trial))
+            for trial in study.get_trials(deepcopy=False)
+        )
 
     def _pruner(self) -> Any:
         """Return the median rule: stop what was never as good as half of the complete trials were at the same step."""

@@ -17,6 +17,8 @@ from csac.studies.shared_study import Question, SharedStudy, import_optuna
 from csac.studies.tune import MOST_TRIALS, tune
 from csac.studies.tune_progress import TuneProgress
 from csac.tasks.environment import Environment
+from csac.training.options import MOST_SEEDS
+from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,11 +31,16 @@ def run_tune(question: Question, directory: Path, trials: int, groups: int | Non
     """Search, and return the exit code; `arguments` are what was typed after `csac tune`.
 
     Raises:
-        InputError: fewer than one trial, no such task, Optuna is missing, or a directory of something else.
+        InputError: fewer than one trial, no such task, groups that the seeds do not fill, a device that there is not,
+            Optuna is missing, or a directory of something else.
         StorageFailure: the directory can no longer be written.
     """
+    from csac.training.devices import choose_device  # JAX
+
     check_whole("trials", trials, 1, MOST_TRIALS)
+    _check_groups(groups, question.seeds)
     import_optuna()
+    choose_device(question.device)
     Environment(question.task, question.environment_arguments).close()  # says what is to be said of the task
     study, line = SharedStudy(directory, question), shlex.join(["csac", "tune", *arguments])
     console = make_console()
@@ -52,6 +59,15 @@ def run_tune(question: Question, directory: Path, trials: int, groups: int | Non
         )
         return 128 + stopped.signal_number
     return 0 if study.best() else 3
+
+
+def _check_groups(groups: int | None, seeds: int) -> None:
+    """Raise InputError for what every trial would be refused for."""
+    if groups is None:
+        return
+    check_whole("groups", groups, 1, MOST_SEEDS)
+    if groups > seeds:
+        raise InputError(f"groups must be at most as many as seeds, {seeds}, not {groups}: each needs one")
 
 
 def _conclude(study: SharedStudy, line: str, console: Console) -> None:

@@ -400,8 +400,9 @@ def test_a_search_begins_with_the_preset_that_learns_its_entropy_weight(monkeypa
 
 
 def test_a_trial_is_trained_as_the_command_says(monkeypatch):
-    fake = FakeTrain(constant)
+    fake, devices = FakeTrain(constant), []
     monkeypatch.setattr(training, "train", fake)
+    monkeypatch.setattr("csac.training.devices.choose_device", devices.append)
     line = f"tune probes:Endless-v0 {TINY} --search discount --trials 1 --steps 90 --seeds 3 --first-seed 7 --groups 2 "
     line += "--device gpu --evaluation-interval 30 --evaluation-episodes 4 --checkpoint-interval 40 "
     line += "--keep-checkpoints 1 --directory out --env-kwargs '{\"length\": 5}'"
@@ -427,6 +428,7 @@ def test_a_trial_is_trained_as_the_command_says(monkeypatch):
             "command": f"csac {line}",
         }
     ]
+    assert devices == ["gpu"]
 
 
 # What it leaves.
@@ -577,6 +579,8 @@ def test_a_signal_is_an_exit_code_and_the_line_to_type(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
+        (f"{LINE} --groups 0", "groups must be a whole number of at least 1, not 0"),
+        (f"{LINE} --groups 5", "groups must be at most as many as seeds, 2, not 5: each needs one"),
         (f"{LINE} --trials 0", "trials must be a whole number of at least 1, not 0"),
         (LINE.replace("ActionReward", "ActionRewrad"), "no task is called probes:ActionRewrad-v0"),
         (LINE.replace("actor_learning_rate", "actor_learning_rat"), "did you mean actor_learning_rate?"),
@@ -599,6 +603,16 @@ def test_mistakes_are_told_in_one_line(capsys, tmp_path, line, message):
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["file"]
 
 
+def test_a_device_that_there_is_not_leaves_nothing_behind(monkeypatch, capsys, tmp_path):
+    def refuse(device):
+        raise InputError(f"no {device}")
+
+    monkeypatch.setattr("csac.training.devices.choose_device", refuse)
+    assert csac(f"{LINE} --device gpu") == 2
+    assert capsys.readouterr().err == "csac: no gpu\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_directory_of_another_question_is_refused(monkeypatch, capsys):
     monkeypatch.setattr(training, "train", FakeTrain(constant))
     assert csac(f"{LINE} --trials 1 --directory out") == 0
@@ -615,6 +629,21 @@ def test_a_directory_of_another_question_is_refused(monkeypatch, capsys):
         assert complaint.startswith("csac: out tunes another question: ")
         assert told in complaint
     assert Path("out/journal.log").read_bytes() == before
+
+
+def test_a_directory_whose_trials_could_not_begin_takes_another_question(search, tmp_path):
+    study = SharedStudy(tmp_path / "study", question())
+    first = study.next(10)
+    assert first is not None
+    with pytest.raises(InputError, match="tunes another question: discount is"):
+        SharedStudy(tmp_path / "study", question(("actor_learning_rate",)))  # while it is being run
+    study.drop(first)
+
+    other = search(constant, trials=2, asked=question(("actor_learning_rate",), steps=500))
+    assert [result.label for result in other.results()] == [0, 1]
+    assert other.results()[0].values == {"actor_learning_rate": 3e-4}
+    with pytest.raises(InputError, match="tunes another question"):
+        SharedStudy(tmp_path / "study", question())
 
 
 def test_a_damaged_journal_is_told(monkeypatch, capsys):
