@@ -25,7 +25,7 @@ from csac.studies.job import Ended, Job, Message, Stopped, is_over
 from csac.studies.named import NAMED
 from csac.studies.options import List, Report, Run, Show
 from csac.studies.progress import StudyProgress
-from csac.studies.refusals import refuse_as_results, refuse_file, refuse_unwritable
+from csac.studies.refusals import refuse_as_results, refuse_device, refuse_file, refuse_tasks, refuse_unwritable
 from csac.studies.results import Results, Runs, collect
 from csac.studies.study import Study, cells_of
 from csac.types import InputError
@@ -161,10 +161,13 @@ def run(options: Run) -> int:
         cells = [cells[options.cell]]
     every = _jobs(studies, cells, store, options)
     refuse_file(options.directory)
-    if options.results:
-        refuse_as_results(options.results, store)
     collected = _collected(studies, cells, options.results)
     jobs = [job for job in every if job.cell.key not in collected and not is_over(job)]
+    if jobs and options.engine != "ray":  # whose nodes may have what this machine has not
+        refuse_tasks(jobs)
+        refuse_device(options.device, beside=engine is not run_here)
+    if options.results:
+        refuse_as_results(options.results, store)
     if jobs:
         refuse_unwritable(options.directory)
     if options.results:

@@ -11,7 +11,7 @@ from rich.console import Console
 from studying import TINY, cell, make_run, write
 
 from csac.cli import main
-from csac.studies import commands
+from csac.studies import commands, refusals
 from csac.studies.calibration import Calibration, Cost, predict
 from csac.studies.cells import HOME, Cell, Store, write_history
 from csac.studies.collected import ROLLOUTS
@@ -381,12 +381,85 @@ def test_rollouts_are_asked_of_the_cells_that_need_them(engine):
     assert [job.rollouts for job in engine] == [100]
 
 
-def test_a_cell_that_fails_is_an_exit_code_and_a_reason(tmp_path, capsys):
+def test_a_cell_that_fails_is_an_exit_code_and_a_reason(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(commands, "refuse_tasks", lambda jobs: None)  # as where a task is lost meanwhile
     write(tmp_path / "wrong.toml", TINY.replace("Hopper-v4", "nowhere:Hop-v4").replace("seeds = 2", "seeds = 1"))
     assert csac("study run wrong.toml --engine local") == 3
     last = capsys.readouterr().out.splitlines()[-2:]
     assert last[0].startswith("failed: SAC on nowhere:Hop-v4, seed 0: nowhere:Hop-v4: the module nowhere")
     assert last[1] == "1 cells: 1 failed"
+
+
+WRONG_TASKS = [
+    (("Hopper-v4", "CartPole-v1"), "CartPole-v1: the action space is Discrete(2)"),
+    (("Hopper-v4", "nowhere:Hop-v4"), "nowhere:Hop-v4: the module nowhere cannot be imported: "),
+    (("seeds = 2", "seeds = 2\nenvironment_arguments = {gg = 1}"), "Hopper-v4 could not be made with the arguments"),
+    (
+        ('tasks = ["Hopper-v4"]', 'tasks = ["Pendulum-v1"]\nconditions = [["friction=2@10"], ["gravity=2@10"]]'),
+        "Pendulum-v1 is no MuJoCo task",
+    ),
+]
+
+
+@pytest.mark.parametrize("option", ["--engine local", "--engine processes", "--cell 1"])
+@pytest.mark.parametrize(("change", "message"), WRONG_TASKS)
+def test_a_task_that_cannot_be_made_here_is_refused_before_anything_is_written(
+    engine, capsys, tmp_path, change, message, option
+):
+    write(tmp_path / "tiny.toml", TINY.replace(*change))
+    assert csac(f"study run tiny.toml {option} --results out") == 2
+    (complaint,) = capsys.readouterr().err.splitlines()
+    assert message in complaint
+    assert not engine
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.toml"]
+
+
+def test_where_one_task_cannot_be_made_it_is_said_how_to_run_the_others(engine, capsys, tmp_path):
+    write(tmp_path / "tiny.toml", TINY.replace('"Hopper-v4"', '"Hopper-v4", "nowhere:Hop-v4", "Ant-v4"'))
+    assert csac("study run tiny.toml") == 2
+    complaint = capsys.readouterr().err
+    assert complaint.endswith("No module named 'nowhere'; to run the others, add --tasks Hopper-v4,Ant-v4\n")
+    assert csac("study run tiny.toml --tasks Hopper-v4,Ant-v4") == 0
+    assert len(engine) == 4
+
+
+def test_a_task_is_made_once_whatever_its_methods_and_seeds_and_not_for_what_is_final(engine, monkeypatch, tmp_path):
+    made = []
+
+    class Noted(refusals.Environment):
+        def __init__(self, task, arguments):
+            made.append(task)
+            super().__init__(task, arguments)
+
+    monkeypatch.setattr(refusals, "Environment", Noted)
+    second = '[[methods]]\nalgorithm = "td3"\n'
+    write(tmp_path / "tiny.toml", TINY.replace('["Hopper-v4"]', '["Hopper-v4", "Walker2d-v4"]') + second)
+    for one in cells_of([read_study("tiny.toml")]):
+        if one.task == "Hopper-v4":
+            finished(Store(), one)
+    assert csac("study run tiny.toml") == 0
+    assert made == ["Walker2d-v4"]
+    assert csac("study show tiny.toml --no-measure") == 0
+    assert csac("study report tiny.toml --out report") == 0
+    assert made == ["Walker2d-v4"]
+
+
+def test_a_task_that_ray_s_nodes_may_have_is_not_looked_for_here(monkeypatch, tmp_path):
+    write(tmp_path / "far.toml", TINY.replace("Hopper-v4", "nowhere:Hop-v4"))
+    given = []
+    monkeypatch.setattr("csac.studies.cluster.run_on_ray", lambda jobs, tell, **_: given.extend(jobs))
+    assert csac("study run far.toml --engine ray") == 0
+    assert len(given) == 2
+
+
+@pytest.mark.parametrize("name", ["local", "processes"])
+def test_a_device_that_there_is_not_is_refused_before_anything_is_written(engine, capsys, tmp_path, monkeypatch, name):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert csac(f"study run tiny.toml --engine {name} --device gpu") == 2
+    (complaint,) = capsys.readouterr().err.splitlines()
+    assert "choose the cpu" in complaint or "train on the gpu in a new one" in complaint
+    assert not engine
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.toml"]
 
 
 def test_a_signal_is_an_exit_code_and_the_line_to_type(monkeypatch, capsys):
