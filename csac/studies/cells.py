@@ -194,6 +194,14 @@ def is_final(path: Path) -> bool:
     return False
 
 
+def restarting_seeds(path: Path) -> tuple[int, ...]:
+    """Return the seeds that restart their episode where this run goes on: its checkpoint could not hold it."""
+    with suppress(InputError):
+        if is_run(path) and (manifest := RunDirectory.open(path).manifest).last_checkpoint:
+            return manifest.inexact_seeds
+    return ()
+
+
 def complete(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Return every hyperparameter of an algorithm: those given, and the defaults of the others.
 

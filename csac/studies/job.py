@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from csac.record.csv_tables import COLUMNS, read_rows, write_rows
 from csac.record.run import RunDirectory
-from csac.studies.cells import Cell, is_final, is_in_use, read_history, write_history
+from csac.studies.cells import Cell, is_final, is_in_use, read_history, restarting_seeds, write_history
 from csac.studies.collected import ROLLOUTS
 from csac.tasks.perturbations import Perturbation, perturbations_of, values_at
 from csac.types import InputError
@@ -64,7 +64,15 @@ class Ended:
     reason: str = ""
 
 
-Message = Started | Advanced | Ended
+@dataclass(frozen=True)
+class Noted:
+    """What the user should know of a cell that is being run: what it does."""
+
+    key: str
+    text: str
+
+
+Message = Started | Advanced | Noted | Ended
 
 
 class Stopped(Exception):
@@ -138,6 +146,8 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
     from csac.training.train import train
 
     cell = job.cell
+    if restarting_seeds(job.path):
+        tell(Noted(cell.key, "restarts the episode in progress, which the checkpoint could not hold"))
     return train(
         cell.make_algorithm(),
         cell.task,

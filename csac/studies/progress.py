@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from csac.console.tables import duration, make_console, number, short
-from csac.studies.job import Advanced, Ended, Message, Started
+from csac.studies.job import Advanced, Ended, Message, Noted, Started
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -80,6 +80,8 @@ class StudyProgress:
             self._steps[message.key] = message.step
             if row := self._running.get(message.key):
                 row.step, row.mean_return = message.step, message.mean_return
+        elif isinstance(message, Noted):
+            self._say(f"note: {self._labels[message.key]} {message.text}")
         else:
             self._end(message)
 

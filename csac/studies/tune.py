@@ -14,6 +14,7 @@ import numpy as np
 from csac.checks import check_whole
 from csac.record.run import RunDirectory, is_run
 from csac.record.statistics import evaluation_matrix, last_evaluations
+from csac.studies.cells import restarting_seeds
 from csac.studies.job import Stopped
 from csac.studies.shared_study import POINTS
 from csac.tasks.seeds import TUNING_EVALUATION_SEED
@@ -21,7 +22,7 @@ from csac.training.interruptions import signals_noted
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from csac.studies.shared_study import Attempt, Result, SharedStudy
 
@@ -34,6 +35,9 @@ class Watcher:
 
     def begins(self, attempt: Attempt, step: int) -> None:
         """A trial begins, or goes on from a step."""
+
+    def restarts(self, attempt: Attempt, seeds: Sequence[int]) -> None:
+        """The trial goes on without the episodes that these seeds were in, which its checkpoint could not hold."""
 
     def advanced(self, step: int, objective: float) -> None:
         """The trial was evaluated: so much it has of the objective so far."""
@@ -74,6 +78,8 @@ def _run(study: SharedStudy, attempt: Attempt, watcher: Watcher, options: dict[s
     question = study.question
     points = _points_before(attempt.path)
     watcher.begins(attempt, max(points, default=0))
+    if seeds := restarting_seeds(attempt.path):
+        watcher.restarts(attempt, seeds)
     for step in points:
         attempt.trial.report(_objective(points, step), step)
     is_pruned = False

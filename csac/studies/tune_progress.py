@@ -16,7 +16,7 @@ from csac.console.tables import duration, make_console, number, short
 from csac.studies.tune import Watcher
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from rich.console import Console, RenderableType
 
@@ -68,6 +68,13 @@ class TuneProgress(Watcher):
         self._label, self._step, self._objective = attempt.label, step, math.nan
         begins = f"goes on from step {step:,}" if step else "begins"
         self._print(Text(f"trial {attempt.label} {begins}: {written(attempt.values)}", "dim"))
+
+    def restarts(self, attempt: Attempt, seeds: Sequence[int]) -> None:
+        """Say which seeds go on inexactly."""
+        several = len(seeds) > 1
+        who = f"seed{'s' * several} {', '.join(map(str, seeds))} restart{'s' * (not several)}"
+        lost = "the episode in progress, which the checkpoint could not hold"
+        self._print(Text(f"note: trial {attempt.label}: {who} {lost}"))
 
     def advanced(self, step: int, objective: float) -> None:
         """Show how far the trial is."""

@@ -15,7 +15,7 @@ from csac.studies import commands, refusals
 from csac.studies.calibration import Calibration, Cost, predict
 from csac.studies.cells import HOME, Cell, Store, write_history
 from csac.studies.collected import ROLLOUTS
-from csac.studies.job import Ended, Started, Stopped
+from csac.studies.job import Ended, Noted, Started, Stopped
 from csac.studies.results import Results, Runs, collect
 from csac.studies.study import cells_of, read_study
 
@@ -315,6 +315,16 @@ def test_a_killed_cell_is_told_from_where_it_goes_on(engine, capsys):
     make_run(Store(), one, steps_done=290, last_checkpoint=200)
     csac("study run tiny.toml --seeds 1")
     assert "begins: SAC on Hopper-v4, seed 0, from step 200\n" in capsys.readouterr().out
+
+
+def test_what_a_cell_notes_is_told_with_its_name(monkeypatch, capsys):
+    def run(jobs, tell):
+        tell(Started(jobs[0].cell.key))
+        tell(Noted(jobs[0].cell.key, "restarts the episode in progress"))
+
+    monkeypatch.setattr(commands, "run_here", run)
+    assert csac("study run tiny.toml --engine local") == 0
+    assert "note: SAC on Hopper-v4, seed 0 restarts the episode in progress\n" in capsys.readouterr().out
 
 
 def test_what_another_machine_has_collected_stays_as_it_is(engine):

@@ -10,7 +10,7 @@ from csac.record.run import RunDirectory
 from csac.studies import engines
 from csac.studies.cells import Cell, Store, is_final
 from csac.studies.engines import run_here, run_in_processes, split_cores
-from csac.studies.job import Advanced, Ended, Started, Stopped
+from csac.studies.job import Advanced, Ended, Noted, Started, Stopped
 from csac.tasks.seeds import training_seed
 from csac.training.interruptions import caught_signals
 
@@ -101,6 +101,26 @@ def test_a_signal_saves_the_cell_and_leaves_the_rest(tmp_path, uninterrupted, ru
     assert 100 <= store.status(two[0].cell).steps < 300
     run_here(two[:1], lambda _: None)
     assert contents(two[0].path) == uninterrupted
+
+
+def test_a_cell_that_goes_on_inexactly_says_so_once(tmp_path):
+    (job,), messages = jobs(tmp_path, cell(task="Pendulum-v1")), []
+
+    def stop(message):
+        messages.append(message)
+        if isinstance(message, Advanced) and message.step == 100:  # in the middle of an episode of 200 steps
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Stopped):
+        run_here([job], stop)
+    assert not any(isinstance(message, Noted) for message in messages)
+    messages.clear()
+    run_here([job], messages.append)
+    told = [message for message in messages if isinstance(message, Noted)]
+    assert told == [
+        Noted(job.cell.key, "restarts the episode in progress, which the checkpoint could not hold"),
+    ]
+    assert outcomes(messages) == {job.cell.key: "complete"}
 
 
 @pytest.mark.parametrize("around", [caught_signals, nullcontext], ids=["its last step", "its test"])

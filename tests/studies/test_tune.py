@@ -577,6 +577,20 @@ def test_a_signal_is_an_exit_code_and_the_line_to_type(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
+    ("seeds", "told"), [((1_000, 1_001), "seeds 1000, 1001 restart"), ((1_001,), "seed 1001 restarts")]
+)
+def test_a_trial_that_goes_on_inexactly_says_so(monkeypatch, capsys, seeds, told):
+    monkeypatch.setattr(training, "train", FakeTrain(constant, stop_at=60))
+    assert csac(f"{LINE} --trials 1 --directory out") == 130
+    RunDirectory.open("out/trials/0000").update_manifest(inexact_seeds=seeds)
+    assert "note" not in capsys.readouterr().out
+    monkeypatch.setattr(training, "train", FakeTrain(constant))
+    assert csac(f"{LINE} --trials 1 --directory out") == 0
+    line = f"note: trial 0: {told} the episode in progress, which the checkpoint could not hold"
+    assert capsys.readouterr().out.splitlines().count(line) == 1
+
+
+@pytest.mark.parametrize(
     ("line", "message"),
     [
         (f"{LINE} --groups 0", "groups must be a whole number of at least 1, not 0"),
