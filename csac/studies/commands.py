@@ -19,7 +19,7 @@ from csac.console.tables import duration, make_console, program, short
 from csac.processes import usable_cores
 from csac.record.wandb import import_wandb
 from csac.studies.calibration import Calibration, Prediction, predict
-from csac.studies.cells import Cell, Store
+from csac.studies.cells import HOME, Cell, Store
 from csac.studies.engines import run_here, run_in_processes
 from csac.studies.job import Ended, Job, Message, Stopped, is_over
 from csac.studies.named import NAMED
@@ -77,6 +77,8 @@ def list_studies(_: List) -> int:
 
 def show(options: Show) -> int:
     """Print the cells of a study, one row for each."""
+    for directory in filter(None, (options.directory, options.results)):
+        refuse_file(directory)
     studies, store, console = options.studies(), Store(options.directory), make_console()
     cells, labels = cells_of(studies), labels_of(studies)
     collected = _collected(studies, cells, options.results)
@@ -104,6 +106,9 @@ def show(options: Show) -> int:
             str(store.path(cell).relative_to(store.root)),
         )
     console.print(table)
+    for directory in filter(None, (options.directory, options.results)):
+        if directory != HOME and not directory.exists():  # the other is made by the first run
+            _say(console, f"note: {directory} does not exist, so nothing in it is counted")
     console.print(f"{len(cells)} cells below {store.root}: {_counted(statuses.values())}", soft_wrap=True)
     if rest:
         console.print(_told(rest, predictions), soft_wrap=True)
@@ -225,6 +230,7 @@ def report(options: Report) -> int:
     """Write the report and print where it is."""
     from csac.studies.report import write_report  # matplotlib is slow to import
 
+    refuse_file(options.directory)
     studies, store, console = options.studies(), Store(options.directory), make_console()
     source = Results(options.results) if options.results else Runs(store)
     scale = f"-scale-{studies[0].scale:g}" if options.scale < 1 else ""
@@ -233,11 +239,24 @@ def report(options: Report) -> int:
     results = [] if options.results is None else ["--results", str(options.results)]
     place = [] if options.out is None else ["--out", str(options.out)]
     run, report = (["csac", "study", command, *chosen, *results] for command in ("run", "report"))
+    is_empty = not any(source.record(cell) for cell in cells_of(studies))
+    if is_empty:
+        _keep_report(folder, options.results or options.directory)
     path = write_report(studies, source, folder, [shlex.join(run), shlex.join([*report, *place])])
     _say(console, f"{path}\n{path.with_suffix('.md')}")
-    if not any(source.record(cell) for cell in cells_of(studies)):
+    if is_empty:
         _say(console, f"note: no cell is over yet in {options.results or options.directory}, so there is little in it")
     return 0
+
+
+def _keep_report(folder: Path, source: Path) -> None:
+    """Raise InputError where a report of nothing would replace another."""
+    for path in (folder / "report.html", folder / "report.md"):
+        if path.exists():
+            raise InputError(
+                f"no cell is over yet in {source}, and a report of that would replace {path}: "
+                "give another --directory, --results or --out"
+            )
 
 
 COMMANDS: Mapping[str, tuple[type, Any]] = {

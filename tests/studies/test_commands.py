@@ -296,6 +296,34 @@ def test_show_counts_as_run_does(engine, capsys):
     assert [job.cell for job in engine] == [other]
 
 
+@pytest.mark.parametrize("option", ["--directory", "--results"])
+def test_show_refuses_a_file_and_says_what_does_not_exist(capsys, option):
+    assert csac(f"study show tiny.toml --no-measure {option} tiny.toml") == 2
+    assert capsys.readouterr().err == "csac: tiny.toml is a file; choose another directory\n"
+    assert csac(f"study show tiny.toml --no-measure {option} nowhere") == 0
+    assert capsys.readouterr().out.count("note: nowhere does not exist, so nothing in it is counted\n") == 1
+    Path("nowhere").mkdir()
+    assert csac(f"study show tiny.toml --no-measure {option} nowhere") == 0
+    assert csac("study show tiny.toml --no-measure") == 0
+    assert "note: " not in capsys.readouterr().out
+
+
+def test_a_report_of_nothing_replaces_no_other(capsys):
+    assert csac("study report tiny.toml --out out") == 0, "there is none yet"
+    finished(Store(), cells_of([read_study("tiny.toml")])[0])
+    assert csac("study report tiny.toml --out out") == 0
+    before = Path("out/report.md").read_bytes()
+    capsys.readouterr()
+    assert csac("study report tiny.toml --out out --directory nowhere") == 2
+    assert capsys.readouterr().err == (
+        "csac: no cell is over yet in nowhere, and a report of that would replace out/report.html: "
+        "give another --directory, --results or --out\n"
+    )
+    assert Path("out/report.md").read_bytes() == before
+    assert csac("study report tiny.toml --directory tiny.toml") == 2
+    assert capsys.readouterr().err == "csac: tiny.toml is a file; choose another directory\n"
+
+
 def test_show_says_that_it_measures_before_it_does(engine, monkeypatch, capsys):
     told = []
 
