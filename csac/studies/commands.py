@@ -53,6 +53,7 @@ The paper's experiments, and your own, as studies: tasks x methods x seeds, one 
 NAME may also be a TOML file of your own (docs/studies.md).
 To begin: csac study run smoke
 """
+MOST_NAMED = 5  # methods in a line
 STATE_STYLES = {"complete": "green", "running": "cyan", "partial": "yellow", "waiting": "dim", "failed": "red"}
 
 
@@ -106,6 +107,7 @@ def show(options: Show) -> int:
             str(store.path(cell).relative_to(store.root)),
         )
     console.print(table)
+    _tell_of_warmup(studies, cells, console)
     for directory in filter(None, (options.directory, options.results)):
         if directory != HOME and not directory.exists():  # the other is made by the first run
             _say(console, f"note: {directory} does not exist, so nothing in it is counted")
@@ -179,6 +181,7 @@ def run(options: Run) -> int:
         _collect_over(every, store, options.results, labels)
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     _say(console, _intention(studies, cells, statuses.values()), "bold")
+    _tell_of_warmup(studies, [job.cell for job in jobs], console)
     by_key = {cell.key: cell for cell in cells}
     done = {job.cell.key: store.first_step(job.cell) for job in jobs}
     progress = StudyProgress([job.cell for job in jobs], labels, done, console)
@@ -356,6 +359,19 @@ def _conclude(statuses: Mapping[str, Status], labels: Mapping[str, str], console
         _say(console, f"failed: {labels[key]}: {reason}", "red")
     _say(console, f"{len(statuses)} cells: {_counted(statuses.values())}")
     return 3 if failed else 0
+
+
+def _tell_of_warmup(studies: Iterable[Study], cells: Iterable[Cell], console: Console) -> None:
+    """Say which methods will learn nothing in these cells, since they end before the first update."""
+    keys, idle = {cell.key for cell in cells}, dict[str, None]()
+    for study in studies:
+        for method, _, cell in study.entries():
+            if cell.key in keys and cell.steps < cell.make_algorithm().cadence.first_update:
+                idle[f"{method.label} on {cell.task}"] = None
+    if idle:
+        more = f" and {len(idle) - MOST_NAMED} more" if len(idle) > MOST_NAMED else ""
+        named = "; ".join(list(idle)[:MOST_NAMED])
+        _say(console, f"note: nothing will be learnt by {named}{more}: all steps come before the first update")
 
 
 def _counted(statuses: Iterable[Status]) -> str:

@@ -66,7 +66,7 @@ def refuse_tasks(jobs: Iterable[Job]) -> None:
             refused.setdefault(task, error)
     if refused:
         others = dict.fromkeys(task for task, _ in cells if task not in refused)
-        without = f"; to run the others, add --tasks {','.join(others)}" if others else ""
+        without = f" (--tasks {','.join(others)} runs the others)" if others else ""
         raise InputError(f"{next(iter(refused.values()))}{without}")
 
 

@@ -300,10 +300,10 @@ def test_show_counts_as_run_does(engine, capsys):
 def test_show_refuses_a_file_and_says_what_does_not_exist(capsys, option):
     assert csac(f"study show tiny.toml --no-measure {option} tiny.toml") == 2
     assert capsys.readouterr().err == "csac: tiny.toml is a file; choose another directory\n"
-    assert csac(f"study show tiny.toml --no-measure {option} nowhere") == 0
-    assert capsys.readouterr().out.count("note: nowhere does not exist, so nothing in it is counted\n") == 1
-    Path("nowhere").mkdir()
-    assert csac(f"study show tiny.toml --no-measure {option} nowhere") == 0
+    assert csac(f"study show tiny.toml --no-measure {option} absent") == 0
+    assert capsys.readouterr().out.count("note: absent does not exist, so nothing in it is counted\n") == 1
+    Path("absent").mkdir()
+    assert csac(f"study show tiny.toml --no-measure {option} absent") == 0
     assert csac("study show tiny.toml --no-measure") == 0
     assert "note: " not in capsys.readouterr().out
 
@@ -343,6 +343,24 @@ def test_a_killed_cell_is_told_from_where_it_goes_on(engine, capsys):
     make_run(Store(), one, steps_done=290, last_checkpoint=200)
     csac("study run tiny.toml --seeds 1")
     assert "begins: SAC on Hopper-v4, seed 0, from step 200\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["show idle.toml --no-measure", "run idle.toml"])
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ("", ["; ".join(f"idle {k} on Hopper-v4" for k in range(5)) + " and 1 more"]),
+        ("--algorithms 'idle 3,SAC'", ["idle 3 on Hopper-v4"]),
+        ("--algorithms SAC", []),
+    ],
+)
+def test_methods_that_are_all_warm_up_are_told_in_one_line(engine, capsys, tmp_path, command, options, named):
+    idle = "[[methods]]\nlabel = 'idle {0}'\nalgorithm = 'td3'\nhyperparameters = {{ warmup_steps = 30{0} }}\n"
+    last = idle.format(0).replace("300", "307")  # a warm-up of 300 steps leaves the last one to learn from
+    write(tmp_path / "idle.toml", TINY + last + "".join(idle.format(k) for k in range(1, 6)))
+    assert csac(f"study {command} {options}") == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert told == [f"note: nothing will be learnt by {one}: all steps come before the first update" for one in named]
 
 
 def test_what_a_cell_notes_is_told_with_its_name(monkeypatch, capsys):
@@ -456,7 +474,7 @@ def test_where_one_task_cannot_be_made_it_is_said_how_to_run_the_others(engine, 
     write(tmp_path / "tiny.toml", TINY.replace('"Hopper-v4"', '"Hopper-v4", "nowhere:Hop-v4", "Ant-v4"'))
     assert csac("study run tiny.toml") == 2
     complaint = capsys.readouterr().err
-    assert complaint.endswith("No module named 'nowhere'; to run the others, add --tasks Hopper-v4,Ant-v4\n")
+    assert complaint.endswith("No module named 'nowhere' (--tasks Hopper-v4,Ant-v4 runs the others)\n")
     assert csac("study run tiny.toml --tasks Hopper-v4,Ant-v4") == 0
     assert len(engine) == 4
 
