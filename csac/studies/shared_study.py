@@ -194,10 +194,14 @@ class SharedStudy:
 
     def results(self) -> list[Result]:
         """Return every trial, in order; one that was taken up again stands there once."""
-        found = {}
+        found, before = {}, {}
         for trial in self._all():
-            if "trial" in trial.user_attrs and trial.state.name != "FAIL":  # whose configuration is queued again
-                found[_label(trial)] = _result(trial)
+            if "trial" not in trial.user_attrs:
+                continue
+            if trial.state.name != "FAIL":
+                found[_label(trial)] = _result(trial, before.get(_label(trial), {}))
+            elif trial.intermediate_values:  # whose configuration is queued again
+                before[_label(trial)] = trial.intermediate_values
         return [found[label] for label in sorted(found)]
 
     def best(self) -> Result | None:
@@ -343,10 +347,12 @@ def _label(trial: optuna.trial.FrozenTrial) -> int:
     return trial.user_attrs.get("trial", -1)
 
 
-def _result(trial: optuna.trial.FrozenTrial) -> Result:
-    facts, last = trial.user_attrs, trial.last_step
+def _result(trial: optuna.trial.FrozenTrial, before: Mapping[int, float]) -> Result:
+    """Return what has become of a trial; one that waits to go on is as far as it was `before`, by its evaluations."""
+    facts, values = trial.user_attrs, trial.intermediate_values or before
     state: Any = "failed" if "failure" in facts else trial.state.name.lower()
-    value = trial.value if trial.value is not None else None if last is None else trial.intermediate_values[last]
+    last = max(values, default=None)
+    value = trial.value if trial.value is not None else None if last is None else values[last]
     returns = {int(seed): value for seed, value in facts.get("returns", {}).items()}
     objective = math.nan if value is None else float(value)
     return Result(

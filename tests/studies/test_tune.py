@@ -230,6 +230,8 @@ def test_a_signal_leaves_a_trial_to_be_gone_on_with(search):
         search(lambda algorithm, seed, step: step / 100, trials=3, stop_at=400)
     assert stopped.value.signal_number == signal.SIGINT
     assert search.told.begun == [(0, 0)]
+    (waiting,) = SharedStudy(search.directory, question()).results()
+    assert (waiting.state, waiting.step, waiting.objective) == ("waiting", 400, 3.0)  # 2, 3 and 4
 
     study = search(lambda algorithm, seed, step: step / 100, trials=3)
     assert search.told.begun == [(0, 400), (1, 0), (2, 0)]
@@ -271,6 +273,7 @@ def test_a_trial_whose_process_died_is_taken_up_and_one_that_is_run_is_not(tmp_p
     assert another is not None
     assert another.label == 2
     assert [result.state for result in mine.results()] == ["running"] * 3
+    assert {result.step for result in mine.results()} == {0}
     # Lost once more, it is still one trial of the three that there are to be.
     again.lock.close()
     third = mine.next(3)
