@@ -224,7 +224,7 @@ def similar(word: str, known: Iterable[str]) -> str:
     """Return what resembles `word` most, or else all there is, as the end of a sentence."""
     known = list(known)
     hint = did_you_mean(word, known)
-    return f"; {hint}" if hint else f": there is {', '.join(known)}"
+    return f"; {hint}" if hint else f": there is {', '.join(repr(one) if ',' in one else one for one in known)}"
 
 
 def is_in_use(path: Path) -> bool:

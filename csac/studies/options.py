@@ -19,11 +19,14 @@ if TYPE_CHECKING:
 
 
 def _split(text: str, known: Collection[str]) -> list[str]:
-    """Return the names in a text with commas between them; a name that is known may have commas itself."""
+    """Return the names in a text with commas between them; a name that is known may have commas itself.
+
+    Blanks around a name are none of its own.
+    """
     words, names = text.split(","), []
     while words:
-        count = next((n for n in range(len(words), 0, -1) if ",".join(words[:n]) in known), 1)
-        names.append(",".join(words[:count]))
+        count = next((n for n in range(len(words), 0, -1) if ",".join(words[:n]).strip() in known), 1)
+        names.append(",".join(words[:count]).strip())
         del words[:count]
     return names
 
@@ -49,7 +52,7 @@ class Chosen:
         """Return the studies that are meant."""
         studies = [study.shortened(self.scale) for study in find(self.name)]
         names = {name for study in studies for name in study.names}
-        tasks = None if self.tasks is None else self.tasks.split(",")
+        tasks = None if self.tasks is None else [word.strip() for word in self.tasks.split(",")]
         algorithms = None if self.algorithms is None else _split(self.algorithms, names)
         return narrowed(studies, tasks, algorithms, self.seeds)
 

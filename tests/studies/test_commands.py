@@ -409,9 +409,11 @@ def test_one_cell_of_an_array(engine):
     assert [job.cell.seed for job in engine] == [1]
 
 
-def test_a_method_whose_name_has_a_comma_is_found(engine):
-    assert csac("study run reference --tasks Hopper-v4 --algorithms 'SAC, 0.2,SAC, automatic' --seeds 1") == 0
-    assert sorted(job.cell.hyperparameters["temperature"] for job in engine) == ["automatic", "fixed"]
+@pytest.mark.parametrize("names", ["SAC, 0.2,SAC, automatic", " SAC, 0.2 , SAC, automatic "])
+def test_a_method_whose_name_has_a_comma_is_found(engine, names):
+    assert csac(f"study run reference --tasks 'Hopper-v4, Walker2d-v4' --algorithms '{names}' --seeds 1") == 0
+    assert sorted(job.cell.hyperparameters["temperature"] for job in engine) == ["automatic"] * 2 + ["fixed"] * 2
+    assert {job.cell.task for job in engine} == {"Hopper-v4", "Walker2d-v4"}
 
 
 def test_what_is_narrowed_is_run(engine):
@@ -544,6 +546,10 @@ def test_a_signal_is_an_exit_code_and_the_line_to_type(monkeypatch, capsys):
         ("study run tiny.toml --engine ray --cell-cores 0", "--cell-cores is at least 1"),
         ("study run tiny.toml --scale 2", "scale is a share of the steps"),
         ("study run tiny.toml --tasks Ant-v4", "tiny: no task 'Ant-v4': there is Hopper-v4"),
+        (
+            "study run reference --algorithms ppo",
+            "'ppo': there is sac, 'SAC, 0.2', 'SAC, automatic', csac, 'CSAC, paper'",
+        ),
         ("study run smoke --tasks Swimmer-v4", "no task 'Swimmer-v4'"),
         (
             "study run smoke --tasks Hopper-v4 --algorithms 'CSAC (paper), tau 0.5'",
