@@ -55,8 +55,23 @@ def read_collected(path: Path) -> Record:
         manifest, fields = manifests.read(content), json.loads(content)
     except (InputError, OSError) as error:
         raise InputError(f"{path} is not a cell's: {error}") from None
-    tables = read_rows(path.with_suffix(".csv")), read_rollouts(rollouts_of(path))
+    tables = _read_evaluations(path, manifest), read_rollouts(rollouts_of(path))
     return Record(manifest, fields.get("seconds", 0.0), *tables, fields.get("interrupted"))
+
+
+def _read_evaluations(path: Path, manifest: Manifest) -> np.ndarray:
+    """Return the returns of a cell. Raises InputError where they are missing, or end before a finished run did."""
+    table = path.with_suffix(".csv")
+    if not table.exists():
+        raise InputError(f"{table} is missing: restore it, or remove {path.name} too, and the cell is run again")
+    rows = read_rows(table)
+    is_cut = manifest.state == "finished" and not (rows["step"] >= manifest.steps_done).any()
+    if is_cut or "return" not in (rows.dtype.names or ()):
+        what = f"no evaluation of step {manifest.steps_done:,}" if is_cut else "no returns"
+        raise InputError(
+            f"{table} is damaged, as it has {what}: restore it, or remove it and {path.name}, and the cell is run again"
+        )
+    return rows
 
 
 def rollouts_of(path: Path) -> Path:

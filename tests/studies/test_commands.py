@@ -385,6 +385,32 @@ def test_what_another_machine_has_collected_stays_as_it_is(engine):
     assert not engine
 
 
+@pytest.mark.parametrize(
+    ("table", "complaint"),
+    [
+        ("seed,step,xx\n", "is damaged, as it has no evaluation of step 300: restore it, or remove it and seed-0.json"),
+        ("", "is damaged, as it has no evaluation of step 300: restore it, or remove it and seed-0.json"),
+        ("seed,step,return\n0,200,1\n", "is damaged, as it has no evaluation of step 300: "),
+        ("seed,step,xx\n0,300,1\n", "is damaged, as it has no returns: "),
+        (None, "is missing: restore it, or remove seed-0.json too, and the cell is run again\n"),
+    ],
+)
+@pytest.mark.parametrize("command", ["show tiny.toml --no-measure", "run tiny.toml", "report tiny.toml"])
+def test_a_collected_table_that_is_damaged_is_not_a_complete_cell(engine, capsys, command, table, complaint):
+    (one,) = cells_of([read_study("tiny.toml")])[:1]
+    finished(Store("there"), one)
+    collect(Store("there"), one, "out")
+    path = Path("out/cells", one.name).with_suffix(".csv")
+    path.unlink()
+    if table is not None:
+        path.write_text(table)
+    assert csac(f"study {command} --results out") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"csac: {path} {complaint}")
+    assert error.count("\n") == 1
+    assert not engine
+
+
 def test_a_cell_that_failed_before_its_first_evaluation_is_collected_and_over(engine):
     (one,) = cells_of([read_study("tiny.toml")])[:1]
     make_run(Store(), one, steps_done=20, state="failed", failures={0: "step 20: the actor is not finite"})

@@ -3,6 +3,7 @@
 import re
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -129,7 +130,7 @@ def collected(place, returns, rollouts="", **changes):
         run = make_run_of(f"made/{place}/{seed}", [line], seeds=(seed,), **changes)
         path = Path(place, f"seed-{seed}.json")
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(manifests.written(run.manifest))
+        path.write_bytes(manifests.written(replace(run.manifest, steps_done=10 * len(line))))
         path.with_suffix(".csv").write_bytes((run.path / "evaluations.csv").read_bytes())
         if rollouts:
             path.with_name(f"seed-{seed}.rollouts.csv").write_text(f"{ROWS},crash\n" + rollouts.format(seed=seed))
@@ -142,8 +143,8 @@ def test_collected_cells_are_the_runs_that_they_were():
     # (10 + 20) / 2 = 15 and (30 + 40) / 2 = 35
     assert table_of("--label it=cells/Hopper-v4/sac")[2].startswith("| it | 2 | 20 | 25 ± 14 |")
     text = report("cells")
-    assert "| cells/Hopper-v4/sac/seed-1.csv | Hopper-v4 | sac | 1 | 100 | finished |" in text
-    assert "| cells/Ant-v4/sac/seed-0.csv | Ant-v4 | sac | 0 | 100 | finished |" in text
+    assert "| cells/Hopper-v4/sac/seed-1.csv | Hopper-v4 | sac | 1 | 20 | finished |" in text
+    assert "| cells/Ant-v4/sac/seed-0.csv | Ant-v4 | sac | 0 | 20 | finished |" in text
     assert "| SAC | 2 | 20 | 25 ± 14 |" in text
 
 
