@@ -195,17 +195,30 @@ def read_study(path: str | Path) -> Study:
     """
     path = Path(path)
     try:
-        told = tomllib.loads(path.read_text(encoding="utf-8"))
+        told = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # of the text, of TOML, of numbers and nests that are too long
         raise InputError(f"{path} is not TOML: {error}") from None
     try:
         study = _study(path.stem, told)
-        study.entries()
+        _refuse_twins(study)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return study
+
+
+def _refuse_twins(study: Study) -> None:
+    """Make every cell. Raises InputError for one that cannot be, and for two methods that are the same runs."""
+    cells: dict[str, list[Cell]] = {}
+    for method, _, cell in replace(study, seeds=1).entries():
+        cells.setdefault(method.label, []).append(cell)
+    seen: dict[tuple[str, ...], str] = {}
+    for label, several in cells.items():
+        keys = tuple(cell.key for cell in several)
+        if keys in seen:
+            raise InputError(f"the methods {seen[keys]!r} and {label!r} are the same: leave one of them out")
+        seen[keys] = label
 
 
 def _study(name: str, told: dict[str, Any]) -> Study:
@@ -221,8 +234,8 @@ def _study(name: str, told: dict[str, Any]) -> Study:
     for key, (least, most) in _RANGES.items():
         if key in values:
             _check_range(key, values[key], least, most)
-    written = [tuple(map(str, perturbations_of(one))) for one in values.get("conditions", ())]
-    for key, items in (("tasks", values["tasks"]), ("conditions", written)):
+    written = [list(map(str, perturbations_of(one))) for one in values.get("conditions", ())]
+    for key, items in (("tasks", list(map(repr, values["tasks"]))), ("conditions", list(map(json.dumps, written)))):
         if twice := _twice(items):
             raise InputError(f"{key} has {twice} twice: its runs would count twice")
     check_events(values.get("events", ()))
@@ -234,14 +247,17 @@ def _study(name: str, told: dict[str, Any]) -> Study:
         _check_range(f"steps_on.{task}", steps, 1, STEPS_LIMIT)
     _some(values.get("analyses", ()), ANALYSES, "analyses: there is no")
     labels = [method.label for method in values["methods"]]
-    if twice := _twice(labels):
+    for label in labels:
+        if not label.strip() or not label.isprintable():
+            raise InputError(f"{label!r} is no label: it is a line of text")
+    if twice := _twice(list(map(repr, labels))):
         raise InputError(f"two methods are called {twice}: give each a label of its own")
     return Study(**{"name": name, "title": name, **values})
 
 
-def _twice(items: Sequence[Any]) -> str | None:
-    """Return the first of the items that is there again, as Python writes it."""
-    return next((repr(item) for item, count in Counter(items).items() if count > 1), None)
+def _twice(items: Iterable[str]) -> str | None:
+    """Return the first of the items that is there again."""
+    return next((item for item, count in Counter(items).items() if count > 1), None)
 
 
 def _check_range(key: str, value: int, least: int, most: int) -> None:

@@ -134,6 +134,11 @@ def test_a_toml_file_is_a_study(tmp_path):
     assert first.hyperparameters["actor_hidden_sizes"] == (8, 8)
 
 
+def test_a_file_that_begins_with_a_byte_order_mark_is_read(tmp_path):
+    path = write(tmp_path / "mine.toml", f"\ufeff{TINY}")
+    assert read_study(path).seeds == 2
+
+
 def test_a_sweep_is_a_method_for_each_combination(tmp_path):
     text = (
         TINY.replace('"sac"', '"csac"') + "[methods.sweep]\nrelative_entropy_weight = [0.5, 5]\nbatch_size = [4, 8]\n"
@@ -189,13 +194,19 @@ def test_what_methods_have_in_common_gives_way_to_presets_and_to_their_own(tmp_p
         (("seeds = 2", 'steps_on = {"Hopper-v5" = 10}'), "the study has no task 'Hopper-v5'; did you mean Hopper-v4?"),
         (("replay_size = 150", "[[methods]]\nlabel = 'SAC'\nalgorithm = 'sac'"), "two methods are called 'SAC'"),
         (('tasks = ["Hopper-v4"]', 'tasks = ["Hopper-v4", "Hopper-v4"]'), "tasks has 'Hopper-v4' twice"),
-        (("seeds = 2", "conditions = [[], []]"), "conditions has () twice"),
+        (("seeds = 2", "conditions = [[], []]"), "conditions has [] twice"),
         (
             ("seeds = 2", "conditions = [['friction=2@10'], ['friction=2.0@1e1']]"),
-            "conditions has ('friction=2@10',) twice: its runs would count twice",
+            'conditions has ["friction=2@10"] twice: its runs would count twice',
         ),
         (("seeds = 2", "steps_on = {'Hopper-v4' = 5_000_000_000}"), "steps_on.Hopper-v4 must be at most"),
         (("seeds = 2", "seeds = 2\nfirst_seed = 4294967295"), "the last seed would be 4,294,967,296"),
+        (
+            ("replay_size = 150", "[methods.sweep]\ndiscount = [0, 0.0]"),
+            "the methods 'SAC, discount 0' and 'SAC, discount 0.0' are the same: leave one of them out",
+        ),
+        (('label = "SAC"', 'label = " "'), "' ' is no label: it is a line of text"),
+        (('label = "SAC"', 'label = "SAC\\n2"'), "'SAC\\n2' is no label: it is a line of text"),
         (("seeds = 2", "seeds = 100_001"), "mine would have 100,001 cells, and 100,000 is the most: give fewer seeds"),
         (
             ("replay_size = 150", f"[methods.sweep]\nbatch_size = {[*range(400)]}\nreplay_size = {[*range(400)]}"),
