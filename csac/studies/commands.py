@@ -31,7 +31,7 @@ from csac.studies.study import Study, cells_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from rich.console import Console
 
@@ -111,7 +111,7 @@ def show(options: Show) -> int:
     for directory in filter(None, (options.directory, options.results)):
         if directory != HOME and not directory.exists():  # the other is made by the first run
             _say(console, f"note: {directory} does not exist, so nothing in it is counted")
-    console.print(f"{len(cells)} cells below {store.root}: {_counted(statuses.values())}", soft_wrap=True)
+    console.print(f"{_cells(len(cells))} below {store.root}: {_counted(statuses.values())}", soft_wrap=True)
     if rest:
         console.print(_told(rest, predictions), soft_wrap=True)
     return 0
@@ -210,7 +210,8 @@ def run(options: Run) -> int:
         for key, reason in not_collected.items():
             _say(console, f"not copied to {options.results}: {labels[key]}: {reason}; the same line copies it", "red")
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
-    code = _conclude(_with_failures(statuses, progress.outcomes), labels, console)
+    told = set(progress.outcomes) if len(jobs) == 1 else set[str]()  # of several, the lines are far apart
+    code = _conclude(_with_failures(statuses, progress.outcomes), labels, told, console)
     return 3 if not_collected else code
 
 
@@ -343,7 +344,7 @@ def _jobs(studies: Sequence[Study], cells: Sequence[Cell], store: Store, options
 
 def _intention(studies: Sequence[Study], cells: Sequence[Cell], statuses: Iterable[Status]) -> str:
     scale = f", at {studies[0].scale:g} of the steps" if studies[0].scale < 1 else ""
-    return f"{', '.join(study.name for study in studies)}{scale}: {len(cells)} cells, {_counted(statuses)}"
+    return f"{', '.join(study.name for study in studies)}{scale}: {_cells(len(cells))}, {_counted(statuses)}"
 
 
 def _with_failures(statuses: Mapping[str, Status], outcomes: Mapping[str, Ended]) -> dict[str, Status]:
@@ -352,13 +353,19 @@ def _with_failures(statuses: Mapping[str, Status], outcomes: Mapping[str, Ended]
     return {**statuses, **{key: statuses[key]._replace(state="failed", reason=failed[key]) for key in failed}}
 
 
-def _conclude(statuses: Mapping[str, Status], labels: Mapping[str, str], console: Console) -> int:
-    """Print what became of the cells, and return the exit code."""
+def _conclude(
+    statuses: Mapping[str, Status], labels: Mapping[str, str], told: Collection[str], console: Console
+) -> int:
+    """Print what became of the cells, but for failures that were `told` already, and return the exit code."""
     failed = {key: status.reason for key, status in statuses.items() if status.state == "failed"}
-    for key, reason in failed.items():
-        _say(console, f"failed: {labels[key]}: {reason}", "red")
-    _say(console, f"{len(statuses)} cells: {_counted(statuses.values())}")
+    for key in (key for key in failed if key not in told):
+        _say(console, f"failed: {labels[key]}: {failed[key]}", "red")
+    _say(console, f"{_cells(len(statuses))}: {_counted(statuses.values())}")
     return 3 if failed else 0
+
+
+def _cells(count: int) -> str:
+    return f"{count:,} cell{'s' * (count != 1)}"
 
 
 def _tell_of_warmup(studies: Iterable[Study], cells: Iterable[Cell], console: Console) -> None:

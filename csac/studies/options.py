@@ -49,7 +49,9 @@ class Chosen:
     """Directory of the runs of all cells."""
 
     def studies(self) -> list[Study]:
-        """Return the studies that are meant."""
+        """Return the studies that are meant. Raises InputError for what there is not."""
+        if self.seeds is not None and self.seeds < 1:
+            raise InputError(f"--seeds must be at least 1, not {self.seeds}")
         studies = [study.shortened(self.scale) for study in find(self.name)]
         names = {name for study in studies for name in study.names}
         tasks = None if self.tasks is None else [word.strip() for word in self.tasks.split(",")]

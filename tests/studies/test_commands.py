@@ -55,7 +55,7 @@ def test_list_has_every_study(capsys):
 
 def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
     assert csac("study run tiny.toml --engine local --seeds 1 --results out") == 0
-    assert "1 cells: 1 complete" in capsys.readouterr().out
+    assert "1 cell: 1 complete" in capsys.readouterr().out
     store, (one, other) = Store(), cells_of([read_study("tiny.toml")])
     assert [store.status(each).state for each in (one, other)] == ["complete", "waiting"]
     collected, made = Results("out").record(one), Runs(store).record(one)
@@ -74,7 +74,7 @@ def test_a_study_is_run_shown_collected_and_not_run_again(capsys, monkeypatch):
         states = re.findall(r" (complete|waiting) ", capsys.readouterr().out)
         assert states == ["complete", "waiting"]
     assert csac("study run tiny.toml --engine local --seeds 1 --directory another/machine --results out") == 0
-    assert "1 cells: 1 complete" in capsys.readouterr().out
+    assert "1 cell: 1 complete" in capsys.readouterr().out
     assert Results("out").status(one, rollouts=100) is None, "its policy was not tested yet"
 
 
@@ -469,9 +469,10 @@ def test_a_cell_that_fails_is_an_exit_code_and_a_reason(tmp_path, capsys, monkey
     monkeypatch.setattr(commands, "refuse_tasks", lambda jobs: None)  # as where a task is lost meanwhile
     write(tmp_path / "wrong.toml", TINY.replace("Hopper-v4", "nowhere:Hop-v4").replace("seeds = 2", "seeds = 1"))
     assert csac("study run wrong.toml --engine local") == 3
-    last = capsys.readouterr().out.splitlines()[-2:]
-    assert last[0].startswith("failed: SAC on nowhere:Hop-v4, seed 0: nowhere:Hop-v4: the module nowhere")
-    assert last[1] == "1 cells: 1 failed"
+    lines = capsys.readouterr().out.splitlines()
+    (told,) = [line for line in lines if line.startswith("failed: ")]
+    assert told.startswith("failed: SAC on nowhere:Hop-v4, seed 0: nowhere:Hop-v4: the module nowhere")
+    assert lines[-1] == "1 cell: 1 failed"
 
 
 WRONG_TASKS = [
@@ -562,6 +563,12 @@ def test_a_signal_is_an_exit_code_and_the_line_to_type(monkeypatch, capsys):
         ("study rnu mujoco", "no study command is called 'rnu'; did you mean run? (csac study --help)"),
         ("study run mojoco", "no study is called 'mojoco'; did you mean mujoco?"),
         ("study run tiny.toml --cell 2", "--cell counts from 0 to 1, not 2"),
+        ("study run tiny.toml --seeds 0", "csac: --seeds must be at least 1, not 0"),
+        ("study show mujoco --seeds 5_000_000_000", "the last seed would be 4,999,999,999: seeds are below"),
+        (
+            "study report mujoco --seeds 1_000_000_000",
+            "mujoco would have 24,000,000,000 cells, and 100,000 is the most",
+        ),
         ("study run tiny.toml --workers 0", "--workers must be at least 1, not 0"),
         ("study run tiny.toml --engine local --workers 2", "leave out --workers"),
         ("study run tiny.toml --engine ray --workers 3", "leave out --workers"),
