@@ -155,15 +155,20 @@ def _value(text: str) -> Any:
         ("reference", "ant", "CSAC, paper | **SAC, 0.2**", ["README.md"]),
         ("reference", "ant", "CSAC, previous | **SAC, 0.2**", ["README.md"]),
         ("reference", "ant", "CSAC, average 0.05 | **SAC, 0.2**", ["README.md"]),
+        ("reference", "recovery", "CSAC, previous | **SAC, 0.2**", []),
+        ("reference", "recovery", "CSAC, average 0.05 | **SAC, 0.2**", []),
     ],
 )
 def test_what_documents_tell_of_a_comparison_stands_in_its_table(name, mark, pair, documents):
     page = f"results/{name}/README.md"
     table = (ROOT / page).read_text().partition(f"<!-- {mark}: begin -->")[2].partition(f"<!-- {mark}: end -->")[0]
-    probability = re.search(rf"^\| {re.escape(pair)} \| (.*?) \|", table, re.MULTILINE)
-    assert probability is not None
+    row = re.search(rf"^\| {re.escape(pair)} \| (.*?) \| .*? \| (.*?) \|", table, re.MULTILINE)
+    assert row is not None
     for document in [*documents, page]:
-        assert probability[1] in _prose(document).replace("95 % interval ", "")
+        assert row[1] in _prose(document).replace("95 % interval ", "")
+    if pair.startswith("CSAC, previous | **"):  # of whose steadiness and recovery the verdict tells too
+        assert row[2] in _prose("README.md")
+        assert row[2] in _prose(page)
 
 
 def _prose(document: str) -> str:
