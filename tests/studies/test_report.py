@@ -166,6 +166,7 @@ published = "tau 0.5"
 label = "weight, most"
 algorithm = "csac"
 preset = "paper"
+hyperparameters = { relative_entropy_weight = 5.0 }
 published = "tau 50"
 [[methods]]
 label = "weight, learnt"
