@@ -16,9 +16,8 @@ from csac.studies.job import Stopped
 from csac.studies.shared_study import Question, SharedStudy, import_optuna
 from csac.studies.tune import MOST_TRIALS, tune
 from csac.studies.tune_progress import TuneProgress
-from csac.tasks.environment import Environment
-from csac.training.options import MOST_SEEDS
-from csac.types import InputError
+from csac.tasks.environment import Environment, try_arguments
+from csac.training.options import check_groups
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,10 +37,13 @@ def run_tune(question: Question, directory: Path, trials: int, groups: int | Non
     from csac.training.devices import choose_device  # JAX
 
     check_whole("trials", trials, 1, MOST_TRIALS)
-    _check_groups(groups, question.seeds)
+    if groups is not None:
+        check_groups(groups, question.seeds)
     import_optuna()
     choose_device(question.device)
-    Environment(question.task, question.environment_arguments).close()  # says what is to be said of the task
+    with closing(Environment(question.task, question.environment_arguments)) as environment:  # says what is to be said
+        if question.environment_arguments:
+            try_arguments(environment, question.environment_arguments)
     study, line = SharedStudy(directory, question), shlex.join(["csac", "tune", *arguments])
     console = make_console()
     stopped = None
@@ -59,15 +61,6 @@ def run_tune(question: Question, directory: Path, trials: int, groups: int | Non
         )
         return 128 + stopped.signal_number
     return 0 if study.best() else 3
-
-
-def _check_groups(groups: int | None, seeds: int) -> None:
-    """Raise InputError for what every trial would be refused for."""
-    if groups is None:
-        return
-    check_whole("groups", groups, 1, MOST_SEEDS)
-    if groups > seeds:
-        raise InputError(f"groups must be at most as many as seeds, {seeds}, not {groups}: each needs one")
 
 
 def _conclude(study: SharedStudy, line: str, console: Console) -> None:

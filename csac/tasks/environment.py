@@ -204,6 +204,20 @@ class Environment:
         return noisy
 
 
+def try_arguments(environment: Environment, arguments: Mapping[str, Any]) -> None:
+    """Make one step, as some tasks take an argument of any type and fail where they first use it. Raises InputError.
+
+    Any other failure is left to the run, whose log has the traceback that the author of a task looks for.
+    """
+    try:
+        environment.reset(0)
+        environment.step(np.zeros(environment.spec.action_size, np.float32))
+    except EnvironmentFailure as error:
+        if isinstance(error.__cause__, TypeError):
+            message = f"{environment.task_name} does not work with the arguments {dict(arguments)}: {error}"
+            raise InputError(message) from error
+
+
 def _space(environment: gymnasium.Env, name: Literal["observation_space", "action_space"]) -> gymnasium.Space:
     """Return a space of an environment. Raises InputError where there is none, or one of another package."""
     try:

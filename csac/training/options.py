@@ -105,6 +105,13 @@ def checked_options(given: PlanOptions, algorithm: Algorithm | None = None) -> t
     return Options(**simple), {name: value for name, value in given.items() if name not in names}
 
 
+def check_groups(groups: int, seeds: int) -> None:
+    """Raise InputError for what is no number of groups that this many seeds can fill."""
+    check_whole("groups", groups, 1, MOST_SEEDS)
+    if groups > seeds:
+        raise InputError(f"groups must be at most as many as seeds, {seeds}, not {groups}: each needs one")
+
+
 def _hint(name: str, algorithm: Algorithm | None) -> str:
     """Return ": ..." with what an option is called here, or what is most like it, or nothing."""
     known = PlanOptions.__annotations__

@@ -9,28 +9,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from csac.algorithms import ALGORITHMS
 from csac.checks import check_arguments, check_whole
 from csac.presets import matching_preset
 from csac.record.manifest import CheckpointPlan, EvaluationPlan, Manifest
 from csac.record.run import RunDirectory, is_run
-from csac.tasks.environment import Environment
+from csac.tasks.environment import Environment, try_arguments
 from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.seeds import EVALUATION_SEED, FIRST_TRAINING_SEED
-from csac.tasks.spaces import EnvironmentFailure
 from csac.tasks.trust import remember
 from csac.training.checkpoint import steps_in
 from csac.training.devices import choose_device
-from csac.training.options import MOST_SEEDS, Options, checked_options
+from csac.training.options import Options, check_groups, checked_options
 from csac.training.resume import Source, planned_perturbations, refuse_other_source
 from csac.training.scheduler import choose_evaluation_processes, choose_groups, split_seeds
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from csac.tasks.making import Task
     from csac.training.options import PlanOptions
@@ -151,7 +148,7 @@ def make_plan(
     with closing(Environment(task, arguments)) as environment:
         spec, task_name = environment.spec, environment.task_name
         if arguments:
-            _try_arguments(environment, arguments)
+            try_arguments(environment, arguments)
         remember(task)
         changes = planned_perturbations(asked, before.existing, before.source)
         if not before.existing:  # whose number of steps has its own refusal
@@ -188,20 +185,6 @@ def make_plan(
 _SEVERAL = ("several groups need", "groups=1")
 
 
-def _try_arguments(environment: Environment, arguments: Mapping[str, Any]) -> None:
-    """Make one step, as some tasks take an argument of any type and fail where they first use it. Raises InputError.
-
-    Any other failure is left to the run, whose log has the traceback that the author of a task looks for.
-    """
-    try:
-        environment.reset(0)
-        environment.step(np.zeros(environment.spec.action_size, np.float32))
-    except EnvironmentFailure as error:
-        if isinstance(error.__cause__, TypeError):
-            message = f"{environment.task_name} does not work with the arguments {dict(arguments)}: {error}"
-            raise InputError(message) from error
-
-
 def _choose_events(task: Task, given: Sequence[str] | None, before: Manifest | None) -> tuple[str, ...]:
     """Return the events asked for beside the task's own; without a word those of the run that this one continues."""
     if given is not None:
@@ -225,9 +208,7 @@ def _choose_parts(
         groups = len(existing.groups) or 1  # so that the numbers stay the same to the last bit
     if groups is None:
         groups = choose_groups(options.seeds, options.device) if can_be_sent else 1
-    check_whole("groups", groups, 1, MOST_SEEDS)
-    if groups > options.seeds:
-        raise InputError(f"groups must be at most as many as seeds, {options.seeds}, not {groups}: each needs one")
+    check_groups(groups, options.seeds)
     return tuple(tuple(part) for part in split_seeds(options.labels, groups))
 
 

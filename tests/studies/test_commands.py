@@ -480,6 +480,10 @@ WRONG_TASKS = [
     (("Hopper-v4", "nowhere:Hop-v4"), "nowhere:Hop-v4: the module nowhere cannot be imported: "),
     (("seeds = 2", "seeds = 2\nenvironment_arguments = {gg = 1}"), "Hopper-v4 could not be made with the arguments"),
     (
+        ('tasks = ["Hopper-v4"]', 'tasks = ["Pendulum-v1"]\nenvironment_arguments = {g = "a"}'),
+        "Pendulum-v1 does not work with the arguments {'g': 'a'}: step raised ",
+    ),
+    (
         ('tasks = ["Hopper-v4"]', 'tasks = ["Pendulum-v1"]\nconditions = [["friction=2@10"], ["gravity=2@10"]]'),
         "Pendulum-v1 is no MuJoCo task",
     ),

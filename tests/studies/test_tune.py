@@ -607,6 +607,7 @@ def test_a_trial_that_goes_on_inexactly_says_so(monkeypatch, capsys, seeds, told
         (f"{LINE} --directory full", "full is not empty and holds no study"),
         (f"{LINE} --directory full/file", "full/file is a file; choose another directory"),
         (f"{LINE} --sedes 2", "there is no option --sedes"),
+        ("""tune Pendulum-v1 --steps 20000 --env-kwargs '{"g": "a"}'""", "does not work with the arguments {'g': 'a'}"),
         ("tune X --algorithm ppo --rollout-steps 1000", "minibatches must divide rollout_steps into equal parts"),
     ],
 )
