@@ -28,8 +28,10 @@ def cells_so_far(arms: Sequence[Arm]) -> Iterator[Part]:
     done = sum(len(arm.manifests) for arm in arms)
     failed = sum(len(arm.failures) for arm in arms)
     missing = sum(len(arm.missing) for arm in arms)
-    text = f"{done} of {done + failed + missing} cells are complete"
-    yield Paragraph(text + f", {failed} failed" * bool(failed) + f", {missing} are not over" * bool(missing) + ".")
+    total = done + failed + missing
+    text = f"{done} of {total} {'cell is' if total == 1 else 'cells are'} complete"
+    unfinished = f", {missing} {'is' if missing == 1 else 'are'} not over"
+    yield Paragraph(text + f", {failed} failed" * bool(failed) + unfinished * bool(missing) + ".")
     if failed or missing:
         yield _grid(arms, _complete)
     if reasons := [

@@ -141,9 +141,9 @@ def test_a_report_says_what_is_the_beginning_of_a_longer_run_and_never_counts_it
     assert csac("study report tested.toml --seeds 1 --results out --out tested") == 0
 
     report, tested = (Path(name, "report.md").read_text() for name in ("shorter", "tested"))
-    assert "1 of 1 cells are complete." in report
+    assert "1 of 1 cell is complete." in report
     assert "SAC, Hopper-v4, seed 0: the beginning of a run of 300 steps" in report
-    assert "0 of 1 cells are complete, 1 are not over." in tested
+    assert "0 of 1 cell is complete, 1 is not over." in tested
 
 
 def test_on_a_terminal_where_nothing_is_left_to_run_it_is_said(engine, monkeypatch):
