@@ -252,7 +252,7 @@ def test_the_early_answer_is_made_of_cells_of_the_paper_s_study():
 
 
 PROTOCOLS = [*sorted(EVIDENCE.glob("*.toml")), *sorted((EVIDENCE.parent / "strong").glob("*.toml"))]
-FRESH = {"confirm", "ant", "recovery", "aims"}
+FRESH = {"confirm", "ant", "recovery", "aims", "leaner"}
 
 
 @pytest.mark.parametrize("path", PROTOCOLS, ids=lambda path: f"{path.parent.name}-{path.stem}")
