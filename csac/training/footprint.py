@@ -44,12 +44,12 @@ def memory_needed(plan: Plan, spec: Spec, goes_on: bool = False) -> str:
 def _bytes_per_seed(plan: Plan, spec: Spec, memories: int) -> int:
     """Return the size of what a seed learns and remembers, `memories` times, and of what one update needs beside it.
 
-    The latter is the batch, and for each of its transitions a number for every unit of the networks, of which there are
-    as many as biases.
+    The latter is the batch, and for each of its transitions a number for every unit of the networks, of which a matrix
+    of weights has as many as columns.
     """
     algorithm, steps, key = plan.algorithm, plan.steps, jax.ShapeDtypeStruct((2,), "uint32")
     state, memory = jax.eval_shape(lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), key)
     transitions = algorithm.cadence.transitions_per_update
-    units = sum(leaf.size for leaf in jax.tree.leaves(state) if len(leaf.shape) == 1)
+    units = sum(leaf.shape[-1] for leaf in jax.tree.leaves(state) if len(leaf.shape) == 2)
     kept = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((state, [memory] * memories)))
     return kept + 4 * transitions * (memory.rows.shape[1] + units)

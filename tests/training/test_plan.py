@@ -124,6 +124,14 @@ def test_a_run_that_goes_on_has_room_for_its_replay_twice():
     assert old - new == pytest.approx(replay / 2**20, abs=1)
 
 
+def test_an_optimiser_that_keeps_its_moments_in_one_vector_needs_no_more_memory():
+    """PPO's are as long as all of its parameters: each was taken for a unit, with a number for every transition."""
+    plan, spec = make_plan(PPO(hidden_sizes=(1_024, 1_024)), "Pendulum-v1", {}, Before.find(None, False, None), True)
+    (needed,) = re.findall(r"1 x (\d+) MiB", memory_needed(plan, spec))
+    parameters = 2 * (1_024 * 1_024 + 1_024 * 4) * 4 / 2**20  # of actor and critic, float32, in MiB
+    assert 3 * parameters < int(needed) < 3 * parameters + 4 * 2_048 * (2 * 2_048 + 100) / 2**20
+
+
 def test_a_batch_that_does_not_fit_is_refused_with_what_it_needs(tmp_path):
     with pytest.raises(InputError, match=r"needs about [\d,.]+ GiB of memory and [\d.]+ GiB are available"):
         train(SAC(batch_size=10**9, replay_size=2 * 10**9), "Pendulum-v1", steps=100, directory=tmp_path / "run")
