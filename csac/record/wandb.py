@@ -188,10 +188,14 @@ def group_of(run: RunDirectory) -> str:
 
 
 def run_id(run: RunDirectory, seed: int) -> str:
-    """Return the id of a seed's W&B run: another for every run, and the same whenever this one goes on."""
-    manifest = run.manifest
-    known = [manifest.created, run.path.name, manifest.task, manifest.algorithm, manifest.hyperparameters]
-    return hashlib.sha256(json.dumps([*known, manifest.seeds, seed]).encode()).hexdigest()[:16]
+    """Return the id of a seed's W&B run: another for every run, and the same whenever this one goes on.
+
+    Steps are not in it, as a run may be given more of them: runs of a study that differ in these have other folders.
+    """
+    manifest, place = run.manifest, run.path.resolve().parts[-2:]
+    known = [manifest.created, place, manifest.task, manifest.algorithm, manifest.hyperparameters]
+    known += [manifest.environment_arguments, manifest.perturbations, manifest.seeds, seed]
+    return hashlib.sha256(json.dumps(known).encode()).hexdigest()[:16]
 
 
 def _read(run: RunDirectory) -> dict[str, Any]:

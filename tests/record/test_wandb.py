@@ -156,6 +156,20 @@ def test_each_seed_and_each_run_has_an_id_of_its_own(tmp_path):
     assert run_id(RunDirectory.open(one.path), 0) == id_before
 
 
+def test_runs_that_begin_in_the_same_second_have_ids_of_their_own(tmp_path):
+    plain = run_directory(tmp_path / "sac" / "seed-0")
+    elsewhere = run_directory(tmp_path / "sac-friction=2" / "seed-0")
+    changes = {"perturbations": ("friction=2@100",)}, {"environment_arguments": {"frame_skip": 2}}
+    others = [run_directory(tmp_path / str(index) / "sac" / "seed-0", **each) for index, each in enumerate(changes)]
+    assert len({run_id(run, 0) for run in (plain, elsewhere, *others)}) == 4
+
+
+def test_an_id_does_not_depend_on_how_the_path_is_typed(tmp_path, monkeypatch):
+    run = run_directory(tmp_path / "sac" / "run")
+    monkeypatch.chdir(run.path)
+    assert run_id(RunDirectory.open("."), 0) == run_id(run, 0)
+
+
 def test_seeds_of_a_study_are_one_group(tmp_path):
     assert group_of(run_directory(tmp_path / "Hopper-v4" / "sac" / "today")) == "Hopper-v4/sac/today"
     cells = [run_directory(tmp_path / "Hopper-v4" / "sac-1a2b" / f"seed-{seed}") for seed in (0, 1)]
