@@ -218,6 +218,8 @@ class _Scheduler:
             self._next(worker)
         elif isinstance(message, Ended | GroupCrashed):
             worker.over = True
+            if isinstance(message, Ended):
+                worker.step = message.step
             self._take_cores(worker)
         return message
 
@@ -266,7 +268,8 @@ class _Scheduler:
         elif any(worker.step == self.settings.plan.steps for worker in self.workers):
             self.target = self.settings.plan.steps  # one has made all its steps, and the others are close behind
         else:
-            self.target = max(self._end_of_turn(worker) for worker in living)
+            # Also of those that are over: what is saved before the step at which a seed failed has to hold that seed.
+            self.target = max(map(self._end_of_turn, self.workers))
         waiting, self.waiting = self.waiting, []
         for worker in waiting:
             self._next(worker)
@@ -290,7 +293,7 @@ class _Scheduler:
         return any(worker.saved < self.target for worker in self.workers if not worker.over)
 
     def _end_of_turn(self, worker: _Worker) -> int:
-        if worker.cores is None:
+        if worker.cores is None and not worker.over:
             return worker.step
         return next(step for step in count(worker.step + 1) if self.settings.ends_turn(step))
 

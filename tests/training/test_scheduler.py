@@ -109,6 +109,20 @@ def test_a_slow_run_stops_where_all_groups_were_saved(tmp_path, monkeypatch):
     assert {(group, message.step) for group, message in told if isinstance(message, Ended)} == {(0, 1_250), (1, 1_250)}
 
 
+def test_a_stop_comes_after_the_step_at_which_a_seed_ahead_has_failed(tmp_path, monkeypatch):
+    """Saved before it, the others were no checkpoint, since the files of the seed that was sound then were missing."""
+    SlowWorkers(monkeypatch, seconds=1.0)
+    settings = plans.settings(SAC(), "Hopper-v4", 100_000, tmp_path, checkpoint_interval=50_000)
+    scheduler: Any = _Scheduler(settings, [[0], [1]], lambda: True, None, lambda: True)
+    failed, other = scheduler.workers
+    failed.answers.append(Ended(51_900, {}))
+    failed.step, other.step, other.saved, other.made = 51_750, 51_000, 50_000, 51_000
+    scheduler.waiting = [other]
+    scheduler._receive(0, failed)
+    saved = [(group, message.step) for group, message in scheduler.run() if isinstance(message, Saved)]
+    assert saved == [(1, 52_000)]
+
+
 def test_what_is_left_of_several_groups_keeps_its_number_of_cores(tmp_path, monkeypatch):
     """A seed whose fellow had failed had all cores after a resume, and so other last bits than without one."""
     workers = SlowWorkers(monkeypatch, seconds=1.0)
