@@ -173,9 +173,13 @@ class _Scheduler:
             raise
         self.restarted: set[int] = set()
         cores = usable_cores()
-        planned = max(len(settings.plan.groups), len(groups))  # also those of which nothing is left
-        sets = min(planned, len(cores))
+        planned = max(settings.plan.groups, groups, key=len)  # also those of which nothing is left
+        sets = min(len(planned), len(cores))
         self.free = [cores[i::sets] for i in range(sets)]
+        # Sets differ in size where there are more cores than groups: each group has its own, since its last bits depend
+        # on how many cores its process began with. Of several groups to a core, each takes the one that is free.
+        owned = self.free if sets == len(planned) else []
+        self.own = {seed: its for its, group in zip(owned, planned, strict=False) for seed in group}
         self.waiting = list(self.workers)
         self.stopping, self.target = False, -1
         self.timer = _Timer()
@@ -308,7 +312,8 @@ class _Scheduler:
         last = min((worker.step for worker in self.workers if not worker.over), default=0)
         while self.free and self.waiting and self.waiting[-1].step <= last + LONGEST_LEAD:
             worker = self.waiting.pop()
-            worker.cores = self.free.pop(0)
+            worker.cores = self.own.get(worker.seeds[0], self.free[0])
+            self.free.remove(worker.cores)
             worker.tell(worker.cores)
 
 

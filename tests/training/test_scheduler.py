@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import multiprocessing
 import os
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +63,7 @@ class SlowWorkers:
     """Workers that make their turns at once, on a clock of their own: each turn takes so many seconds."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-        self.clock, self.cores = 0.0, []
+        self.clock, self.cores, self.cores_of = 0.0, [], defaultdict(list)
         machine, clock = self, SimpleNamespace(monotonic=lambda: self.clock)
 
         class Worker:
@@ -81,6 +81,7 @@ class SlowWorkers:
                 else:
                     self.made += 250
                     machine.cores.append(order)
+                    machine.cores_of[self.seeds[0]].append(order)
                     machine.clock += seconds
                     self.answers.append(Boundary(self.made))
 
@@ -130,6 +131,19 @@ def test_what_is_left_of_several_groups_keeps_its_number_of_cores(tmp_path, monk
     settings = settings._replace(plan=replace(settings.plan, groups=((0,), (1,))))
     told = [message for _, message in scheduler_module.run_groups(settings, [[0]], lambda: False)]
     assert (told[-1], workers.cores) == (Ended(250, {}), [[0]])
+
+
+@pytest.mark.parametrize("left", [[0, 1, 2], [1], [1, 2], [0, 2]])
+def test_each_group_keeps_its_cores_whichever_are_left_and_whoever_is_first(tmp_path, monkeypatch, left):
+    """Of five cores one group has one and two have two; a resume without a seed that had failed handed them on."""
+    workers = SlowWorkers(monkeypatch, seconds=1.0)
+    monkeypatch.setattr(scheduler_module, "usable_cores", lambda: [0, 1, 2, 3, 4])
+    settings = plans.settings(SAC(), "Hopper-v4", 1_000, tmp_path, checkpoint_interval=500)
+    settings = settings._replace(plan=replace(settings.plan, groups=((0,), (1,), (2,))))
+    for _ in scheduler_module.run_groups(settings, [[seed] for seed in left], lambda: False):
+        pass
+    own = {0: (0, 3), 1: (1, 4), 2: (2,)}
+    assert {seed: {tuple(cores) for cores in workers.cores_of[seed]} for seed in left} == {s: {own[s]} for s in left}
 
 
 class MadeUpGroup:
