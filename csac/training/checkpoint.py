@@ -192,7 +192,11 @@ class Checkpoints:
     def pin_newest(self) -> None:
         """Keep the newest checkpoint for good: a seed failed after it, and its last sound state is there."""
         if self.newest is not None:
-            self.pinned.add(self.newest)
+            self.pin(self.newest)
+
+    def pin(self, step: int) -> None:
+        """Keep the checkpoint of this step for good, which may still have to be committed."""
+        self.pinned.add(step)
 
     def commit(self, step: int, files: Files, values: dict[str, Any]) -> None:
         """Make a checkpoint of files that are written already, then remove what no checkpoint needs any more."""

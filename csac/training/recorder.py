@@ -190,6 +190,8 @@ class Recorder:
         values = {"log_bytes": log_bytes, "failures": failures, "groups": self.groups}
         # Said before, so that no checkpoint is ever taken for exact that is not.
         self.run.update_manifest(steps_done=step, inexact_seeds=sorted(self.inexact))
+        if any(failed_at > step for failed_at in self._failed_at.values()):
+            self.checkpoints.pin(step)  # all were saved here by the time a seed ahead failed, and it was sound
         self.checkpoints.commit(step, files, values)
         self.run.update_manifest(last_checkpoint=step)
         for earlier in [other for other in self._saved if other <= step]:

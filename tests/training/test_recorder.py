@@ -78,6 +78,17 @@ def test_the_last_checkpoint_comes_though_every_seed_of_the_slower_group_failed(
     assert steps_in(recorder.run.path / "checkpoint") == [300, 600]
 
 
+def test_the_checkpoint_before_a_failure_stays_though_it_became_whole_after_it(recorder):
+    saves(recorder, 0, 300)
+    recorder.handle(0, Failed(0, 350, "a reward is NaN", "", None))
+    recorder.handle(0, Ended(350, {}))
+    for step in (300, 600, 700, 800):
+        saves(recorder, 1, step)
+    place = recorder.run.path / "checkpoint"
+    assert steps_in(place) == [300, 700, 800]
+    assert "step_300.seed_0.safetensors" in Checkpoint.open(place, 300).files
+
+
 def test_a_step_by_which_every_seed_had_failed_is_no_checkpoint(recorder):
     for group in (0, 1):
         saves(recorder, group, 300)
