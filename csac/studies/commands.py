@@ -82,7 +82,7 @@ def show(options: Show) -> int:
         refuse_file(directory)
     studies, store, console = options.studies(), Store(options.directory), make_console()
     cells, labels = cells_of(studies), labels_of(studies)
-    collected = _collected(studies, cells, options.results)
+    collected = _collected(studies, cells, _results(options.results))
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     rollouts = _rollouts(studies)
     jobs = [Job(cell, store.path(cell), rollouts=rollouts[cell.key]) for cell in cells if cell.key not in collected]
@@ -168,7 +168,8 @@ def run(options: Run) -> int:
         cells = [cells[options.cell]]
     every = _jobs(studies, cells, store, options)
     refuse_file(options.directory)
-    collected = _collected(studies, cells, options.results)
+    results = _results(options.results)
+    collected = _collected(studies, cells, results)
     jobs = [job for job in every if job.cell.key not in collected and not is_over(job)]
     if jobs and options.engine != "ray":  # whose nodes may have what this machine has not
         refuse_tasks(jobs)
@@ -177,8 +178,8 @@ def run(options: Run) -> int:
         refuse_as_results(options.results, store)
     if jobs:
         refuse_unwritable(options.directory)
-    if options.results:
-        _collect_over(every, store, options.results, labels)
+    if results:
+        _collect_over(every, store, results, labels)
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     _say(console, _intention(studies, cells, statuses.values()), "bold")
     _tell_of_warmup(studies, [job.cell for job in jobs], console)
@@ -190,9 +191,9 @@ def run(options: Run) -> int:
 
     def tell(message: Message) -> None:
         progress.tell(message)
-        if options.results and isinstance(message, Ended):
+        if results and isinstance(message, Ended):
             try:
-                collect(store, by_key[message.key], options.results)
+                collect(store, by_key[message.key], results)
             except (OSError, InputError) as error:  # which ends no other cell
                 not_collected[message.key] = getattr(error, "strerror", None) or str(error)
 
@@ -215,19 +216,19 @@ def run(options: Run) -> int:
     return 3 if not_collected else code
 
 
-def _collect_over(jobs: Iterable[Job], store: Store, directory: Path, labels: Mapping[str, str]) -> None:
+def _collect_over(jobs: Iterable[Job], store: Store, results: Results, labels: Mapping[str, str]) -> None:
     """Collect the cells that are over and were not collected with all that is wanted of them.
 
     What another machine may have run stays as it is. Raises InputError for what cannot be copied.
     """
-    results = Results(directory, may_be_empty=True)
     for job in jobs:
         is_there = results.has(job.cell) and results.status(job.cell, job.rollouts) is not None
         if not is_there and is_over(job):
             try:
-                collect(store, job.cell, directory)
+                collect(store, job.cell, results)
             except OSError as error:
-                raise InputError(f"cannot copy {labels[job.cell.key]} to {directory}: {error.strerror}") from None
+                label, why = labels[job.cell.key], error.strerror
+                raise InputError(f"cannot copy {label} to {results.directory}: {why}") from None
 
 
 def report(options: Report) -> int:
@@ -308,11 +309,15 @@ def _engine(options: Run) -> Engine:
     return run_here if engine == "local" else partial(run_in_processes, workers=options.workers)
 
 
-def _collected(studies: Sequence[Study], cells: Sequence[Cell], directory: Path | None) -> dict[str, Status]:
+def _results(directory: Path | None) -> Results | None:
+    return None if directory is None else Results(directory, may_be_empty=True)
+
+
+def _collected(studies: Sequence[Study], cells: Sequence[Cell], results: Results | None) -> dict[str, Status]:
     """Return how the cells ended that were collected there with all that these studies want of them."""
-    if directory is None:
+    if results is None:
         return {}
-    results, rollouts = Results(directory, may_be_empty=True), _rollouts(studies)
+    rollouts = _rollouts(studies)
     statuses = {cell.key: results.status(cell, rollouts[cell.key]) for cell in cells}
     return {key: status for key, status in statuses.items() if status is not None}
 

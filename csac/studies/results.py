@@ -66,6 +66,10 @@ class Results:
         """Whether the cell itself was collected, and not a longer run alone."""
         return cell.key in self._files
 
+    def path(self, cell: Cell) -> Path:
+        """Return where a cell's manifest is, or is to be: what an older version collected lies under another name."""
+        return self._files.get(cell.key, self.directory / "cells" / cell.name.with_suffix(".json"))
+
     def record(self, cell: Cell) -> Record | None:
         """Return what a cell has given, or None where it was not collected."""
         path = self._files.get(cell.key)
@@ -95,14 +99,15 @@ class Results:
         return Status("failed" if record.failure else "complete", cell.steps, record.failure, record.seconds)
 
 
-def collect(store: Store, cell: Cell, directory: str | Path) -> None:
+def collect(store: Store, cell: Cell, to: Results | str | Path) -> None:
     """Copy what a cell that is over has given to files that are small enough to be kept with the code.
 
-    One that failed before its first evaluation has a table without rows. A failure replaces nothing.
+    `to` is their directory, or what is known to be in it already. One that failed before its first evaluation has a
+    table without rows. A failure replaces nothing.
     """
-    record, source = Runs(store).record(cell), store.path(cell)
+    results = to if isinstance(to, Results) else Results(to, may_be_empty=True)
+    record, source, path = Runs(store).record(cell), store.path(cell), results.path(cell)
     table = source / "evaluations.csv"
-    path = Path(directory) / "cells" / cell.name.with_suffix(".json")
     if record is None or not (record.failure or table.exists()) or (record.failure and path.exists()):
         return
     path.parent.mkdir(parents=True, exist_ok=True)

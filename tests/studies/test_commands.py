@@ -267,6 +267,24 @@ def test_a_failure_here_replaces_nothing_that_another_machine_has_collected(engi
     assert len(record.evaluations)
 
 
+@pytest.mark.parametrize("folder", ["an-older-name", "z-older-name"])
+def test_a_cell_that_lies_under_an_older_name_is_collected_there(engine, tmp_path, folder):
+    write(tmp_path / "tested.toml", TINY.replace("steps = 300", "steps = 300\nrollouts = 1"))
+    (one,) = cells_of([read_study("tested.toml")])[:1]
+    run = finished(Store(), one)
+    collect(Store(), one, "out")
+    older = Path("out/cells", one.name.parent.with_name(folder))
+    Path("out/cells", one.name.parent).rename(older)
+    (run.path / ROLLOUTS).write_text("seed,step,episode,return,length,success\n0,300,0,1,9,\n")
+    assert csac("study run tested.toml --seeds 1 --results out") == 0
+    assert Results("out").status(one, rollouts=1) == ("complete", 300, "", 0.0)
+    run.update_manifest(state="failed", failures={0: "step 20: the actor is not finite"})
+    collect(Store(), one, "out")
+    assert Results("out").status(one, rollouts=1) == ("complete", 300, "", 0.0), "a failure replaces nothing"
+    assert [path.parent for path in Path("out").rglob("seed-0.json")] == [older]
+    assert not engine
+
+
 def test_a_damaged_table_of_rollouts_is_made_again_and_ends_no_other_cell(monkeypatch, tmp_path, capsys):
     write(tmp_path / "tested.toml", TINY.replace("steps = 300", "steps = 300\nrollouts = 1"))
     first, second = cells_of([read_study("tested.toml")])
