@@ -14,6 +14,7 @@ is there twice, since two are kept. The JSON file is written last, so a checkpoi
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -49,6 +50,14 @@ class Damaged(InputError):
     """A checkpoint's file is missing, cut off or changed. The message names it."""
 
 
+class Unread(Damaged):
+    """A checkpoint's file may be sound and could not be read this time, or by this csac: no other takes its place."""
+
+
+# What reading a file that is gone, or lies where the disk is broken, is answered with; anything else may pass.
+_LOST = (errno.ENOENT, errno.EIO, errno.ENOTDIR, errno.EISDIR)
+
+
 class Checkpoint:
     """One checkpoint on disk. `values` is what the run as a whole noted down with it.
 
@@ -70,18 +79,19 @@ class Checkpoint:
         try:
             fields = json.loads(path.read_bytes())
             checksum = fields.pop("sha256")
+            is_changed = checksum != sha256(_encoded(fields)) or fields.get("step") != step
             if fields["schema_version"] != SCHEMA_VERSION:
-                raise Damaged(
+                raise (Damaged if is_changed else Unread)(
                     f"{path} is of schema {fields['schema_version']!r} and this csac reads {SCHEMA_VERSION}: "
                     "go on with the csac that wrote it"
                 )
-            if checksum != sha256(_encoded(fields)) or fields["step"] != step:
+            if is_changed:
                 raise Damaged(f"{path} has changed since it was written")
             return cls(folder, step, _checked_files(fields["files"]), _checked_values(fields["values"]))
         except Damaged:
             raise
         except OSError as error:
-            raise Damaged(f"{path} cannot be read: {error.strerror}") from error
+            raise _unreadable(path, error) from error
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise Damaged(f"{path} is not a checkpoint ({type(error).__name__}: {error})") from error
 
@@ -106,7 +116,7 @@ class Checkpoint:
         except OSError as error:
             if (right := self._original(name)) is not None:
                 return right
-            raise Damaged(f"{path} cannot be read: {error.strerror}") from error
+            raise _unreadable(path, error) from error
         if is_unchanged(content, facts):
             return content
         if (right := self._mended(name, content)) is not None:
@@ -268,13 +278,19 @@ def _step_of(name: str) -> int:
 
 
 def newest_sound(folder: Path) -> tuple[Checkpoint | None, list[str]]:
-    """Return the newest checkpoint whose every file is as it was written, and what is wrong with those after it."""
+    """Return the newest checkpoint whose every file is as it was written, and what is wrong with those after it.
+
+    Raises:
+        Unread: one of those after it may be sound; without it, whoever goes on from an earlier one would discard it.
+    """
     complaints = []
     for step in reversed(steps_in(folder)):
         try:
             checkpoint = Checkpoint.open(folder, step)
             checkpoint.verify()
             return checkpoint, complaints
+        except Unread:
+            raise
         except Damaged as error:
             complaints.append(str(error))
     return None, complaints
@@ -291,6 +307,12 @@ def sound_at(folder: Path, step: int) -> Checkpoint:
         return checkpoint
     except Damaged as error:
         raise InputError(f"{error}: choose another of the steps {', '.join(map(str, steps_in(folder)))}") from None
+
+
+def _unreadable(path: Path, error: OSError) -> Damaged:
+    if error.errno in _LOST:
+        return Damaged(f"{path} cannot be read: {error.strerror}")
+    return Unread(f"{path} cannot be read: {error.strerror}; the same line goes on once that is mended")
 
 
 def original_of(run: Path, name: str) -> Path | None:

@@ -35,6 +35,7 @@ from csac.training.checkpoint import (
     Checkpoint,
     Checkpoints,
     Damaged,
+    Unread,
     newest_sound,
     remove_unfinished,
     steps_in,
@@ -239,6 +240,35 @@ def test_blocks_that_the_disk_cannot_read_are_mended(tmp_path, monkeypatch):
     checkpoint = Checkpoint.open(tmp_path, 2000)
     assert checkpoint.read(f"replay/{path.name}") == content
     assert checkpoint.mended == {f"replay/{path.name}"}
+
+
+@pytest.mark.parametrize("name", ["step_20.json", "step_20.seed_0.safetensors", "replay/seed_0.10-20.safetensors"])
+def test_a_file_that_could_not_be_read_this_time_is_no_damage(tmp_path, monkeypatch, name):
+    """An earlier checkpoint took the place of the newest one, which was then removed, for one failed read."""
+    for step in (10, 20):
+        save(tmp_path, step, keep=2)
+    read_bytes = Path.read_bytes
+
+    def read(self: Path) -> bytes:
+        if self == tmp_path / name:
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+        return read_bytes(self)
+
+    monkeypatch.setattr(Path, "read_bytes", read)
+    with pytest.raises(Unread, match=rf"{name} cannot be read: Stale file handle; the same line goes on once"):
+        newest_sound(tmp_path)
+
+
+def test_a_checkpoint_of_another_schema_is_no_damage(tmp_path):
+    for step in (10, 20):
+        save(tmp_path, step, keep=2)
+    fields = json.loads((tmp_path / "step_20.json").read_text())
+    del fields["sha256"]
+    fields["schema_version"] += 1
+    checksum = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
+    (tmp_path / "step_20.json").write_text(json.dumps({**fields, "sha256": checksum}))
+    with pytest.raises(Unread, match="go on with the csac that wrote it"):
+        newest_sound(tmp_path)
 
 
 def test_transitions_that_are_missing_are_told(tmp_path):
