@@ -18,7 +18,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
     Of several writers, on machines that share the folder too, one is the last.
     """
-    aside = path.with_name(f".{path.name}.{_unique()}.{os.getpid()}")
+    aside = name_aside(path)
     try:
         with open(aside, "wb") as file:
             file.write(data)
@@ -27,6 +27,11 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def name_aside(path: Path) -> Path:
+    """Return what a file is called until it is whole: a name that no other writer takes, on whatever machine."""
+    return path.with_name(f".{path.name}.{_unique()}.{os.getpid()}")
 
 
 def check_name(path: Path, aside: Path) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from csac.record.atomic import check_name
+from csac.record.atomic import check_name, name_aside
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def check_new(path: Path, what: str = "table", suffix: str = ".csv") -> None:
     if path.suffix.lower() != suffix:
         better = path.with_suffix(suffix) if path.name else path / f"{what}{suffix}"
         raise InputError(f"the {what} is a {suffix} file: name it {better}")
-    check_name(path, _aside(path))
+    check_name(path, name_aside(path))
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
     folder = path.parent
@@ -76,9 +76,8 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
     Raises:
         InputError: it cannot be written.
     """
-    aside = _aside(path)
+    aside = name_aside(path)
     try:
-        aside.unlink(missing_ok=True)  # of a process of the same number that was killed
         append_rows(aside, columns, rows)
         aside.replace(path)
     except OSError as error:
@@ -86,10 +85,6 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
     finally:
         with suppress(OSError):  # what was raised is told
             aside.unlink()
-
-
-def _aside(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}")
 
 
 def read_rows(path: str | Path) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from csac.deploy.choosing import load
+from csac.record import csv_tables
 from csac.record import run as record
 from csac.record.atomic import write_atomically
 from csac.record.csv_tables import COLUMNS, append_rows, check_new, read_rows, write_rows
@@ -458,11 +459,21 @@ def test_a_table_that_cannot_be_is_refused_at_once_and_told_in_one_line(tmp_path
     assert str(caught.value) == f"cannot write {path}: {reason}; choose another place"
 
 
-def test_what_a_killed_process_of_the_same_number_left_is_not_taken(tmp_path):
-    path = tmp_path / "rows.csv"
-    append_rows(tmp_path / f".rows.csv.{os.getpid()}", COLUMNS["evaluations"], [evaluation(), evaluation()])
+def test_two_writers_of_one_process_number_do_not_meet(tmp_path, monkeypatch):
+    path, append, asides = tmp_path / "rows.csv", csv_tables.append_rows, []
+
+    def meet(aside, *given):
+        append(aside, *given)
+        asides.append(aside)
+        if len(asides) == 1:  # before it is whole, another one, of another container, begins and ends
+            write_rows(path, COLUMNS["evaluations"], [evaluation(), evaluation()])
+            assert len(read_rows(path)) == 2
+
+    monkeypatch.setattr(csv_tables, "append_rows", meet)
     write_rows(path, COLUMNS["evaluations"], [evaluation()])
     assert len(read_rows(path)) == 1
+    assert len(set(asides)) == 2
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_log_lines_follow_each_other(run):
