@@ -13,13 +13,10 @@ import importlib.util
 import os
 import sys
 from contextlib import suppress
+from importlib.machinery import ModuleSpec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from csac.types import InputError
-
-if TYPE_CHECKING:
-    from importlib.machinery import ModuleSpec
 
 
 def module_of(task: object) -> str:
@@ -75,12 +72,8 @@ def _note(module: str, place: str) -> Path | None:
 
 def _place(module: str) -> str | None:
     """Return where a module's code is, or None where there is none. Runs nothing of it, nor of its packages."""
-    spec: ModuleSpec | None = None
-    path = None
     try:
-        for end in _ends(module):
-            spec = _find(module[:end], path)
-            path = spec.submodule_search_locations if spec else []
+        spec = _spec(module)
     except (ImportError, ValueError, AttributeError, TypeError):
         return None
     if spec is None:
@@ -89,13 +82,40 @@ def _place(module: str) -> str | None:
     return os.pathsep.join(os.path.realpath(place) for place in places) or spec.origin
 
 
+def _spec(module: str) -> ModuleSpec | None:
+    """Return what the import system knows of a module, or None.
+
+    `importlib.util.find_spec` would import what is around a part: only the first part, with nothing around, is for it.
+    """
+    first, *ends = _ends(module)
+    spec = importlib.util.find_spec(module[:first])
+    for end in ends:
+        path = spec.submodule_search_locations if spec else None
+        if path is None:  # a plain module has no parts
+            return None
+        spec = _find(module[:end], list(path))
+    return spec
+
+
 def _ends(module: str) -> list[int]:
     return [*(index for index, letter in enumerate(module) if letter == "."), len(module)]
 
 
-def _find(name: str, path: object) -> ModuleSpec | None:
-    if path is None:
-        return importlib.util.find_spec(name)
-    # `importlib.util.find_spec` would import the package around it.
-    found = (finder.find_spec(name, path) for finder in sys.meta_path)  # pyright: ignore[reportArgumentType]
-    return next((spec for spec in found if spec), None)
+def _find(name: str, path: list[str]) -> ModuleSpec | None:
+    """Return what is known of a part of a package whose code is in these places."""
+    for finder in sys.meta_path:
+        try:
+            spec = finder.find_spec(name, path)
+        except KeyError:  # a folder without __init__.py: importlib wants the package around it to be imported
+            spec = _namespace(name, path)
+        if spec:
+            return spec
+    return None
+
+
+def _namespace(name: str, path: list[str]) -> ModuleSpec | None:
+    """Return the spec of a namespace package, whose places are the folders of its name that are there, if any."""
+    folders = [os.path.join(place, name.rpartition(".")[2]) for place in path]
+    spec = ModuleSpec(name, None, is_package=True)
+    spec.submodule_search_locations = [folder for folder in folders if os.path.isdir(folder)]
+    return spec if spec.submodule_search_locations else None

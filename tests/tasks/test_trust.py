@@ -103,12 +103,38 @@ def test_a_task_that_was_trusted_once_is_trusted_where_it_was_found(stranger):
     assert csac(moved, "evaluate", "run", "--episodes", "1").returncode == 2
 
 
-def test_a_module_that_is_not_there_is_told_and_not_looked_for_by_importing(stranger):
-    stranger.make_run("package.nowhere:Task-v0")
+@pytest.mark.parametrize("module", ["package.nowhere", "stranger.nowhere", "package.stranger.nowhere.at.all"])
+def test_a_module_that_is_not_there_is_told_and_not_looked_for_by_importing(stranger, module):
+    stranger.make_run(f"{module}:Task-v0")
     done = csac(stranger.folder, "evaluate", "run")
     assert done.returncode == 2
-    assert "needs the module package.nowhere, which is not found here" in done.stderr
+    assert f"needs the module {module}, which is not found here" in done.stderr
     assert not stranger.marker.exists()
+
+
+@pytest.mark.parametrize("module", ["envs.robot.stranger", "envs.robot.arm.stranger", "package.arm.stranger"])
+def test_a_module_in_folders_without_init_is_asked_about_and_then_trusted(stranger, module):
+    path = stranger.folder / f"{module.replace('.', '/')}.py"
+    path.parent.mkdir(parents=True)
+    path.write_text((stranger.folder / "stranger.py").read_text())
+    stranger.make_run(f"{module}:Stranger-v0")
+    done = csac(stranger.folder, "evaluate", "run")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"run wants to run the code of {path} (its task is" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not stranger.marker.exists()
+    trusting = csac(stranger.folder, "evaluate", "run", "--episodes", "1", "--trust-task")
+    assert trusting.returncode == 0, trusting.stderr
+    again = csac(stranger.folder, "evaluate", "run", "--episodes", "1")
+    assert (again.returncode, again.stdout) == (0, trusting.stdout)
+
+
+def test_a_folder_without_init_that_is_not_there_is_not_found(stranger):
+    (stranger.folder / "envs" / "robot").mkdir(parents=True)
+    stranger.make_run("envs.arm.task:Task-v0")
+    done = csac(stranger.folder, "evaluate", "run")
+    assert done.returncode == 2
+    assert "needs the module envs.arm.task, which is not found here" in done.stderr
 
 
 def test_who_trains_has_named_the_module(tmp_path, monkeypatch):
