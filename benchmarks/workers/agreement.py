@@ -13,8 +13,8 @@ from benchmarks.driver import Driver, make_learner
 def measure(updates: int) -> dict[str, Any]:
     """Return which GPU there is, and how far it is from the CPU after so many updates from the same beginning.
 
-    The difference is relative to the size of each parameter array, and the largest of all. Where JAX can use no GPU,
-    `device` is "".
+    The difference is relative to the size of each array of the learner's state, and the largest of all. Where JAX can
+    use no GPU, `device` is "".
     """
     try:
         gpu = jax.devices("gpu")[0]
@@ -22,15 +22,29 @@ def measure(updates: int) -> dict[str, Any]:
         return {"device": ""}
     if not updates:
         return {"device": gpu.device_kind}
-    pairs = zip(*(_parameters(device, updates) for device in (jax.devices("cpu")[0], gpu)), strict=True)
-    difference = max(float(np.abs(ours - theirs).max() / (np.abs(ours).max() + 1e-6)) for ours, theirs in pairs)
-    return {"device": gpu.device_kind, "updates": updates, "largest_difference": difference}
+    ours, theirs = (learnt(device, updates) for device in (jax.devices("cpu")[0], gpu))
+    return {"device": gpu.device_kind, "updates": updates, "largest_difference": largest_difference(ours, theirs)}
 
 
-def _parameters(device: Any, updates: int) -> list[np.ndarray]:
+def learnt(device: Any, updates: int) -> list[Any]:
+    """Return each seed's whole state, actor, critics and optimisers, after so many updates on this device."""
+    seeds = 2
     with jax.default_device(device):
-        driver = Driver(make_learner("csac", seeds=2, replay_size=1_000), seeds=2)
+        driver = Driver(make_learner("csac", seeds=seeds, replay_size=1_000), seeds=seeds)
         for _ in range(updates):
             driver.step += 1
-            driver.learner.step(driver.observations, np.zeros((2, 6), np.float32), driver.outcome, driver.step)
-        return [np.asarray(leaf) for leaf in jax.tree.leaves(driver.learner.networks())]
+            driver.learner.step(driver.observations, driver.actions, driver.outcome, driver.step)
+        return [driver.learner.carry(index).state for index in range(seeds)]
+
+
+def largest_difference(ours: Any, theirs: Any) -> float:
+    """Return the largest difference of two trees of arrays, each relative to the largest number in its array of ours.
+
+    It is not a number where one of the arrays holds such.
+    """
+    pairs = zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True)
+    return float(np.max([_relative(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in pairs]))
+
+
+def _relative(ours: np.ndarray, theirs: np.ndarray) -> np.floating:
+    return np.abs(ours - theirs).max(initial=0.0) / (np.abs(ours).max(initial=0.0) + 1e-6)
