@@ -77,7 +77,12 @@ SPEED_COLUMNS = {
 
 def render_speed(rows: list[Row]) -> str:
     """Return a row for each number of seeds and updates in one dispatch."""
-    return formatted([{**row, "aim": AIMS.get(row["seeds"], "")} for row in rows], SPEED_COLUMNS)
+    return formatted([{**row, "aim": _aim(row)} for row in rows], SPEED_COLUMNS)
+
+
+def _aim(row: Row) -> str:
+    """Return what is aimed at; an aim is for strict order, one update in a dispatch."""
+    return AIMS.get(row["seeds"], "") if row["updates_in_one_dispatch"] == 1 else ""
 
 
 GROUPS = [Seeds(seeds, interval) for interval in INTERVALS for seeds in SEEDS]

@@ -11,7 +11,7 @@ from benchmarks import dispatch
 from benchmarks.__main__ import PARTS, SUITES, main, named
 from benchmarks.measuring import ROOT, Process, run, surroundings
 from benchmarks.parts import Options, Part
-from benchmarks.suites import growth
+from benchmarks.suites import gpu, growth
 from benchmarks.tables import formatted, read_rows, write_rows
 from csac import CSAC
 from csac.presets import hyperparameters
@@ -122,6 +122,19 @@ def test_growth_compares_each_point_with_the_one_before():
     assert growth.render(rows).splitlines()[2:] == [
         "| 128 | 200 | 5.00 | 400 |  | 1,500 |",
         "| 256 | 100 | 10.00 | 800 | 2.00 (4.00) | 1,500 |",
+    ]
+
+
+def test_only_updates_in_strict_order_have_an_aim():
+    measured = {"device": "a GPU", "steps_per_second": 9_000.0, "start_seconds": 1.0, "peak_mib": 1.0}
+    rows = [{**measured, "seeds": seeds, "updates_in_one_dispatch": each} for each in (1, 10) for seeds in (1, 5)]
+
+    table = [[cell.strip() for cell in line.split("|")] for line in gpu.render_speed(rows).splitlines()[2:]]
+    assert [(line[2], line[3], line[5]) for line in table] == [
+        ("1", "1", ""),
+        ("5", "1", "10,000"),
+        ("1", "10", ""),
+        ("5", "10", ""),
     ]
 
 
