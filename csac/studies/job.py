@@ -16,6 +16,7 @@ from csac.record.run import RunDirectory
 from csac.studies.cells import Cell, is_final, is_in_use, read_history, restarting_seeds, write_history
 from csac.studies.collected import ROLLOUTS
 from csac.tasks.perturbations import Perturbation, perturbations_of, values_at
+from csac.training.interruptions import caught_signals
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
     What goes wrong with one cell is written beside it and returned, so that the others go on.
 
     Raises:
-        Stopped: SIGINT or SIGTERM, after what was learnt was saved.
+        Stopped: SIGINT or SIGTERM, after what was learnt was saved. A test that it breaks off is made again.
     """
     key = job.cell.key
     if is_in_use(job.path):
@@ -119,14 +120,14 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a seed that failed is told of below
             run = _trained(job, tell)
         write_history(job.path, spent())  # now: the process may end while the policy is tested
-        if run.manifest.state == "finished" and job.rollouts:
-            _roll_out(job)
+        if run.manifest.state == "finished" and not _is_tested(job):
+            _roll_out(job, run)
             write_history(job.path, spent())
     except InputError as error:
         return Ended(key, "elsewhere") if is_in_use(job.path) else _failed(job, spent(), str(error))
-    except Interrupted as interruption:
+    except (Interrupted, Stopped) as stop:
         write_history(job.path, spent())
-        raise Stopped(interruption.signal_number) from None
+        raise Stopped(stop.signal_number) from None
     except Exception as error:
         reason = ": ".join(filter(None, (type(error).__name__, str(error))))
         return _failed(job, spent(), reason, traceback.format_exc())
@@ -172,20 +173,33 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
     )
 
 
-def _roll_out(job: Job) -> None:
+def _roll_out(job: Job, run: RunDirectory) -> None:
     """Test the last policy on episodes that neither training nor its evaluations have seen, and keep a row of each.
 
     The task is perturbed as it was at the end of training.
+
+    Raises:
+        InputError: another process has the run.
+        Stopped: a signal came before the last batch of episodes; those of the others are not kept.
     """
     from csac.evaluation.play import evaluate_run
 
-    if _is_tested(job):
-        return
     last = values_at(perturbations_of(job.cell.perturbations), job.cell.steps)
     perturbed = [Perturbation(kind, value) for kind, value in last.items()]
-    ((seed, episodes),) = evaluate_run(job.path, episodes=job.rollouts, perturbations=perturbed, processes=1)
-    rows = [episode.row(seed, job.cell.steps) for episode in episodes]
-    write_rows(job.path / ROLLOUTS, COLUMNS["evaluations"], rows)
+    with run.locked(), caught_signals() as (_, received):
+
+        def stop_if_asked(done: int, wanted: int) -> None:
+            if received and done < wanted:
+                raise Stopped(received[0])
+
+        if _is_tested(job):  # by the process that had the lock before
+            return
+        stop_if_asked(0, job.rollouts)
+        ((seed, episodes),) = evaluate_run(
+            job.path, episodes=job.rollouts, perturbations=perturbed, processes=1, on_progress=stop_if_asked
+        )
+        rows = [episode.row(seed, job.cell.steps) for episode in episodes]
+        write_rows(job.path / ROLLOUTS, COLUMNS["evaluations"], rows)
 
 
 def _is_tested(job: Job) -> bool:

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from shown import Clock
 from studying import cell, jobs, make_run
 
 from csac.evaluation.evaluator import EvaluationEpisode
+from csac.record.csv_tables import COLUMNS, write_rows
 from csac.record.run import RunDirectory
 from csac.studies import job as module
-from csac.studies.cells import Store, read_history, write_history
+from csac.studies.cells import Store, is_in_use, read_history, write_history
 from csac.studies.collected import ROLLOUTS
-from csac.studies.job import Ended, Job, execute, is_over
+from csac.studies.engines import run_here
+from csac.studies.job import Ended, Job, Stopped, execute, is_over
 from csac.studies.results import Results, collect
+from csac.training.interruptions import signals_noted
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 class Stand:
@@ -25,6 +33,7 @@ class Stand:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.clock, self.tests, self.interrupting = Clock(), list[dict[str, Any]](), False
+        self.during_batch: Callable[[int], Any] = lambda done: None
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=self.clock))
         monkeypatch.setattr(module, "_train", self.train)
         monkeypatch.setattr("csac.evaluation.play.evaluate_run", self.evaluate)
@@ -40,6 +49,9 @@ class Stand:
         if self.interrupting:
             raise KeyboardInterrupt
         self.tests.append(options)
+        for done in (*range(10, options["episodes"], 10), options["episodes"]):
+            self.during_batch(done)
+            options["on_progress"](done, options["episodes"])
         yield 0, [EvaluationEpisode(number, 1.0, 9, None) for number in range(options["episodes"])]
 
 
@@ -57,6 +69,55 @@ def test_the_seconds_of_training_outlive_a_stop_while_the_policy_is_tested(tmp_p
     stand.interrupting = False
     assert execute(job, print) == Ended(job.cell.key, "complete")
     assert read_history(job.path) == {"seconds": 120.0}
+
+
+@pytest.mark.parametrize("engine", [execute, lambda job, tell: run_here([job], tell)], ids=["alone", "here"])
+def test_a_signal_stops_a_test_between_its_batches(tmp_path, stand, engine):
+    (job,) = jobs(tmp_path, cell(), rollouts=25)
+    stand.during_batch = lambda done: signal.raise_signal(signal.SIGINT) if done == 10 else None
+    with pytest.raises(Stopped) as stopped:
+        engine(job, lambda _: None)
+    assert stopped.value.signal_number == signal.SIGINT
+    assert read_history(job.path) == {"seconds": 120.0}
+    assert not is_in_use(job.path)
+    assert not is_over(job)
+    stand.during_batch = lambda done: None
+    engine(job, lambda _: None)
+    assert is_over(job)
+
+
+def test_a_signal_that_came_before_a_test_begins_none_and_one_in_its_last_batch_is_too_late(tmp_path, stand):
+    first, second = jobs(tmp_path, cell(0), cell(1), rollouts=25)
+    with signals_noted() as received:
+        received.append(signal.SIGTERM)
+        with pytest.raises(Stopped):
+            execute(first, print)
+    assert not stand.tests
+    stand.during_batch = lambda done: signal.raise_signal(signal.SIGINT) if done == 25 else None
+    assert execute(second, print).outcome == "complete"
+    assert is_over(second)
+
+
+def test_a_cell_that_is_tested_is_left_to_the_process_that_does(tmp_path, stand):
+    (job,), others = jobs(tmp_path, cell(), rollouts=3), []
+    stand.during_batch = lambda _: others.append(execute(job, print))
+    assert execute(job, print).outcome == "complete"
+    assert others == [Ended(job.cell.key, "elsewhere")]
+    assert len(stand.tests) == 1
+
+
+def test_what_another_process_has_tested_meanwhile_is_not_tested_again(tmp_path, stand, monkeypatch):
+    (job,) = jobs(tmp_path, cell(), rollouts=1)
+
+    @contextmanager
+    def locked(run):
+        write_rows(run.path / ROLLOUTS, COLUMNS["evaluations"], [EvaluationEpisode(0, 1.0, 9, None).row(0, 300)])
+        yield
+
+    monkeypatch.setattr(RunDirectory, "locked", locked)
+    assert execute(job, print).outcome == "complete"
+    assert is_over(job)
+    assert not stand.tests
 
 
 def test_a_policy_is_tested_again_where_more_episodes_are_wanted(tmp_path, stand):
