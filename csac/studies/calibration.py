@@ -48,7 +48,7 @@ class Cost(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """What a cell will take; an upper bound where evaluation episodes may end before the task's limit."""
+    """What a cell will take, of which every episode that tests a policy goes on as far as the task's limit."""
 
     seconds: float
     memory: float
@@ -57,13 +57,13 @@ class Prediction(NamedTuple):
     """Bytes of its checkpoints while it runs."""
 
 
-def predict(cell: Cell, cost: Cost, done: int = 0) -> Prediction:
-    """Return what the steps of a cell after the first `done` will take."""
+def predict(cell: Cell, cost: Cost, done: int = 0, rollouts: int = 0) -> Prediction:
+    """Return what the steps of a cell after the first `done` will take, and so many rollouts of its last policy."""
     warmup = min(cell.hyperparameters.get("warmup_steps", 0), cell.steps)
     learning = cell.steps - max(warmup, done)
     evaluations = math.ceil((cell.steps - done) / cell.evaluation_interval) * cell.evaluation_episodes
     seconds = learning * cost.learning + max(warmup - done, 0) * cost.evaluating
-    seconds += evaluations * cost.longest_episode * cost.evaluating
+    seconds += (evaluations + rollouts) * cost.longest_episode * cost.evaluating
     capacity = cell.hyperparameters.get("replay_size", cell.hyperparameters.get("rollout_steps", 0))
     memory = min(capacity, cell.steps) * cost.transition_size * BYTES_PER_NUMBER
     return Prediction(seconds + SECONDS_TO_START, memory + BYTES_PER_PROCESS, memory)

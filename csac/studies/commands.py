@@ -21,7 +21,7 @@ from csac.record.wandb import import_wandb
 from csac.studies.calibration import Calibration, Prediction, predict
 from csac.studies.cells import HOME, Cell, Store
 from csac.studies.engines import run_here, run_in_processes
-from csac.studies.job import Ended, Job, Message, Stopped, is_over
+from csac.studies.job import Ended, Job, Message, Stopped, is_over, is_tested
 from csac.studies.named import NAMED
 from csac.studies.options import List, Report, Run, Show
 from csac.studies.progress import StudyProgress
@@ -86,7 +86,7 @@ def show(options: Show) -> int:
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     rollouts = _rollouts(studies)
     jobs = [Job(cell, store.path(cell), rollouts=rollouts[cell.key]) for cell in cells if cell.key not in collected]
-    rest = [job.cell for job in jobs if not is_over(job)]
+    rest = [job for job in jobs if not is_over(job)]
     predictions = _predictions(rest, store, not options.no_measure, console)
     table = _table("cell", "what", "steps", "state", "time", "directory")
     table.columns[5].overflow = "fold"
@@ -117,14 +117,15 @@ def show(options: Show) -> int:
     return 0
 
 
-def _predictions(cells: Sequence[Cell], store: Store, measure: bool, console: Console) -> dict[str, Prediction]:
+def _predictions(jobs: Sequence[Job], store: Store, measure: bool, console: Console) -> dict[str, Prediction]:
     """Return what each cell will take, of those whose kind was measured or can be."""
     calibration, predictions, refused = Calibration(), {}, set()
-    if measure and any(calibration.cost(cell) is None for cell in cells):
+    if measure and any(calibration.cost(job.cell) is None for job in jobs):
         _say(
             console, "measuring each kind of cell once: some seconds, longer on a busy machine (--no-measure skips it)"
         )
-    for cell in cells:
+    for job in jobs:
+        cell = job.cell
         cost, kind = calibration.cost(cell), f"{cell.algorithm} on {cell.task}"
         if cost is None and measure and kind not in refused:
             try:
@@ -134,23 +135,25 @@ def _predictions(cells: Sequence[Cell], store: Store, measure: bool, console: Co
                 refused.add(kind)
                 _say(console, f"{kind} cannot be measured: {error}", "red")
         if cost:
-            predictions[cell.key] = predict(cell, cost, store.first_step(cell))
+            rollouts = 0 if is_tested(job) else job.rollouts
+            predictions[cell.key] = predict(cell, cost, store.first_step(cell), rollouts)
     if calibration.is_busy:
         _say(console, "other processes keep this machine busy: what was measured now is too slow, and not remembered")
     return predictions
 
 
-def _told(rest: Sequence[Cell], predictions: Mapping[str, Prediction]) -> str:
-    """Return what the cells that are not over will take together."""
+def _told(rest: Sequence[Job], predictions: Mapping[str, Prediction]) -> str:
+    """Return what the cells that are not over will take together; several at once, as long as the longest of them."""
     if len(predictions) < len(rest):
         return f"{len(rest)} to run, {len(rest) - len(predictions)} of them not measured"
     workers = min(len(usable_cores()), len(rest))
-    seconds = sum(one.seconds for one in predictions.values())
+    each = [one.seconds for one in predictions.values()]
     memory = sum(sorted((one.memory for one in predictions.values()), reverse=True)[:workers])
     disk = sum(sorted((one.disk for one in predictions.values()), reverse=True)[:workers])
-    at_once = f", {duration(seconds / workers)} with {workers} at once" if workers > 1 else ""
+    together = duration(max(sum(each) / workers, *each))
+    at_once = f", about {together} with {workers} at once" if workers > 1 else ""
     return (
-        f"{len(rest)} to run: at most {duration(seconds)} of one core{at_once}; "
+        f"{len(rest)} to run: about {duration(sum(each))} of one core{at_once}; "
         f"{memory / 2**30:.2g} GiB of memory, {disk / 2**30:.2g} GiB of disk for checkpoints"
     )
 

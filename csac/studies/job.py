@@ -92,7 +92,7 @@ def is_over(job: Job) -> bool:
     if not is_final(job.path):
         return False
     failed = RunDirectory.open(job.path).manifest.state == "failed"
-    return failed or (_is_tested(job) and "failure" not in read_history(job.path))
+    return failed or (is_tested(job) and "failure" not in read_history(job.path))
 
 
 def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
@@ -120,7 +120,7 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a seed that failed is told of below
             run = _trained(job, tell)
         write_history(job.path, spent())  # now: the process may end while the policy is tested
-        if run.manifest.state == "finished" and not _is_tested(job):
+        if run.manifest.state == "finished" and not is_tested(job):
             _roll_out(job, run)
             write_history(job.path, spent())
     except InputError as error:
@@ -192,7 +192,7 @@ def _roll_out(job: Job, run: RunDirectory) -> None:
             if received and done < wanted:
                 raise Stopped(received[0])
 
-        if _is_tested(job):  # by the process that had the lock before
+        if is_tested(job):  # by the process that had the lock before
             return
         stop_if_asked(0, job.rollouts)
         ((seed, episodes),) = evaluate_run(
@@ -202,7 +202,7 @@ def _roll_out(job: Job, run: RunDirectory) -> None:
         write_rows(job.path / ROLLOUTS, COLUMNS["evaluations"], rows)
 
 
-def _is_tested(job: Job) -> bool:
+def is_tested(job: Job) -> bool:
     """Whether the last policy was tested on as many episodes as are wanted. What cannot be read is made again."""
     with suppress(InputError):
         return not job.rollouts or len(read_rows(job.path / ROLLOUTS)) >= job.rollouts

@@ -631,6 +631,26 @@ def test_a_prediction_is_warm_up_learning_and_evaluation():
     # From step 5,000 on: half of the steps, all of them learning, and half of the evaluations.
     assert predict(one, cost, done=5_000).seconds == pytest.approx(50 + 5 + 10)
     assert predict(one, cost).disk == 150 * 20 * 4  # its replay
+    # Once it is trained, only the rollouts are left.
+    assert predict(one, cost, done=10_000, rollouts=50).seconds == pytest.approx(5 + 10)
+
+
+def test_show_counts_the_rollouts_and_is_as_long_as_the_longest_cell(monkeypatch, tmp_path, capsys):
+    write(tmp_path / "tested.toml", TINY.replace("seeds = 2\nsteps = 300", "seeds = 3\nsteps = 300\nrollouts = 1000"))
+    cost = Cost(learning=0.0, evaluating=0.001, longest_episode=3_600, transition_size=20)
+    monkeypatch.setattr(Calibration, "cost", lambda self, cell: cost)
+    monkeypatch.setattr(commands, "usable_cores", lambda: [0, 1])
+    tested, untested, _ = cells_of([read_study("tested.toml")])
+    finished(Store(), tested, "0,300,0,1,9,\n" * 1000)
+    write_history(Store().path(tested), {"failure": "its process was killed by SIGKILL"})
+    finished(Store(), untested)
+    assert csac("study show tested.toml") == 0
+    out = capsys.readouterr().out
+    # 3,600 s for the rollouts of a policy, 3.6 s for an evaluation's episode, ten seconds to start.
+    assert re.findall(r"about (10 s|1 h) ", out.partition("to run")[0]) == ["10 s", "1 h", "1 h"]
+    assert "3 to run: about 2 h of one core, about 1 h with 2 at once; " in out
+    assert csac("study show tested.toml --seeds 2") == 0
+    assert "2 to run: about 1 h of one core, about 1 h with 2 at once; " in capsys.readouterr().out
 
 
 def test_a_kind_is_measured_once_whatever_its_weights(monkeypatch):
