@@ -26,6 +26,9 @@ UNGUARDED = 97
 
 _PR_SET_PDEATHSIG = 1
 
+# Of those that the system has: Windows has no hang-up.
+_HELD_BACK = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
+
 
 def usable_cores() -> list[int]:
     """Return the processors that this process may use."""
@@ -148,11 +151,13 @@ def worker_surroundings() -> Iterator[None]:
     before = {name: os.environ.get(name) for name in names}
     resource_tracker.ensure_running()  # starts at the first spawn otherwise, and would let the signals through again
     os.environ.update(dict.fromkeys(names, "1"))
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
+    has_masks = hasattr(signal, "pthread_sigmask")  # not on Windows, where a Ctrl-C reaches the workers too
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK) if has_masks else set()
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        if has_masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 

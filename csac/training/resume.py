@@ -159,6 +159,7 @@ def roll_back(run: RunDirectory) -> Restart:
         if not unfinished.is_dir():
             unfinished.unlink()
     if checkpoint is None:
+        Checkpoints(run.checkpoints, run.manifest.checkpoints.keep).discard_after(0)  # what a first one left unfinished
         return BEGINNING
     step, pinned = checkpoint.step, checkpoint.values["pinned"]
     Checkpoints(run.checkpoints, run.manifest.checkpoints.keep, pinned).discard_after(step)
@@ -235,7 +236,7 @@ class Source(NamedTuple):
     def described(self, wanted: Manifest, defaults: Mapping[str, Any]) -> Origin:
         """Return what the manifest says of where the new run began, and of what is different in it."""
         changes = differences(_fixed(self.run.manifest, defaults), _fixed(wanted, defaults))
-        return Origin(str(self.run.path), self.checkpoint.step, tuple(changes))
+        return Origin(os.path.abspath(self.run.path), self.checkpoint.step, tuple(changes))
 
     def begun(self, wanted: Manifest, defaults: Mapping[str, Any]) -> Manifest:
         """Return the manifest with which the new run is made: which seeds begin their episode anew is known by now."""

@@ -107,7 +107,9 @@ def train(
 
     Raises:
         InputError: a mistake in the arguments; nothing has been written then.
-        Interrupted: on SIGINT or SIGTERM, after everything was saved.
+        Interrupted: on SIGINT or SIGTERM, after everything was saved, if it saves checkpoints and no process that
+            trains was still starting or far behind the others; the message says from where the run can go on.
+        StoppedAtOnce: on a second signal; what came after the last checkpoint is lost.
         StorageFailure: the run directory can no longer be written; it is as sound as if the run had been killed.
     """
     end_if_unguarded()
