@@ -102,7 +102,7 @@ class Environment:
 
         Raises:
             EnvironmentFailure: the environment raised, gave no pair of observation and info, or an observation that is
-                not finite or misshapen.
+                not finite or misshapen, or took back the physics that `perturb` gave it.
         """
         self._seed = seed
         if self._noise:
@@ -112,6 +112,8 @@ class Environment:
                 given = self.raw.reset(seed=seed)
         except RAISED as error:
             raise failed_reset(error) from error
+        if self._physics and (undone := self._physics.undone()):
+            raise EnvironmentFailure(undone)
         observation = first_observation(given)
         try:
             return self._flatten(observation)

@@ -30,15 +30,16 @@ NOISES = ("observation_noise", "action_noise")
 class Physics:
     """The model of a MuJoCo task, scaled. Factors are on what the model was when this object was made.
 
-    A reset leaves it scaled, since it only renews the state.
+    A reset leaves it scaled where it only renews the state, as those of Gymnasium's tasks do; `undone` finds out.
 
     Raises:
         InputError: not a MuJoCo task.
     """
 
     def __init__(self, environment: gymnasium.Env, task_name: str) -> None:
+        self._environment: Any = environment.unwrapped
         self._mujoco: Any = sys.modules.get("mujoco")  # a task that it simulates has imported it
-        self._model: Any = getattr(environment.unwrapped, "model", None)
+        self._model: Any = getattr(self._environment, "model", None)
         if self._mujoco is None or not isinstance(self._model, self._mujoco.MjModel):
             raise InputError(
                 f"{task_name} is no MuJoCo task: {', '.join(PHYSICS)} cannot be changed, and {' and '.join(NOISES)} can"
@@ -46,6 +47,7 @@ class Physics:
         self._task_name = task_name
         self._original = copy.copy(self._model)
         self._factors = dict.fromkeys(PHYSICS, 1.0)
+        self._scaled: dict[str, np.ndarray] = {}  # what was written of the kinds whose factor is not 1, by its array
 
     def set(self, factors: Mapping[str, float]) -> None:
         """Scale the model from the next step on; a kind that is not named has the factor 1.
@@ -63,6 +65,22 @@ class Physics:
         if "mass" in changed:
             self._renew_constants()
         self._factors = wanted
+        names = (name for kind, factor in wanted.items() if factor != 1.0 for name in _SCALED[kind])
+        self._scaled = {name: _array(self._model, name).copy() for name in names}
+
+    def undone(self) -> str | None:
+        """Return what to say where a reset has taken back what was scaled, and None where it has not.
+
+        A task does so that draws other physics for each episode. To see it takes a few microseconds.
+        """
+        is_same = not self._scaled or getattr(self._environment, "model", None) is self._model
+        if is_same and all((_array(self._model, name) == array).all() for name, array in self._scaled.items()):
+            return None
+        kinds = " and ".join(kind for kind, factor in self._factors.items() if factor != 1.0)
+        return (
+            f"{self._task_name} sets its own physics at reset, which undoes a changed {kinds}: "
+            "it cannot be perturbed in this way"
+        )
 
     def _renew_constants(self) -> None:
         """Have MuJoCo derive anew what it derives of masses, with data of its own: the episode's is not touched."""

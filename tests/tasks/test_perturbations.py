@@ -16,13 +16,14 @@ from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
 from logs import log_lines
 from plans import settings
+from policies import contract, random_policy
 from resuming import LEARNERS, Crash, contents, crash_at, run
 from trajectories import steps_of
 
 from csac.deploy.choosing import load
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.evaluation.evaluator import Evaluator, evaluate
+from csac.evaluation.evaluator import EvaluationFailure, Evaluator, evaluate
 from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
@@ -37,6 +38,7 @@ from csac.tasks.perturbations import (
 )
 from csac.tasks.seeds import EVALUATION_SEED, SeedEnvironments
 from csac.tasks.snapshots import _mujoco_arrays
+from csac.tasks.spaces import EnvironmentFailure
 from csac.training import messages
 from csac.training.group import Group
 from csac.training.messages import Progress
@@ -352,6 +354,67 @@ def test_muscles_have_no_gain_to_scale(tmp_path):
     environment.perturb({"mass": 2.0})
     with pytest.raises(InputError, match="Block has actuators such as muscles"):
         environment.perturb({"gain": 2.0})
+
+
+class Randomised(Block):
+    """A block whose friction, mass or whole model is another one in each episode."""
+
+    def __init__(self, path: str, what: str) -> None:
+        self.what = ""  # the constructor of MujocoEnv makes no episode
+        super().__init__(path)
+        self.what = what
+
+    def reset_model(self) -> np.ndarray:
+        friction = self.np_random.uniform(0.2, 0.4)
+        if self.what == "friction":
+            self.model.geom_friction[1, 0] = friction
+        if self.what == "mass":
+            self.model.body_mass[1] *= 1.5
+        if self.what == "gravity":
+            self.model.opt.gravity[2] = -9.0
+        if self.what == "model":
+            self.model, self.data = self._initialize_simulation()
+        return super().reset_model()
+
+
+def randomised(folder: Path, what: str) -> Environment:
+    path = folder / "block.xml"
+    path.write_text(BLOCK.format(actuator=MOTOR, pairs=""))
+    return Environment(Randomised, {"path": str(path), "what": what})
+
+
+@pytest.mark.parametrize(
+    ("what", "kind"), [("friction", "friction"), ("mass", "mass"), ("gravity", "gravity"), ("model", "gain")]
+)
+@pytest.mark.parametrize("episodes", [0, 1])
+def test_a_task_that_sets_its_own_physics_at_reset_says_so(tmp_path, what, kind, episodes):
+    environment = randomised(tmp_path, what)
+    for seed in range(episodes):
+        environment.reset(seed)
+    environment.perturb({kind: 2.0})
+    with pytest.raises(EnvironmentFailure, match=f"^Randomised sets its own physics at reset, .* a changed {kind}: it"):
+        environment.reset(7)
+
+
+def test_a_task_that_sets_other_physics_at_reset_or_is_not_perturbed_goes_on(tmp_path):
+    environment = randomised(tmp_path, "friction")
+    environment.perturb({"mass": 2.0, "gravity": 0.5})
+    environment.reset(0)
+    environment.perturb({"friction": 1.0})
+    environment.reset(1)
+    environment = randomised(tmp_path, "model")
+    environment.perturb({"friction": 1.0})
+    environment.reset(0)
+
+
+def test_an_evaluation_that_cannot_be_perturbed_fails_in_one_line(tmp_path):
+    path = tmp_path / "block.xml"
+    path.write_text(BLOCK.format(actuator=MOTOR, pairs=""))
+    evaluator = Evaluator(Randomised, {"path": str(path), "what": "friction"}, 1, EVALUATION_SEED)
+    evaluator.perturb({"friction": 2.0})
+    with pytest.raises(EvaluationFailure, match=r"sets its own physics at reset.*cannot be perturbed") as failure:
+        evaluator.run(random_policy(contract(((None, (3,)),), (1,))))
+    assert "\n" not in str(failure.value)
 
 
 @pytest.mark.parametrize("kind", ["friction", "gravity", "mass", "gain"])
