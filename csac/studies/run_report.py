@@ -127,19 +127,27 @@ def _one_group(arms: Sequence[Arm]) -> tuple[tuple[str, tuple[str, ...]], list[A
 def _tables(arms: Sequence[Arm], kind: TableName) -> list[Table]:
     groups, tables = by_condition(arms), []
     for (task, condition), own in groups.items():
-        found: list[Table | None] = []
+        title = described(task, condition) if len(groups) > 1 else ""
         if kind == "returns":
-            found = [comparison_table(compare([(arm.label, arm.rows) for arm in own]))]
+            found = {title: comparison_table(compare([(arm.label, arm.rows) for arm in own]))}
         elif kind == "cases":
             tested = [(arm.label, arm.rollouts) for arm in own if len(arm.rollouts)]
-            found = [case_comparison_table(tested)] if tested else []
+            found = {title: case_comparison_table(tested) if tested else None}
         else:
-            found += [
-                sections.recoveries_table(own, marks_of(condition), index) for index in range(len(marks_of(condition)))
-            ]
-        title = described(task, condition) if len(groups) > 1 else ""
-        tables += [table._replace(title=title, note=f"{table.note} {_behind(own)}".strip()) for table in found if table]
+            found = _recoveries(own, title)
+        note = _behind(own)
+        tables += [
+            table._replace(title=title, note=f"{table.note} {note}".strip()) for title, table in found.items() if table
+        ]
     return tables
+
+
+def _recoveries(arms: Sequence[Arm], title: str) -> dict[str, Table]:
+    """Return a table for each change of the arms of one task and condition: under `title`, or told from each other."""
+    task, condition = arms[0].task, arms[0].condition
+    marks = marks_of(condition)
+    titles = sections.titles_of_changes(task, condition) if len(marks) > 1 else [title] * len(marks)
+    return {title: sections.recoveries_table(arms, marks, index) for index, title in enumerate(titles)}
 
 
 def _parts(

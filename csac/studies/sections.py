@@ -174,10 +174,8 @@ def robustness(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
                 panels = [panel._replace(title=", ".join(text for _, text in panel.marks)) for panel in panels]
             yield scope.figure(kind, f"{task}{number_of_it}", Curves(tuple(panels)), title)
         for (_, condition), each in conditions:
-            perturbed = by_step(perturbations_of(condition))
-            for index, (step, text) in enumerate(perturbed):
-                title = scope.titled(f"{task}, {text} after step {step:,}")
-                yield recoveries_table(each, perturbed, index)._replace(title=title)
+            for index, title in enumerate(titles_of_changes(task, condition)):
+                yield recoveries_table(each, marks_of(condition), index)._replace(title=scope.titled(title))
 
 
 def recoveries_table(arms: Sequence[Arm], perturbed: Sequence[tuple[int, str]], index: int = 0) -> Table:
@@ -255,6 +253,11 @@ def commands(lines: Sequence[str], runs: Sequence[str], told: str) -> Iterator[P
 def described(task: str, condition: Sequence[str]) -> str:
     """Return a task and what was changed there in words."""
     return ", ".join(filter(None, (task, _changes(condition))))
+
+
+def titles_of_changes(task: str, condition: Sequence[str]) -> list[str]:
+    """Return what each change of a condition is called, where it stands by itself."""
+    return [", ".join(filter(None, (task, f"{text} after step {step:,}"))) for step, text in marks_of(condition)]
 
 
 def marks_of(condition: Sequence[str]) -> list[tuple[int, str]]:

@@ -96,6 +96,19 @@ def test_what_a_change_cost_several_runs():
     ]
 
 
+def test_what_several_changes_cost_is_told_change_by_change():
+    lines = table_of("--table recovery --perturb friction=2@20 --perturb gravity=2@40", A=[[100, 100, 40, 95, 50, 60]])
+    titles = [line for line in lines if line and not line.startswith("|")]
+    assert titles == ["**friction x 2 after step 20**", "**gravity x 2 after step 40**"]
+    run = make_run_of("run", [[100.0] * 6], algorithm="sac", perturbations=("friction=2@20", "gravity=2@40"))
+    Path("page.md").write_text("<!-- it: begin -->\n<!-- it: end -->\n")
+    assert csac(f"report --into page.md#it --table recovery {run.path}") == 0
+    titles = re.findall(r"\*\*(.*)\*\*", Path("page.md").read_text())
+    assert titles == [
+        f"{run.manifest.task}, {change}" for change in ("friction x 2 after step 20", "gravity x 2 after step 40")
+    ]
+
+
 def test_what_comes_later_is_left_out():
     _, _, row = table_of("--until 20", a=[[10.0, 20.0, 99.0], [30.0, 40.0, 99.0]])
     assert row == "| a | 2 | 20 | 25 ± 14 | 2 seeds: no interval | 1.00 | 30 at 20 |"
