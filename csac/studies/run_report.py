@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Literal
 from csac.record.atomic import write_atomically
 from csac.record.plots import learning_curve
 from csac.record.rendering import Cell, Row, Table, between_markers, markdown
-from csac.record.summaries import compare
 from csac.record.summary_tables import case_comparison_table, comparison_table
 from csac.studies import sections
 from csac.studies.aggregates import over_tasks
@@ -129,7 +128,7 @@ def _tables(arms: Sequence[Arm], kind: TableName) -> list[Table]:
     for (task, condition), own in groups.items():
         title = described(task, condition) if len(groups) > 1 else ""
         if kind == "returns":
-            found = {title: comparison_table(compare([(arm.label, arm.rows) for arm in own]))}
+            found = {title: comparison_table(sections.compared(own))}
         elif kind == "cases":
             tested = [(arm.label, arm.rollouts) for arm in own if len(arm.rollouts)]
             found = {title: case_comparison_table(tested) if tested else None}
@@ -160,7 +159,7 @@ def _parts(
     yield _runs_table(comparison)
     failed = [f"{arm.label}, seed {seed} failed: {reason}" for arm in arms for seed, reason in arm.failures.items()]
     if failed:
-        yield Paragraph("Seeds that failed are in no number below.")
+        yield Paragraph("Seeds that failed are counted below, and are in no other number.")
         yield Items(tuple(failed))
     if behind := _behind(arms):
         yield Paragraph(behind)

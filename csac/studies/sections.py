@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
     from csac.record.manifest import Manifest
     from csac.record.plots import Look
+    from csac.record.summaries import RunSummary
     from csac.studies.arms import Arm
     from csac.studies.figures import Drawing
     from csac.studies.parts import Part
@@ -107,11 +108,16 @@ def returns(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
     yield Heading(scope.titled("Maximum average returns"))
     for (task, condition), own in by_condition(arms).items():
         yield returns_table(own, scope.titled(described(task, condition)))
-        yield comparison_table(compare([(arm.label, arm.rows) for arm in own]))
+        yield comparison_table(compared(own))
         yield stability_table(own, scope.titled(", ".join(filter(None, (described(task, condition), "stability")))))
         for name, trend in _trends(own):
             yield scope.figure("returns", f"{described(task, condition)}, over {name}", trend)
     yield Paragraph("Mean ± standard deviation over seeds at the evaluation where that mean is highest.")
+
+
+def compared(arms: Sequence[Arm]) -> tuple[RunSummary, ...]:
+    """Return the arms of one task and condition beside each other, with how many of their seeds have failed."""
+    return compare(_runs(arms), {arm.label: arm.failures for arm in arms})
 
 
 def returns_table(arms: Sequence[Arm], title: str) -> Table:

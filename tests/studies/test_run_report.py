@@ -305,11 +305,23 @@ def test_a_report_tells_of_perturbations_success_and_what_failed():
     make_run_of("runs/a", returns, perturbations=("friction=2@10",), failures={2: "critic is not finite"}, success=1)
     text = report("runs/a")
     assert "SAC, seed 2 failed: critic is not finite" in text
+    assert "| SAC | 2 (1 failed) | 30 |" in text
     assert "**Hopper-v4, friction x 2 after step 10**" in text
     assert "| mean | 100.0 | 50.0 | 50% |" in text  # of two seeds
     assert "## Success" in text
     assert "| success | 1,000.0 ± 0.0 |" in text
     assert {path.suffix for path in Path("out").iterdir()} == {".html", ".md", ".png", ".svg"}
+
+
+def test_the_table_of_returns_counts_the_seeds_that_failed():
+    make_run_of("runs/a", [[100.0], [80.0]], failures={1: "critic is not finite"})
+    make_run_of("runs/b", [[100.0], [80.0]])
+    Path("page.md").write_text("<!-- it: begin -->\n<!-- it: end -->\n")
+    assert csac("report --into page.md#it --label a=runs/a --label b=runs/b") == 0
+    assert re.findall(r"^\| (a|b) \| ([^|]+) \|", Path("page.md").read_text(), re.MULTILINE) == [
+        ("a", "1 (1 failed)"),
+        ("b", "2"),
+    ]
 
 
 def test_a_manifest_says_what_perturbed_a_run_and_an_option_does_not():
