@@ -2,6 +2,7 @@ import errno
 import io
 import re
 import shlex
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -440,6 +441,14 @@ def test_a_cell_that_failed_before_its_first_evaluation_is_collected_and_over(en
     assert record.evaluations.dtype.names == ("seed", "step", "episode", "return", "length", "success")
     assert csac("study run tiny.toml --seeds 1 --directory another/machine --results out") == 3
     assert not engine
+    # It is repeated once both its directory and its collected files are gone.
+    shutil.rmtree(Store().path(one))
+    assert csac("study run tiny.toml --seeds 1 --results out") == 3
+    assert not engine
+    for path in Path("out/cells", one.name.parent).glob("seed-0.*"):
+        path.unlink()
+    csac("study run tiny.toml --seeds 1 --results out")
+    assert [job.cell for job in engine] == [one]
 
 
 def test_a_manifest_tells_the_command_and_not_where_csac_is(engine, monkeypatch):
