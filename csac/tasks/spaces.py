@@ -114,7 +114,7 @@ def part(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
             return flat.astype(np.float32)
         with np.errstate(over="ignore"):
             flat = flat.astype(np.float32)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise EnvironmentFailure(f"{name} is not an array of numbers: {one_line(error)}") from error
     if array.shape != shape:
         raise EnvironmentFailure(f"{name} has shape {array.shape} where its space has {shape}")
@@ -138,6 +138,8 @@ def scalar(reward: Any) -> float:
         reward = float(reward)
     except (TypeError, ValueError):
         raise EnvironmentFailure(f"reward is a {type(reward).__name__} and is to be one number") from None
+    except OverflowError:
+        raise EnvironmentFailure("reward is a whole number that no float can hold") from None
     if not abs(reward) <= FLOAT32_MAX:
         raise EnvironmentFailure(f"reward is {reward}")
     return reward

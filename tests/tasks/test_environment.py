@@ -323,6 +323,7 @@ NAN, INF = float("nan"), float("inf")
         (spaces.Box(-9, 9, (3,)), None, "observation has shape () where its space has (3,)"),
         (spaces.Box(-9, 9, (3,)), ["a", "b", "c"], "observation is not an array of numbers"),
         (spaces.Box(-9, 9, (2,)), [[1], [1, 2]], "observation is not an array of numbers"),
+        (UNIT, [10**400], "observation is not an array of numbers"),
         (spaces.Dict(a=UNIT, b=UNIT), {"a": [0.0], "b": [NAN]}, "observation['b'][0] is nan"),
         (spaces.Dict(a=UNIT, b=UNIT), {"a": [0.0]}, "observation has no 'b'"),
         (spaces.Dict(a=UNIT), np.zeros(1), "observation has no 'a'"),
@@ -347,6 +348,7 @@ def test_a_bad_observation_is_named(space, observation, message):
         (np.ones(1), r"reward has shape \(1,\)"),
         (None, "reward is a NoneType"),
         ("high", "reward is a str"),
+        (10**400, "reward is a whole number that no float can hold"),
     ],
 )
 def test_a_bad_reward_is_named(reward, message):
