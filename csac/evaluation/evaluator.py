@@ -395,8 +395,8 @@ def _number(value: Any) -> bool | float | None:
 
 def _success(info: dict[str, Any]) -> float | None:
     """Return 1 or 0 for what a task says of its success, and None where it is silent or says nothing that counts."""
-    verdict = _numbers(info.get("is_success", info.get("success")))
-    return None if verdict is None else float(verdict.all())
+    verdicts = (_numbers(info.get(name)) for name in ("is_success", "success"))
+    return next((float(verdict.all()) for verdict in verdicts if verdict is not None), None)
 
 
 def _numbers(value: Any) -> np.ndarray | None:

@@ -239,14 +239,34 @@ def test_success_is_what_the_last_step_says(key):
     ],
 )
 def test_success_is_a_boolean_or_a_number_or_it_is_not_known(verdict, success):
+    assert success_of({"is_success": verdict}) == success
+
+
+@pytest.mark.parametrize(
+    ("told", "success"),
+    [
+        ({"is_success": None, "success": True}, 1.0),
+        ({"is_success": "no", "success": 0}, 0.0),
+        ({"is_success": False, "success": True}, 0.0),
+        ({"is_success": True, "success": None}, 1.0),
+        ({"is_success": None, "success": "yes"}, None),
+    ],
+)
+def test_of_two_words_on_success_the_first_that_counts_is_taken(told, success):
+    assert success_of(told) == success
+
+
+def success_of(info: dict[str, object]) -> float | None:
+    """Return the success of an episode whose last step has this info."""
+
     def task() -> gymnasium.Env:
         environment = probes.ConstantReward()
         step = environment.step
-        environment.step = lambda action: (*step(action)[:4], {"is_success": verdict})
+        environment.step = lambda action: (*step(action)[:4], info)
         return environment
 
     (episode,) = Evaluator(task, episodes=1).run(policy_for(probes.ConstantReward))
-    assert episode.success == success
+    return episode.success
 
 
 def test_episodes_are_offered_with_all_that_is_known_of_them():
