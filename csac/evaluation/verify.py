@@ -16,7 +16,7 @@ from csac.tasks.seeds import FRESH_EVALUATION_SEED
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from csac.deploy.artefact import Artefact
     from csac.deploy.contract import Contract
@@ -136,7 +136,6 @@ def compare_returns(
     reference: Recording,
     task: Task,
     environment_arguments: dict[str, Any] | None = None,
-    on_progress: Callable[[int, int], None] | None = None,
 ) -> Returns:
     """Play the episodes of a recording again, through an artefact.
 
