@@ -50,7 +50,7 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
 
 
 def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
-    """Return the policy that was saved by itself, or has left as an artefact without guards."""
+    """Return the policy that was saved by itself, or has left as an artefact without guards or noise."""
     if seed is not None or which != "last":
         raise InputError(f"{folder} holds one policy and no run: leave out seed and which")
     fields = read_json(folder / CONTRACT)
@@ -59,6 +59,8 @@ def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
     artefact = ArtefactContract.load(folder)
     if artefact.guards.is_any:
         raise InputError(f"{folder} is an artefact with guards: csac.deploy.artefact.open_artefact keeps them")
+    if artefact.noise_seed is not None:
+        raise InputError(f"{folder} is an artefact that samples: csac.deploy.artefact.open_artefact keeps its noise")
     if artefact.file != SAVED:
         raise InputError(f"{folder} is an artefact of the format {artefact.format}: {_OPENED}")
     return Policy.load(folder / SAVED, artefact.policy)

@@ -189,6 +189,15 @@ def test_an_artefact_without_guards_is_loaded_and_one_with_guards_is_not(tmp_pat
         load(tmp_path / "bare")
 
 
+def test_an_artefact_that_samples_is_not_loaded_as_a_policy_that_does_not(tmp_path):
+    policy = random_policy(contract(), 3)
+    write_artefact(tmp_path, policy.network, ArtefactContract(policy.contract, "numpy", noise_seed=7))
+    with pytest.raises(
+        InputError, match=r"is an artefact that samples: .*open_artefact keeps its noise"
+    ):
+        load(tmp_path)
+
+
 def test_an_artefact_of_another_format_is_told_with_what_opens_it(tmp_path):
     pytest.importorskip("onnx")
     policy, export = random_policy(contract()), tmp_path / "run" / "export"
