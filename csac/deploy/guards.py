@@ -158,7 +158,9 @@ def make_guards(
     Raises:
         InputError: numbers or combinations that cannot be meant.
     """
-    if fallback is None and (watchdog is not None or observation_low is not None):
+    if rate_limit is not None:
+        fallback = fallback or "last"
+    if fallback is None and any(given is not None for given in (watchdog, observation_low, observation_high)):
         raise InputError(
             "a watchdog and a range of observations need a --fallback action: zero, middle, last or numbers"
         )
@@ -174,7 +176,6 @@ def make_guards(
             )
         half = 0.5 * contract.action_high - 0.5 * contract.action_low  # a wide range may not overflow
         change = np.minimum(np.float32(2.0 * rate_limit) * half, np.float32(FLOAT32_MAX))
-        fallback = fallback or "last"
     if fallback is None:
         return NO_GUARDS
     size = contract.spec.observation_size

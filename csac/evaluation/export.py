@@ -300,7 +300,7 @@ def _check(formats: Sequence[Format], options: ExportOptions, policy: Policy) ->
         raise InputError(f"no range is called {options.observation_range!r}: choose bounds or recorded")
     if options.observation_range is not None and not options.episodes:
         raise InputError("a range of observations comes from the task: it needs episodes to verify with")
-    if options.observation_range is not None and options.fallback is None:
+    if options.observation_range is not None and options.fallback is None and options.rate_limit is None:
         raise InputError("a range of observations needs a --fallback action: zero, middle, last or numbers")
     if options.range_margin is not None and not 0.0 <= options.range_margin < np.inf:
         raise InputError(f"a range margin of {options.range_margin}: give a share of the width, 0 or more")

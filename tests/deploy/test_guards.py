@@ -56,6 +56,12 @@ def test_the_rate_limit_is_a_share_of_the_range_and_holds_for_fallbacks_too():
     np.testing.assert_allclose(limited, [[3, -1], [2.6, -0.6], [2.2, -0.2], [2.2, -0.2]], atol=1e-6)
 
 
+def test_a_rate_limit_alone_falls_back_on_the_last_action_whatever_else_is_asked_for():
+    steps = [(GOOD, [2.0, 2.0]), (NAN, [0.0, 0.0]), (FAR, [0.0, 0.0]), (GOOD, [0.0, 0.0])]
+    given = {"rate_limit": 1.0, "watchdog": 2, "observation_high": np.full(2, 4.0)}
+    assert run_guards(guards(**given), steps) == [[2, 2]] * 4
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -64,6 +70,8 @@ def test_the_rate_limit_is_a_share_of_the_range_and_holds_for_fallbacks_too():
         ({"fallback": "1,4"}, "outside of the action's bounds"),
         ({"fallback": "1,nan"}, "outside of the action's bounds"),
         ({"watchdog": 3}, "need a --fallback"),
+        ({"observation_low": np.zeros(2)}, "need a --fallback"),
+        ({"observation_high": np.zeros(2)}, "need a --fallback"),
         ({"watchdog": 0, "fallback": "zero"}, "at least 1"),
         ({"watchdog": 2**24 + 1, "fallback": "zero"}, "16,777,217 bad observations: give at most 16,777,216"),
         ({"rate_limit": 0.0}, "more than 0, at most 1"),

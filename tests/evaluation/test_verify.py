@@ -375,6 +375,15 @@ def test_a_range_of_bounds_is_the_tasks(tmp_path):
     assert guards.observation_low[1] == np.finfo(np.float32).min
 
 
+def test_a_rate_limit_brings_the_fallback_that_a_range_and_a_watchdog_need(tmp_path):
+    make_run(tmp_path / "run")
+    options = dataclasses.replace(QUICK, rate_limit=0.1, watchdog=5, observation_range="bounds")
+    guards = export(tmp_path / "run", options=options).contract.guards
+    assert (guards.fallback, guards.watchdog) == ("last", 5)
+    assert guards.observation_low is not None
+    assert guards.observation_low[0] == -1.0
+
+
 def test_without_episodes_the_task_is_not_made(tmp_path):
     make_run(tmp_path / "run", task="no_such_module:Nothing-v0")
     exported = export(tmp_path / "run", options=ExportOptions(episodes=0))
