@@ -23,7 +23,7 @@ from csac.deploy.templates import LOADER
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from csac.deploy.artefact_contract import Format
 
@@ -142,7 +142,13 @@ def compile_c(*arguments: str | Path, program: str = "cc") -> None:
     result = subprocess.run([compiler(program), *map(str, arguments)], capture_output=True, text=True)
     if result.returncode:
         complaint = next((line for line in result.stderr.splitlines() if "error" in line), result.stderr)
-        raise InputError(f"{program} does not compile policy.h: {' '.join(complaint.split())}")
+        raise InputError(f"{program} does not compile {_blamed(complaint, arguments)}: {' '.join(complaint.split())}")
+
+
+def _blamed(complaint: str, arguments: Sequence[str | Path]) -> str:
+    """Return the name of the file that a compiler complains of, or else of the source that it was given."""
+    files = (complaint.partition(":")[0], *map(str, arguments))
+    return next((Path(file).name for file in files if file.endswith((".c", ".h"))), "what it was given")
 
 
 @contextmanager

@@ -83,10 +83,18 @@ def _size(place: Path, target: str, compiler: str, lister: str, options: tuple[s
     if listed.returncode:
         raise _ToolFailure(f"{lister} fails: {' '.join(listed.stderr.split())}")
     stack = sum(int(line.split("\t")[1]) for line in made.with_suffix(".su").read_text().splitlines())
+    bytes_of = _bytes_of(listed.stdout)
+    if not any(bytes_of.values()):
+        raise _ToolFailure(f"{lister} lists none of the sections {', '.join(bytes_of)}")
+    return Size(target, bytes_of["text"], bytes_of["rodata"], bytes_of["data"] + bytes_of["bss"], stack)
+
+
+def _bytes_of(listed: str) -> dict[str, int]:
+    """Return the bytes of each kind of section, such as `.text.csac_step`, in what `size -A` lists."""
     bytes_of = {"text": 0, "rodata": 0, "data": 0, "bss": 0}
-    for line in listed.stdout.splitlines():
+    for line in listed.splitlines():
         words = line.split()
         kind = words[0].split(".")[1] if words and words[0].startswith(".") else ""
         if kind in bytes_of:
             bytes_of[kind] += int(words[1])
-    return Size(target, bytes_of["text"], bytes_of["rodata"], bytes_of["data"] + bytes_of["bss"], stack)
+    return bytes_of

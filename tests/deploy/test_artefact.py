@@ -12,8 +12,8 @@ import pytest
 from artefacts import GUARDED, exported, leave, needs_compiler
 from policies import ALGORITHMS, algorithm_policy, contract, random_layers, random_policy
 
-from csac.deploy import tensors
-from csac.deploy.artefact import header_alone, open_artefact
+from csac.deploy import c_size, tensors
+from csac.deploy.artefact import compile_c, header_alone, open_artefact
 from csac.deploy.artefact_contract import ArtefactContract, Format, sha256_of
 from csac.deploy.guards import NO_GUARDS, make_guards
 from csac.deploy.parameters import to_tensors
@@ -256,6 +256,32 @@ def test_headers_of_the_system_s_that_lie_beside_are_not_compiled(tmp_path, monk
     assert np.isfinite(open_artefact(tmp_path).act(np.zeros(5))).all()
     assert len(latency.measure(tmp_path, calls=3, seconds=0)[0].durations) == 3
     assert isinstance(sizes(tmp_path), list)
+
+
+@needs_compiler
+def test_what_does_not_compile_is_named(tmp_path):
+    source, header = tmp_path / "latency.c", tmp_path / "policy.h"
+    source.write_text('#include "policy.h"\nint two(void) { return missing; }\n')
+    header.write_text("int one(void);\n")
+    with pytest.raises(InputError, match=r"cc does not compile latency\.c: .*missing"):
+        compile_c("-c", source, "-o", tmp_path / "made.o")
+    with pytest.raises(InputError, match=r"cc does not compile latency\.c: .*no-such-option"):
+        compile_c("-c", "--no-such-option", source, "-o", tmp_path / "made.o")
+    header.write_text("#error not today\n")
+    with pytest.raises(InputError, match=r"cc does not compile policy\.h: .*not today"):
+        compile_c("-c", source, "-o", tmp_path / "made.o")
+
+
+@needs_compiler
+def test_sections_of_other_names_have_no_size(tmp_path, monkeypatch):
+    """As on macOS, where an object has `__text` and `__const`: nothing known is not nothing at all."""
+    lister, told = tmp_path / "size", []
+    lister.write_text("#!/bin/sh\necho 'section size addr'\necho '__text 345 0'\necho '__const 4567 345'\n")
+    lister.chmod(0o755)
+    monkeypatch.setattr(c_size, "TARGETS", {"this machine": ("cc", str(lister), ())})
+    leave(tmp_path / "made", algorithm_policy("csac"), "c")
+    assert c_size.sizes(tmp_path / "made", told.append) == []
+    assert told == [f"no size for this machine: {lister} lists none of the sections text, rodata, data, bss"]
 
 
 @needs_compiler
