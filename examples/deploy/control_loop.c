@@ -41,6 +41,24 @@ static struct timespec later(struct timespec time, long nanoseconds)
     return time;
 }
 
+static void sleep_until(struct timespec due)
+{
+#ifdef TIMER_ABSTIME
+    clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
+#else /* macOS sleeps for a while only, not until a time */
+    struct timespec now, wait;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    wait.tv_sec = due.tv_sec - now.tv_sec;
+    wait.tv_nsec = due.tv_nsec - now.tv_nsec;
+    if (wait.tv_nsec < 0) {
+        wait.tv_sec--;
+        wait.tv_nsec += 1000000000;
+    }
+    if (wait.tv_sec >= 0)
+        nanosleep(&wait, NULL);
+#endif
+}
+
 int main(void)
 {
     static csac_state state = CSAC_INITIAL; /* what the guards remember; csac_reset(&state) where an episode begins */
@@ -61,7 +79,7 @@ int main(void)
             missed++;
             due = now; /* go on from here: steps that are late are not made up for by steps that are early */
         } else
-            clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
+            sleep_until(due);
     }
     /* Actuators keep the last action until somebody tells them another: on a robot, command here what is safe for it. */
     fprintf(stderr, "%ld steps at %g Hz, %ld of them too late\n", steps, (double)CSAC_CONTROL_RATE_HZ, missed);

@@ -7,10 +7,12 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from artefacts import WITHOUT_ABSOLUTE_SLEEP
 from policies import algorithm_policy, contract, random_policy
 
 from csac.deploy.artefact_contract import ArtefactContract
@@ -50,6 +52,19 @@ def test_the_loop_in_c(tmp_path, algorithm):
     strict = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
     subprocess.run(["cc", *strict, "-I", folder, EXAMPLES / "control_loop.c", "-o", program, "-lm"], check=True)
     check_loop([program], policy)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
+def test_the_loop_in_c_sleeps_where_nobody_can_sleep_until_a_time(tmp_path):
+    """As on macOS."""
+    policy = algorithm_policy("csac")
+    folder, program, source = leave(tmp_path / "c", policy, "c"), tmp_path / "control_loop", tmp_path / "loop.c"
+    source.write_text(WITHOUT_ABSOLUTE_SLEEP + (EXAMPLES / "control_loop.c").read_text())
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
+    subprocess.run(["cc", *strict, "-I", folder, source, "-o", program, "-lm"], check=True)
+    began = time.perf_counter()
+    check_loop([program], policy)
+    assert time.perf_counter() - began > 0.019  # 20 steps at 1,000 Hz
 
 
 def test_the_loop_in_python(tmp_path):

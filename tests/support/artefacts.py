@@ -17,6 +17,12 @@ from csac.deploy.writing import write_artefact
 FORMATS: tuple[Format, ...] = ("numpy", "onnx", "c")
 HAS_COMPILER = shutil.which("cc") is not None
 needs_compiler = pytest.mark.skipif(not HAS_COMPILER, reason="no C compiler here")
+WITHOUT_ABSOLUTE_SLEEP = """\
+#define _POSIX_C_SOURCE 200112L
+#include <time.h>
+#undef TIMER_ABSTIME
+#pragma GCC poison clock_nanosleep
+"""  # what precedes a source in C, to compile it as where this is not there
 LOW, HIGH = np.full(5, -1.5), np.full(5, 1.5)
 GUARDED: dict[str, Any] = {
     "fallback": "last",
