@@ -43,8 +43,11 @@ class Latency(NamedTuple):
 class Measure(Protocol):
     """Makes calls: so many, `period` nanoseconds apart (0: at once)."""
 
-    def __call__(self, calls: int, period: int, durations: np.ndarray, lateness: np.ndarray) -> None:
-        """Write the nanoseconds of each call, and how late it began, int64 [calls]."""
+    def __call__(self, calls: int, period: int, durations: np.ndarray, lateness: np.ndarray, due: int = 0) -> int:
+        """Write the nanoseconds of each call, and how late it began, int64 [calls]; return when the last was due.
+
+        The first is due a period after `due`, by the clock of these calls, or after now where that is 0.
+        """
         ...
 
 
@@ -109,9 +112,9 @@ def measure_python(act: Callable[[np.ndarray], object], observations: np.ndarray
     """Return what makes calls of a function of Python, on observations [n, observation] in turn."""
     several = list(observations)
 
-    def make_calls(calls: int, period: int, durations: np.ndarray, lateness: np.ndarray) -> None:
+    def make_calls(calls: int, period: int, durations: np.ndarray, lateness: np.ndarray, due: int = 0) -> int:
         clock, count = time.perf_counter_ns, len(several)
-        due, is_collecting = clock(), gc.isenabled()
+        due, is_collecting = due or clock(), gc.isenabled()
         gc.disable()
         try:
             for call in range(calls):
@@ -125,15 +128,17 @@ def measure_python(act: Callable[[np.ndarray], object], observations: np.ndarray
         finally:
             if is_collecting:
                 gc.enable()
+        return due
 
     return make_calls
 
 
 def _in_parts(make_calls: Measure, calls: int, part: int, period: int) -> tuple[np.ndarray, np.ndarray]:
     durations, lateness = np.zeros((2, calls), np.int64)
+    due = 0
     for begin in range(0, calls, part):
         some = slice(begin, begin + part)
-        make_calls(len(durations[some]), period, durations[some], lateness[some])
+        due = make_calls(len(durations[some]), period, durations[some], lateness[some], due)
     return durations, lateness
 
 
@@ -155,17 +160,18 @@ def _measure_c(artefact: Artefact) -> Measure:
             "-lm",
         )
         function = ctypes.CDLL(str(library)).latency_measure  # stays in memory without its file
-    function.restype = None
+    function.restype = ctypes.c_int64
     observations = _observations(artefact)
 
-    def make_calls(calls: int, period: int, durations: np.ndarray, lateness: np.ndarray) -> None:
-        function(
+    def make_calls(calls: int, period: int, durations: np.ndarray, lateness: np.ndarray, due: int = 0) -> int:
+        return function(
             ctypes.c_void_p(observations.ctypes.data),
             ctypes.c_int64(len(observations)),
             ctypes.c_int64(calls),
             ctypes.c_int64(period),
             ctypes.c_void_p(durations.ctypes.data),
             ctypes.c_void_p(lateness.ctypes.data),
+            ctypes.c_int64(due),
         )
 
     return make_calls

@@ -5,12 +5,12 @@ from __future__ import annotations
 import io
 import re
 import shlex
-import shutil
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from artefacts import WITHOUT_ABSOLUTE_SLEEP, needs_compiler
 from policies import algorithm_policy
 from rich.console import Console
 
@@ -27,7 +27,7 @@ from csac.types import InputError
 
 FORMATS = [
     "numpy",
-    pytest.param("c", marks=pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")),
+    pytest.param("c", marks=needs_compiler),
 ]
 
 
@@ -71,6 +71,28 @@ def test_at_a_rate_a_call_that_is_too_long_makes_those_after_it_late(monkeypatch
     # Due at 1,000, 2,000, ...; the third begins at 3,050 and ends at 6,050. Nobody sleeps then: 4,000 is due since
     # 2,050, 5,000 since 1,150 (at 6,150), 6,000 since 250 (at 6,250).
     assert lateness.tolist() == [50, 50, 50, 2_050, 1_150, 250]
+
+
+def test_lateness_is_carried_from_part_to_part(monkeypatch):
+    """The same calls as above: what is too long in one part makes those of the next ones late."""
+    clock = Clock(monkeypatch)
+    _, lateness = latency._in_parts(measure_python(clock.act, np.zeros((2, 1), np.float32)), 6, 3, 1_000)
+    assert lateness.tolist() == [50, 50, 50, 2_050, 1_150, 250]
+
+
+@needs_compiler
+@pytest.mark.parametrize("before", ["", WITHOUT_ABSOLUTE_SLEEP], ids=["until a time", "for a while"])
+def test_in_c_calls_are_due_after_those_before_them(tmp_path, monkeypatch, before):
+    source, period = tmp_path / "latency.c", 2_000_000
+    source.write_text(before + latency.LATENCY.read_text())
+    monkeypatch.setattr(latency, "LATENCY", source)
+    make_calls = latency._measure_c(latency.open_artefact(leave(tmp_path / "artefact", "c")))
+    durations, lateness = np.zeros((2, 5), np.int64)
+    due = make_calls(5, period, durations, lateness)
+    assert (lateness >= 0).all()
+    again = make_calls(5, period, durations, lateness, due - 1_000 * period)
+    assert again == due - 995 * period
+    assert (lateness > 990 * period).all()
 
 
 @pytest.mark.parametrize("format", FORMATS)
