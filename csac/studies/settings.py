@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from csac.studies.parts import Part
-    from csac.studies.study import Method, Study
+    from csac.studies.study import Study
 
 # What the rows of the paper's table are called here: an algorithm has some of these names.
 _NAMES: Mapping[str, tuple[str, ...]] = {
@@ -42,8 +42,7 @@ def hyperparameters(study: Study) -> Iterator[Part]:
     settings: dict[str, Settings] = {}
     for entry in study.narrowed(seeds=1).entries():
         settings.setdefault(entry.method.label, {})[entry.cell.task] = entry.cell.hyperparameters
-    published = [method for method in study.methods if method.published]
-    if published:
+    if published := {method.label: method.published for method in study.methods if method.published}:
         yield from _beside_the_paper(published, settings)
     yield _all(settings, study.tasks)
     if differing := _by_task(settings, study.tasks):
@@ -52,19 +51,18 @@ def hyperparameters(study: Study) -> Iterator[Part]:
         yield Paragraph(_SHORTENED)
 
 
-def _beside_the_paper(methods: Sequence[Method], settings: Mapping[str, Settings]) -> Iterator[Part]:
+def _beside_the_paper(published: Mapping[str, str], settings: Mapping[str, Settings]) -> Iterator[Part]:
+    """Yield the paper's rows for each method, by its label, that stands beside a column of the paper."""
     rows, others = [], []
     for name in (*_NAMES, *_WEIGHTS):
         cells = []
-        for method in methods:
-            pairs = {
-                task: (_ours(name, own), _papers(name, method, task)) for task, own in settings[method.label].items()
-            }
+        for label, column in published.items():
+            pairs = {task: (_ours(name, own), _papers(name, column, task)) for task, own in settings[label].items()}
             differs = any(theirs is not None and not _is_same(ours, theirs) for ours, theirs in pairs.values())
-            others += [f"{name} of {method.label}"] * differs
+            others += [f"{name} of {label}"] * differs
             cells.append(_grouped({task: _told(*pair) for task, pair in pairs.items()}))
         rows.append(Row((Cell(name), *cells)))
-    yield Table(("the paper's rows, our values", *(method.label for method in methods)), tuple(rows))
+    yield Table(("the paper's rows, our values", *published), tuple(rows))
     told = f"Different from the paper's: {', '.join(others)}." if others else "All are the paper's."
     yield Paragraph(told + f" {_PPO_BATCH}" * ("Batch Size of PPO" in others))
 
@@ -101,15 +99,15 @@ def _ours(name: str, own: Mapping[str, Any]) -> list[Any]:
     return list(dict.fromkeys(own[one] for one in names if one in own))
 
 
-def _papers(name: str, method: Method, task: str) -> str | None:
+def _papers(name: str, published: str, task: str) -> str | None:
     """Return what the paper says, None where it says nothing. What a study sweeps is one of the paper's weights too."""
-    column = method.published if method.published in paper.METHODS else "CSAC"
+    column = published if published in paper.METHODS else "CSAC"
     if name in _NAMES:
-        return paper.HYPERPARAMETERS[name][column or "CSAC"]
+        return paper.HYPERPARAMETERS[name][column]
     if column != "CSAC" or task not in paper.WEIGHTS:
         return None
-    if name == "tau" and method.published != "CSAC":
-        return (method.published or "").removeprefix("tau ")
+    if name == "tau" and published != "CSAC":
+        return published.removeprefix("tau ")
     return f"{getattr(paper.WEIGHTS[task], name):g}"
 
 
