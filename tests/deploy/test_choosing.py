@@ -192,9 +192,7 @@ def test_an_artefact_without_guards_is_loaded_and_one_with_guards_is_not(tmp_pat
 def test_an_artefact_that_samples_is_not_loaded_as_a_policy_that_does_not(tmp_path):
     policy = random_policy(contract(), 3)
     write_artefact(tmp_path, policy.network, ArtefactContract(policy.contract, "numpy", noise_seed=7))
-    with pytest.raises(
-        InputError, match=r"is an artefact that samples: .*open_artefact keeps its noise"
-    ):
+    with pytest.raises(InputError, match=r"is an artefact that samples: .*open_artefact keeps its noise"):
         load(tmp_path)
 
 
