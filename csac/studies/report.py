@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from csac.record.plots import NO_LOOKS
 from csac.record.rendering import Cell, Row, Table
@@ -14,6 +14,7 @@ from csac.studies.aggregates import over_tasks
 from csac.studies.arms import gather, with_rows
 from csac.studies.cells import complete
 from csac.studies.claims import VERDICTS, comparisons, decide
+from csac.studies.command_words import changed
 from csac.studies.parts import Heading, Paragraph, write
 from csac.studies.sections import Scope, report_looks
 from csac.studies.settings import hyperparameters
@@ -71,10 +72,7 @@ def train_command(arm: Arm) -> str:
     words += [word for perturbation in one.perturbations for word in ("--perturb", perturbation)]
     words += ["--env-kwargs", json.dumps(one.environment_arguments)] * bool(one.environment_arguments)
     words += ["--events", ",".join(one.events)] * bool(one.events)
-    default = complete(one.algorithm, {})
-    for name, value in complete(one.algorithm, one.hyperparameters).items():
-        if value != default[name]:
-            words += _option(name, value)
+    words += changed(complete(one.algorithm, one.hyperparameters), complete(one.algorithm, {}))
     return shlex.join(words)
 
 
@@ -116,10 +114,3 @@ def _claims(study: Study, arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
     if len(found) > len(measured):
         yield Paragraph(f"Of {len(found) - len(measured)} more nothing was measured, or not both sides.")
     yield Paragraph(_VERDICTS)
-
-
-def _option(name: str, value: Any) -> list[str]:
-    flag = name.replace("_", "-")
-    if isinstance(value, bool):
-        return [f"--{flag}" if value else f"--no-{flag}"]
-    return [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]

@@ -18,12 +18,14 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from csac.record.atomic import write_atomically
 from csac.record.plots import COLOURS, STYLE, save
 from csac.record.rendering import EMPTY, Cell, Row, Table, markdown, number, numeric
+from csac.studies.cells import complete
+from csac.studies.command_words import changed
 from csac.studies.figures import FORMATS
 from csac.studies.shared_study import OBJECTIVE
 from csac.training.options import Options
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from csac.studies.shared_study import Question, Result, SharedStudy
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 FEWEST_FOR_IMPORTANCES = 50  # complete trials: the best tenth, which they rest on, has five of them then
 REPORT_SEEDS = 5  # of the command for the best configuration
 SHOWN = 10  # trials in the table on the terminal
+_EVALUATION = ("evaluation_interval", "evaluation_episodes")
 
 
 def write_report(study: SharedStudy, command: str) -> list[Path]:
@@ -56,15 +59,15 @@ def write_report(study: SharedStudy, command: str) -> list[Path]:
 
 def best_command(question: Question, values: Mapping[str, Any]) -> str:
     """Return the line that trains a configuration with fresh seeds, none of which the search has used."""
-    algorithm = question.algorithm_with(values)
-    default = type(algorithm)()
+    algorithm = question.algorithm.name
     first_seed = 0 if question.first_seed >= REPORT_SEEDS else question.labels[-1] + 1
-    words = ["csac", "train", question.task, "--algorithm", algorithm.name, "--steps", str(question.steps)]
+    words = ["csac", "train", question.task, "--algorithm", algorithm, "--steps", str(question.steps)]
     words += ["--seeds", str(REPORT_SEEDS)] + (["--first-seed", str(first_seed)] if first_seed else [])
-    words += _changed(question, Options(), ("evaluation_interval", "evaluation_episodes"))
+    words += changed({name: getattr(question, name) for name in _EVALUATION}, vars(Options()))
     if question.environment_arguments:
         words += ["--env-kwargs", json.dumps(question.environment_arguments)]
-    return shlex.join(words + _changed(algorithm, default, question.hyperparameters))
+    own = complete(algorithm, {**question.hyperparameters, **values})
+    return shlex.join(words + changed(own, complete(algorithm, {})))
 
 
 def trials_table(question: Question, results: Sequence[Result], most: int | None = None) -> Table:
@@ -201,17 +204,3 @@ def _value_cell(value: Any) -> Cell:
     if value is None:
         return EMPTY
     return Cell(f"{value:g}", float(value)) if isinstance(value, int | float) else Cell(str(value))
-
-
-def _changed(given: object, default: object, names: Iterable[str]) -> list[str]:
-    """Return the options for what is not as it is by default."""
-    words = []
-    for name in names:
-        value, flag = getattr(given, name), name.replace("_", "-")
-        if value == getattr(default, name):
-            continue
-        if isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--no-{flag}")
-        else:
-            words += [f"--{flag}", *(map(str, value) if isinstance(value, tuple) else [str(value)])]
-    return words

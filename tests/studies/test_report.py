@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from csac.studies import paper
 from csac.studies.arms import Arm, gather
 from csac.studies.claims import Comparison, comparisons, decide, interactions, lower_boundary
+from csac.studies.command_words import changed
 from csac.studies.named import NAMED
 from csac.studies.report import train_command, write_report
 from csac.studies.study import ANALYSES, read_study
@@ -376,6 +377,15 @@ def test_the_command_of_an_arm_trains_every_seed_of_it():
     arm.manifests = [replace(one, seeds=(100 + one.seeds[0],)) for one in arm.manifests]
     arm.missing, arm.failures = [102], {103: "critic is not finite"}
     assert "--seeds 4 --first-seed 100 --evaluation-interval" in train_command(arm)
+
+
+def test_settings_are_the_words_of_a_command():
+    default = {"steps": 1, "entropy_weight": 0.2, "sizes": (8, 8), "is_new": False, "is_old": True, "bound": 0.5}
+    given = {"entropy_weight": "auto", "sizes": (8, 16), "is_new": True, "is_old": False}
+    words = "--entropy-weight auto --sizes 8 16 --is-new --no-is-old"
+    assert changed({**default, **given}, default) == words.split()
+    assert changed({**default, "sizes": [4]}, default) == ["--sizes", "4"], "as JSON has it"
+    assert changed({**default, "bound": None}, default) == [], "nothing that can be typed means none"
 
 
 STUDIES = [name for name in NAMED if name not in ("reference", "smoke")]
