@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 HOME = Path("runs/studies/cells")
 LONGEST_NAME = 70  # characters of what a directory says of its cell, before the hash
+LOST_EPISODE = "the episode in progress, which the checkpoint could not hold"  # that `restarting_seeds` restart
 
 State = Literal["waiting", "partial", "running", "complete", "failed"]
 

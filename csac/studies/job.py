@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from csac.record.csv_tables import COLUMNS, read_rows, write_rows
 from csac.record.run import RunDirectory
-from csac.studies.cells import Cell, is_final, is_in_use, read_history, restarting_seeds, write_history
+from csac.studies.cells import LOST_EPISODE, Cell, is_final, is_in_use, read_history, restarting_seeds, write_history
 from csac.studies.collected import ROLLOUTS
 from csac.tasks.perturbations import Perturbation, perturbations_of, values_at
 from csac.training.interruptions import caught_signals
@@ -148,7 +148,7 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
 
     cell = job.cell
     if restarting_seeds(job.path):
-        tell(Noted(cell.key, "restarts the episode in progress, which the checkpoint could not hold"))
+        tell(Noted(cell.key, f"restarts {LOST_EPISODE}"))
     return train(
         cell.make_algorithm(),
         cell.task,

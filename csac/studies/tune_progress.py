@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from csac.console.tables import duration, make_console, number, short
+from csac.studies.cells import LOST_EPISODE
 from csac.studies.tune import Watcher
 
 if TYPE_CHECKING:
@@ -73,8 +74,7 @@ class TuneProgress(Watcher):
         """Say which seeds go on inexactly."""
         several = len(seeds) > 1
         who = f"seed{'s' * several} {', '.join(map(str, seeds))} restart{'s' * (not several)}"
-        lost = "the episode in progress, which the checkpoint could not hold"
-        self._print(Text(f"note: trial {attempt.label}: {who} {lost}"))
+        self._print(Text(f"note: trial {attempt.label}: {who} {LOST_EPISODE}"))
 
     def advanced(self, step: int, objective: float) -> None:
         """Show how far the trial is."""
