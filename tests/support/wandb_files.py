@@ -7,6 +7,7 @@ import struct
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import wandb
 from wandb.proto.wandb_internal_pb2 import Record  # pyright: ignore[reportAttributeAccessIssue]
 
 BLOCK, FILE_HEADER, HEADER = 32768, 7, 7
@@ -28,7 +29,11 @@ class OfflineRun(NamedTuple):
 
 
 def offline_runs(folder: Path) -> list[OfflineRun]:
-    """Return the runs in a folder `wandb`, in the order in which they were begun."""
+    """Return the runs in a folder `wandb`, in the order in which they were begun.
+
+    Ends W&B's own process first: a run's `finish` comes back before that process has written the end of its file.
+    """
+    wandb.teardown()
     return [
         _read(path) for path in sorted(folder.glob("offline-run-*/*.wandb"), key=lambda path: path.stat().st_ctime_ns)
     ]
