@@ -23,12 +23,13 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from benchmarks.contenders import PEERS_PYTHON
 from benchmarks.measuring import ROOT, Process, lasting, machine, run, run_one, surroundings, watch_load
 from benchmarks.tables import Row, read_rows, write_rows
 from csac.processes import usable_cores
+from csac.studies.command_words import options
 from csac.studies.study import Study, read_study
 from csac.types import InputError
 
@@ -105,19 +106,9 @@ def training(study: Study, arm: str, task: str, steps: int) -> list[str]:
     csac always evaluates its last policy. One episode is the least that it can be asked for, a second or less.
     """
     method = next(method for method in study.methods if method.label == arm)
-    words = ["train", task, "--algorithm", method.algorithm]
-    for name, value in method.hyperparameters_on(task).items():
-        words += _flag(name.replace("_", "-"), value)
+    words = ["train", task, "--algorithm", method.algorithm, *options(method.hyperparameters_on(task))]
     plan = ["--steps", str(steps), "--first-seed", str(study.first_seed)]
     return [*words, *plan, "--evaluation-interval", str(steps), "--evaluation-episodes", "1"]
-
-
-def _flag(name: str, value: Any) -> list[str]:
-    if value is None:
-        return []
-    if isinstance(value, bool):
-        return [f"--{'' if value else 'no-'}{name}"]
-    return [f"--{name}", *map(str, value if isinstance(value, (list, tuple)) else [value])]
 
 
 def time_training(words: Sequence[str]) -> float:

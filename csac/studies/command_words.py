@@ -10,7 +10,12 @@ if TYPE_CHECKING:
 
 def changed(given: Mapping[str, Any], default: Mapping[str, Any]) -> list[str]:
     """Return the options for what is not as it is by default."""
-    return [word for name, value in given.items() if value != default[name] for word in _option(name, value)]
+    return options({name: value for name, value in given.items() if value != default[name]})
+
+
+def options(given: Mapping[str, Any]) -> list[str]:
+    """Return the options for all of these settings."""
+    return [word for name, value in given.items() for word in _option(name, value)]
 
 
 def _option(name: str, value: Any) -> list[str]:
