@@ -37,12 +37,15 @@ WIDTHS = Limit(
 
 
 LARGEST = 2**31 - 1  # compiled programs count in 32 bits
+# They compute in 32 as well: what is smaller than the first is 0 there.
+SMALLEST_FLOAT, LARGEST_FLOAT = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 
 def check_hyperparameters(algorithm: Any, incompatible: Iterable[tuple[Mapping[str, Sequence[Any]], str]] = ()) -> None:
     """Take an algorithm's fields as plain Python values, and refuse one outside its range or its choices.
 
-    NumPy's scalars become Python's, and lists tuples, so that what is recorded does not depend on how it was given.
+    NumPy's scalars become Python's, lists tuples, and a whole number a float where that is asked for, so that what is
+    recorded does not depend on how it was given.
     `incompatible` are values of fields that make no sense together, and why.
 
     Raises:
@@ -55,7 +58,7 @@ def check_hyperparameters(algorithm: Any, incompatible: Iterable[tuple[Mapping[s
         if words := _what_it_must_be(value, hints[field.name]):
             hint = written_in_python(field.name, value, hints)
             raise InputError(f"{field.name} must be {words}, not {value!r}{hint and f': {hint}'}")
-        object.__setattr__(algorithm, field.name, value)
+        object.__setattr__(algorithm, field.name, float(value) if _is_float(value, hints[field.name]) else value)
     for values, why in incompatible:
         if all(getattr(algorithm, name) in refused for name, refused in values.items()):
             told = " with ".join(f"{name} {getattr(algorithm, name)}" for name in values)
@@ -86,9 +89,26 @@ def _what_it_must_be(value: Any, hint: Any) -> str | None:
         return "a whole number"
     if hint is int and value > LARGEST:
         return f"at most {LARGEST:,}"
-    if hint in (float, float | None) and not _is_finite(value) and not (value is None and hint == float | None):
-        return "a finite number"
+    if hint in (float, float | None) and not (value is None and hint == float | None):
+        if not _is_finite(value):
+            return "a finite number"
+        if value and not SMALLEST_FLOAT <= abs(value) <= LARGEST_FLOAT:
+            return f"a number that 32 bits can hold, {SMALLEST_FLOAT:.1e} to {LARGEST_FLOAT:.1e}"
+        if words := _broken(limits, value):
+            return words
+        return (words := _broken(limits, float(np.float32(value)))) and f"{words} in 32 bits"
+    return _broken(limits, value)
+
+
+def _broken(limits: Sequence[Limit], value: Any) -> str | None:
     return next((limit.words for limit in limits if not limit.accepts(value)), None)
+
+
+def _is_float(value: Any, hint: Any) -> bool:
+    """Whether it is a number where floats belong, and whole numbers alone do not."""
+    hint, *_ = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    kinds = {kind for part in (get_args(hint) or (hint,)) for kind in (part, *get_args(part))}
+    return isinstance(value, Real) and not isinstance(value, bool) and float in kinds
 
 
 def _plain(value: Any) -> Any:

@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import json
 import math
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -122,6 +123,39 @@ def test_numbers_beyond_what_programs_count_with():
     for settings, words in cases:
         with pytest.raises(InputError, match=words):
             CSAC(**settings)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings", "words"),
+    [
+        (CSAC, {"entropy_weight": 1e39}, "entropy_weight must be a number that 32 bits can hold.*not 1e\\+39"),
+        (PPO, {"clip_range": 10**39}, "clip_range must be a number that 32 bits can hold, 1.2e-38 to 3.4e"),
+        (SAC, {"target_entropy": -1e39}, "target_entropy must be a number that 32 bits can hold"),
+        (TD3, {"max_gradient_norm": 1e-46}, "max_gradient_norm must be a number that 32 bits can hold"),
+        (SAC, {"adam_momentum": 0.99999999}, "adam_momentum must be .*less than 1 in 32 bits, not 0.99999999"),
+        (CSAC, {"discount": 1 - 1e-9}, "discount must be at least 0 and less than 1 in 32 bits, not 0.999999999"),
+    ],
+)
+def test_numbers_that_32_bits_make_others_of_are_refused(algorithm, settings, words):
+    with pytest.raises(InputError, match=words):
+        algorithm(**settings)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "name", "value"),
+    [
+        (CSAC, "entropy_weight", 10**10),  # more than JAX takes of a whole number
+        (CSAC, "relative_entropy_weight", 1),
+        (SAC, "target_entropy", -(10**10)),
+        (TD3, "max_gradient_norm", 0),
+        (SD3, "discount", Fraction(99, 100)),
+        (PPO, "clip_range", np.int64(1)),
+    ],
+)
+def test_a_number_is_kept_as_a_float_where_floats_belong(algorithm, name, value):
+    kept = getattr(algorithm(**{name: value}), name)
+    assert type(kept) is float
+    assert kept == float(value)
 
 
 @pytest.mark.parametrize("algorithm", [CSAC, SAC, TD3])
