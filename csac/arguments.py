@@ -42,6 +42,7 @@ _MISWRITTEN = (
     (r"--seeds (\S*,.*|\d+( \d+)+)", r"--seeds is how many: --seeds 3"),
     (r"--device cuda.*", r"--device takes cpu or gpu (cuda is gpu here)"),
     (r"--entropy-weight auto.*", r"the entropy weight adapts with --temperature automatic"),
+    (r"(--(?:relative-)?entropy-weight) auto\w+.*", r"write \1 auto"),
     (r"--temperature ([\d.]\S*).*", r"write --temperature fixed --entropy-weight \1"),
 )
 
@@ -85,7 +86,9 @@ def parse(
         told += _swallowed(arguments) if told.endswith(" is missing") else ""
         raise InputError(f"{told} ({program} --help)") from None
     if unknown:
-        raise InputError(f"{_unknown(unknown[0], command, elsewhere)} ({program} --help)")
+        raise InputError(
+            f"{_unknown(unknown[0], command, elsewhere, _option_before(unknown[0], arguments))} ({program} --help)"
+        )
     return parsed
 
 
@@ -213,19 +216,27 @@ def _stranger(arguments: list[str], command: type[Any], elsewhere: Mapping[str, 
     return None
 
 
-def _unknown(argument: str, command: type[Any], elsewhere: Mapping[str, type[Any]]) -> str:
+def _option_before(argument: str, arguments: list[str]) -> str:
+    """Return the option that an argument stands behind, where there is nothing between the two."""
+    before = arguments[arguments.index(argument) - 1] if argument in arguments[1:] else ""
+    return before.replace("_", "-") if before.startswith("--") else ""
+
+
+def _unknown(argument: str, command: type[Any], elsewhere: Mapping[str, type[Any]], before: str = "") -> str:
     known = _options(command)
     if not argument.startswith("-"):
+        if known.get(before):
+            return f"there is no place for {argument!r}: {before} takes no value"
         several = "" if "--env-kwargs" not in known else ": one task a run; several: csac study"
         return f"there is no place for {argument!r}{several}"
     option = argument.partition("=")[0].replace("_", "-")
-    for name, kind in elsewhere.items():
-        if option in _options(kind):
-            return (
-                f"{option} is an option of {name}, which --algorithm {name} chooses"
-                if "--algorithm" in known
-                else f"a run keeps its hyperparameters: begin another with csac train TASK --from DIR {option} X"
-            )
+    if names := [name for name, kind in elsewhere.items() if option in _options(kind)]:
+        if "--algorithm" not in known:
+            return f"a run keeps its hyperparameters: begin another with csac train TASK --from DIR {option} X"
+        *most, last = names
+        if most:
+            return f"{option} is an option of {', '.join(most)} and {last}, which --algorithm chooses"
+        return f"{option} is an option of {last}, which --algorithm {last} chooses"
     return f"there is no option {option}{nearest(option, known)}"
 
 

@@ -21,6 +21,12 @@ def check_whole(name: str, value: object, least: int, most: int) -> None:
         )
 
 
+def check_flag(name: str, value: object) -> None:
+    """Raise InputError for what is neither True nor False: "no" would count as true."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} is True or False, not {value!r:.40}")
+
+
 def check_callable(name: str, value: object) -> None:
     """Raise InputError for what is neither None nor can be called."""
     if value is not None and not callable(value):

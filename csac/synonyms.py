@@ -32,6 +32,7 @@ _CALLED_OTHERWISE = MappingProxyType(
         "--policy-frequency": ("--policy-delay",),
         "--n-steps": ("--rollout-steps",),
         "--total-timesteps": ("--steps",),
+        "--seed": ("--first-seed",),
         "--eval-freq": ("--evaluation-interval",),
         "--n-eval-episodes": ("--evaluation-episodes",),
         "--track": ("--wandb",),

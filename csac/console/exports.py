@@ -47,4 +47,5 @@ def _returns_line(returns: Returns) -> str:
         f"{number(values.mean(), largest)} ± {number(values.std(ddof=min(1, len(values) - 1)), largest)}"
         for values in (returns.artefact, returns.policy)
     )
-    return f"{len(returns.policy)} episodes: mean return {through}; the run's policy {without}"
+    episodes = f"{len(returns.policy)} episode{'s' * (len(returns.policy) != 1)}"
+    return f"{episodes}: mean return {through}; the run's policy {without}"

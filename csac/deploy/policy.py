@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from csac.checks import check_path
+from csac.checks import check_flag, check_path
 from csac.deploy import tensors
 from csac.deploy.contract import Activation, Contract, read_file
 from csac.deploy.parameters import check_network, copied, from_tensors, to_tensors
@@ -58,8 +58,9 @@ class Policy:
         One that is not finite gives an action that is not: `csac export` builds in guards that replace it.
 
         Raises:
-            InputError: an observation that is not of the task's shape.
+            InputError: an observation that is not of the task's shape, or `deterministic` is no bool.
         """
+        check_flag("deterministic", deterministic)
         flat = self.contract.flatten(observation)
         actions = self.act(np.atleast_2d(flat), deterministic)
         return self.contract.to_environment(actions if flat.ndim == 2 else actions[0]), state

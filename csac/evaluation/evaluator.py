@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from csac.checks import check_whole
+from csac.checks import check_flag, check_whole
 from csac.deploy.policy import Policy, noise_generator
 from csac.record.manifest import SEED_LIMIT
 from csac.tasks.environment import Environment
@@ -285,6 +285,7 @@ def evaluate_episodes(
         InputError: as `Evaluator`, a policy without `predict`, or perturbations that the task cannot have.
         EvaluationFailure: as `Evaluator.run`.
     """
+    check_flag("deterministic", deterministic)
     perturbed = values_at(constant_perturbations(perturbations), 0)
     if events is not None:
         check_events(events)

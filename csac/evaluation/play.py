@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from csac.checks import check_flag
 from csac.deploy.choosing import load, no_policies
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
@@ -57,6 +58,7 @@ def evaluate_run(
             one whose module has never been named here.
         EvaluationFailure: an environment raised, or gave what is not finite; or a process died.
     """
+    check_flag("deterministic", deterministic)
     run = _open(directory, trust_task)
     evaluator = Evaluator(
         run.manifest.task,

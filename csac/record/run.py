@@ -45,7 +45,7 @@ class StorageFailure(RuntimeError):
     """A run directory can no longer be written. The message says why, in one line."""
 
 
-class _Occupied(InputError):
+class Occupied(InputError):
     """There is something in a directory already."""
 
 
@@ -82,7 +82,7 @@ class RunDirectory:
         path, number = first, 1
         while True:
             if not os.path.lexists(path):
-                with suppress(_Occupied):  # by a process that began in the same second
+                with suppress(Occupied):  # by a process that began in the same second
                     return cls.create(path, manifest)
             number += 1
             path = first.with_name(f"{moment}-{number}")
@@ -300,7 +300,7 @@ def _is_left_over(path: Path) -> bool:
 
 def _refuse_occupied(path: Path) -> None:
     if (path / MANIFEST).exists():
-        raise _Occupied(f"{path} already holds a run; resume it, or choose another directory")
+        raise Occupied(f"{path} already holds a run; resume it, or choose another directory")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path} is a file; choose another directory")
     if path.exists() and not all(_is_left_over(entry) for entry in path.iterdir()):

@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from csac.checks import check_whole
 from csac.record.csv_tables import check_ends, read_evaluations, read_rows
+from csac.record.manifest import STEPS_LIMIT
 from csac.record.run import RunDirectory, find_runs, is_run
 from csac.record.summaries import case_names, last_rows
 from csac.studies.arms import Arm, Time
@@ -46,13 +48,23 @@ class Given(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs to report on. Steps are environment steps per seed."""
+    """Runs to report on. Steps are environment steps per seed.
+
+    Raises:
+        InputError: no such step, no such perturbation, or one of runs that all tell of their own.
+    """
 
     runs: tuple[Given, ...]
     perturbations: tuple[str, ...] = ()
     """What changed in runs that cannot tell it themselves."""
     until: int | None = None
     """The last step that counts."""
+
+    def __post_init__(self) -> None:
+        if self.until is not None:
+            check_whole("--until", self.until, 1, STEPS_LIMIT)
+        if perturbations_of(self.perturbations) and all(run.manifest for run in self.runs):
+            raise InputError("--perturb is for a CSV file alone: these runs tell themselves what was changed in them")
 
     @property
     def has_rows(self) -> bool:

@@ -326,7 +326,7 @@ def _texts(key: str, value: Any) -> tuple[str, ...]:
 
 
 def _conditions(key: str, value: Any) -> tuple[tuple[str, ...], ...]:
-    if not isinstance(value, list) or not value:
+    if not isinstance(value, list) or not value or not all(isinstance(item, list) for item in value):
         raise InputError(f'{key} is a list of lists, such as [[], ["friction=1.5@300000"]], not {value!r}')
     return tuple(_texts(key, item) for item in value)
 

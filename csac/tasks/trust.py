@@ -16,6 +16,7 @@ from contextlib import suppress
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
+from csac.checks import check_flag
 from csac.types import InputError
 
 
@@ -41,8 +42,9 @@ def refuse_untrusted(task: object, run: str | Path, trust_task: bool = False) ->
     What this process has imported already is not run again, so that it is not asked about.
 
     Raises:
-        InputError: nobody has named the module; the message says where it is and how to.
+        InputError: nobody has named the module; the message says where it is and how to. Or `trust_task` is no bool.
     """
+    check_flag("trust_task", trust_task)
     module = module_of(task)
     if not module or module in sys.modules:
         return

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from csac.checks import check_callable, check_path
+from csac.checks import check_callable, check_flag, check_path
 from csac.processes import end_if_unguarded
 from csac.record.manifest import as_kept
 from csac.record.run import RunDirectory
@@ -114,6 +114,10 @@ def train(
     """
     end_if_unguarded()
     check_algorithm(algorithm)
+    check_flag("resume", resume)
+    check_flag("tensorboard", tensorboard)
+    if not isinstance(wandb, str) or wandb.lower() in ("", "yes", "no", "true", "false"):
+        check_flag("wandb", wandb)
     check_callable("on_evaluation", on_evaluation)
     check_callable("stop_when", stop_when)
     if directory is not None:

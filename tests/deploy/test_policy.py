@@ -155,6 +155,11 @@ def test_an_observation_of_another_task_is_refused(parts, observation, message):
         random_policy(contract(parts)).predict(observation)
 
 
+def test_a_word_does_not_choose_between_the_mean_and_a_sample():
+    with pytest.raises(InputError, match="deterministic is True or False, not 'no'"):
+        random_policy(contract()).predict(np.zeros(2), deterministic="no")  # pyright: ignore[reportArgumentType]
+
+
 def test_the_policy_keeps_its_own_copy_of_the_layers():
     network, agreement = random_network(Spec(2, 1)), contract()
     policy = Policy(network, agreement)

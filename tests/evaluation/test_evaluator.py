@@ -438,6 +438,11 @@ def test_what_cannot_predict_is_refused():
         evaluate({}, Lottery)
 
 
+def test_a_word_does_not_choose_between_the_mean_and_a_sample():
+    with pytest.raises(InputError, match="deterministic is True or False, not 'no'"):
+        evaluate(policy_for(Lottery), Lottery, deterministic="no")  # pyright: ignore[reportArgumentType]
+
+
 def test_a_class_is_no_policy():
     with pytest.raises(InputError, match=r"Policy is a class: give a policy as csac\.load returns it"):
         evaluate(Policy, Lottery)

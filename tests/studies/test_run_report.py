@@ -326,7 +326,11 @@ def test_the_table_of_returns_counts_the_seeds_that_failed():
 
 def test_a_manifest_says_what_perturbed_a_run_and_an_option_does_not():
     make_run_of("runs/a", [[100.0, 40.0, 90.0]])
-    assert "friction x 2" not in report("runs/a --perturb friction=2@10")
+    write_rows("b", [[100.0, 40.0, 90.0]])
+    text = report("runs/a --label b=b.csv --perturb friction=2@10")
+    titles = re.findall(r"\*\*(.*friction.*)\*\*", text)
+    assert titles
+    assert all(title.startswith("friction x 2 after step 10") for title in titles)  # b's, whose task is not known
 
 
 def test_fresh_rollouts_of_a_policy_that_has_learnt_for_longer_are_left_out():
@@ -432,6 +436,10 @@ def test_returns_by_seed_and_step_are_enough():
         ("report --label a=a.csv --out a.pdf", "the report is a page: name it a.html"),
         ("report --label a=a.csv --out page.md/a.html", "cannot write page.md/a.html"),
         ("report --label a=a.csv --perturb frction=2", "no perturbation is called 'frction': did you mean friction?"),
+        ("report run --perturb frction=2", "no perturbation is called 'frction': did you mean friction?"),
+        ("report run --perturb friction=2@10", "--perturb is for a CSV file alone: these runs tell themselves what"),
+        ("report --label a=a.csv --until 0", "--until must be a whole number of at least 1, not 0"),
+        ("report run --until -5", "--until must be a whole number of at least 1, not -5"),
         ("report --label a=run,other,b.csv", "a: b.csv does not tell which of Ant-v4 and Hopper-v4 it is of; label it"),
         ("report --label a=run,pushed", "a: its runs differ in perturbations, none and friction=2@10; give"),
         ("report --label a=run,longer", "a: its runs differ in steps, 100 and 200; give each a label of its own"),

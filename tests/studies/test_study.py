@@ -194,6 +194,7 @@ def test_what_methods_have_in_common_gives_way_to_presets_and_to_their_own(tmp_p
         (("seeds = 2", 'steps_on = {"Hopper-v5" = 10}'), "the study has no task 'Hopper-v5'; did you mean Hopper-v4?"),
         (("replay_size = 150", "[[methods]]\nlabel = 'SAC'\nalgorithm = 'sac'"), "two methods are called 'SAC'"),
         (('tasks = ["Hopper-v4"]', 'tasks = ["Hopper-v4", "Hopper-v4"]'), "tasks has 'Hopper-v4' twice"),
+        (("seeds = 2", "conditions = ['friction=2@10']"), "conditions is a list of lists, such as"),
         (("seeds = 2", "conditions = [[], []]"), "conditions has [] twice"),
         (
             ("seeds = 2", "conditions = [['friction=2@10'], ['friction=2.0@1e1']]"),

@@ -171,6 +171,14 @@ def test_what_cannot_be_a_module_is_not_found(task):
     trust.remember(task)
 
 
+def test_a_word_is_no_trust(stranger, monkeypatch):
+    monkeypatch.syspath_prepend(stranger.folder)
+    with pytest.raises(InputError, match="trust_task is True or False, not 'no'"):
+        trust.refuse_untrusted("stranger:Stranger-v0", "run", trust_task="no")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="add --trust-task"):
+        trust.refuse_untrusted("stranger:Stranger-v0", "run")
+
+
 @pytest.mark.parametrize("state", [os.devnull, f"/{'x' * 300}"])
 def test_where_nothing_can_be_noted_one_is_asked_each_time(stranger, monkeypatch, state):
     monkeypatch.syspath_prepend(stranger.folder)

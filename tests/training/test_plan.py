@@ -91,6 +91,10 @@ def test_a_name_or_a_class_is_no_algorithm(tmp_path, algorithm: Any, message):
         ),
         ({"groups": 2}, "groups must be at most as many as seeds, 1, not 2"),
         ({"stop_when": "never"}, "stop_when is a function that is called, not 'never'"),
+        ({"resume": "no"}, "resume is True or False, not 'no'"),
+        ({"tensorboard": 1}, "tensorboard is True or False, not 1"),
+        ({"wandb": 1}, "wandb is True or False, not 1"),
+        ({"wandb": "no"}, "wandb is True or False, not 'no'"),  # a name is a project's
     ],
 )
 def test_what_is_of_another_kind_is_refused_before_anything_is_made(tmp_path, given: Any, message):
