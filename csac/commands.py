@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 class Train(Options):
     """Train controllers for a task: independent seeds, each evaluated at regular intervals.
 
-    Exit codes: 0 done, 2 wrong arguments, 3 a seed failed, 130 or 143 stopped by a signal (the run is saved).
+    Exit codes: 0 done, 1 the directory can no longer be written, 2 wrong arguments, 3 a seed failed, 130 or 143
+    stopped by a signal (the run is saved).
     """
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
@@ -85,7 +86,8 @@ class Tune(Options):
     number of processes and machines that run the same command share the trials; after Ctrl-C or a crash the same
     command continues.
 
-    Exit codes: 0 done, 2 wrong arguments, 3 no trial is complete, 130 or 143 stopped by a signal.
+    Exit codes: 0 done, 1 the directory can no longer be written, 2 wrong arguments, 3 no trial is complete, 130 or 143
+    stopped by a signal.
     """
 
     task: Annotated[Positional[str], arg(metavar="TASK")]

@@ -1,7 +1,8 @@
 /* A control loop in C: read the sensors, ask the policy, drive the actuators, at a fixed rate.
  *
- *     csac export runs/pendulum --format c --fallback zero
- *     cc -std=c99 -O2 -I runs/pendulum/export/c examples/deploy/control_loop.c -o control_loop -lm
+ *     csac train Pendulum-v1 --steps 20000 --warmup-steps 1000 --directory runs/swing
+ *     csac export runs/swing --format c --fallback zero
+ *     cc -std=c99 -O2 -I runs/swing/export/c examples/deploy/control_loop.c -o control_loop -lm
  *     ./control_loop < observations.txt > actions.txt
  *
  * Sensors and actuators are standard input and output here, a line for each step. On a robot, write these two functions

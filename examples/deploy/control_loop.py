@@ -1,7 +1,8 @@
 """A control loop in Python, on NumPy alone: read the sensors, ask the policy, drive the actuators, at a fixed rate.
 
-    csac export runs/pendulum --fallback zero
-    python examples/deploy/control_loop.py runs/pendulum/export/numpy < observations.txt > actions.txt
+    csac train Pendulum-v1 --steps 20000 --warmup-steps 1000 --directory runs/swing
+    csac export runs/swing --fallback zero
+    python examples/deploy/control_loop.py runs/swing/export/numpy < observations.txt > actions.txt
 
 Neither csac nor JAX is needed: `policy.py` lies in the artefact's folder. Sensors and actuators are standard input and
 output here, a line for each step. On a robot, write these two functions anew: the rest stays.

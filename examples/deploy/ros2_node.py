@@ -1,7 +1,8 @@
 """A policy as a node of ROS 2: it hears observations on one topic and says actions on another, at a fixed rate.
 
-    csac export runs/pendulum --fallback zero
-    python examples/deploy/ros2_node.py runs/pendulum/export/numpy
+    csac train Pendulum-v1 --steps 20000 --warmup-steps 1000 --directory runs/swing
+    csac export runs/swing --fallback zero
+    python examples/deploy/ros2_node.py runs/swing/export/numpy
 
 `Controller` is all that a node does, without ROS. Where `rclpy` is installed, `run_with_ros` gives it topics and a
 timer; where it is not, `run_without_ros` plays the robot's part by the task that the policy was trained for.
