@@ -69,7 +69,7 @@ INCOMPATIBLE = (
 
 @dataclass(frozen=True)
 class CSAC:
-    """Conservative Soft Actor-Critic (the paper's Algorithm 1)."""
+    """Conservative Soft Actor-Critic; the paper's own Algorithm 1 is the preset `paper`."""
 
     entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.2
     """Weight of the entropy (the paper's sigma); `auto` learns it, to keep the entropy at its target as SAC does."""
@@ -181,7 +181,8 @@ class CSAC:
     ) -> tuple[Scalar, Metrics]:
         """Return min Q - σ log π - τ log(π/π̃) at ã(s, noise) (the bracket of Eq. Q_CSAC), and its parts.
 
-        Without a reference the critics are those of P = Q + τ log π̃ (Eq. actor_update_3), and it is P - (σ + τ) log π.
+        Without a reference it is P - (σ + τ) log π: the critics are those of P = Q + τ log π̃ (Eq. actor_update_3), or
+        τ counts as 0, as in the target of `actor_only`.
         """
         policy = policy_at(actor, observation)
         q_value = least_q_value(critics, observation, policy.sample(noise))
