@@ -40,6 +40,7 @@ _MISWRITTEN = (
     (r"(--\S*hidden-sizes)", r"\1 needs at least one number, as 256 256"),
     (r"(--\S*hidden-sizes) .*[,[(].*", r"write the numbers with blanks between: \1 400 300"),
     (r"--seeds (\S*,.*|\d+( \d+)+)", r"--seeds is how many: --seeds 3"),
+    (r"--perturb (\S+=\S+) (\S+=\S+).*", r"write --perturb before each: --perturb \1 --perturb \2"),
     (r"--device cuda.*", r"--device takes cpu or gpu (cuda is gpu here)"),
     (r"--entropy-weight auto.*", r"the entropy weight adapts with --temperature automatic"),
     (r"(--(?:relative-)?entropy-weight) auto\w+.*", r"write \1 auto"),

@@ -167,6 +167,10 @@ def test_a_mistake_is_one_line_and_leaves_no_trace(capsys, tmp_path, line, compl
         ("X --actor-hidden-sizes 400, 300", "write the numbers with blanks between: --actor-hidden-sizes 400 300"),
         ("X --seeds 0,1,2", "--seeds is how many: --seeds 3"),
         ("X --seeds 0 1 2", "--seeds is how many: --seeds 3"),
+        (
+            "X --perturb friction=2@9 mass=2@9",
+            "write --perturb before each: --perturb friction=2@9 --perturb mass=2@9",
+        ),
         ("X --device cuda:0", "--device takes cpu or gpu (cuda is gpu here)"),
         ("X --wandb True", "--wandb takes no value; without it, it is off"),
         (
