@@ -56,6 +56,9 @@ class Machine:
     host: str = ""
 
 
+OTHER_TASK = "task is "  # how a change of the task begins
+
+
 @dataclass(frozen=True)
 class Origin:
     """The checkpoint of another run that a run began with, and what is different in this one."""
@@ -63,6 +66,11 @@ class Origin:
     directory: str
     step: int
     changes: tuple[str, ...] = ()
+
+    @property
+    def has_other_task(self) -> bool:
+        """Whether the checkpoint is of another task."""
+        return any(text.startswith(OTHER_TASK) for text in self.changes)
 
 
 @dataclass(frozen=True)
@@ -189,7 +197,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str =
     for name in sorted(before.keys() | now.keys()):
         old, new = _listed(before.get(name)), _listed(now.get(name))
         if isinstance(old, dict) and isinstance(new, dict):
-            lines += differences(old, new, f"{name}." if name == "evaluation" else "")
+            lines += differences(old, new, f"{name}." if name in ("evaluation", "environment_arguments") else "")
         elif not _is_same(old, new):
             lines.append(f"{prefix}{name} is {old!r}, not {new!r}")
     return lines

@@ -28,6 +28,11 @@ _CANNOT_WRITE = (
     errno.ENFILE,
     errno.ESTALE,
     errno.ETIMEDOUT,
+    errno.ENOTDIR,
+    errno.ENOTCONN,
+    errno.ENODEV,
+    errno.ENXIO,
+    errno.EHOSTDOWN,
 )
 
 

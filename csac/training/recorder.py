@@ -80,8 +80,12 @@ class Recorder:
         self._made = dict(self._steps)  # steps of which some may not have been told of yet
         self._pending: dict[Table, list[dict[str, Any]]] = defaultdict(list)
         self._saved: dict[int, dict[int, Files]] = defaultdict(dict)  # step -> group -> its files
-        # One that was lost is followed by the best of later evaluations.
-        self._best = {k: v for k, v in best_returns(run.evaluations).items() if self.run.policy(k, "best").exists()}
+        # One that was lost is followed by the best of later evaluations, and that of another task by the first of this.
+        origin, known = run.manifest.forked_from, run.evaluations
+        if origin and origin.has_other_task:
+            known = known[known["step"] > origin.step]
+        self._best = {k: v for k, v in best_returns(known).items() if self.run.policy(k, "best").exists()}
+        self._has_contract = False  # of this task: a fork begins with its source's
         # Told once, after the first evaluation of the run.
         self._unheard = set() if len(run.evaluations) else set(run.manifest.events)
         self._info_names: set[str] = set()
@@ -173,7 +177,9 @@ class Recorder:
                 self._commit(step)
 
     def _had_failed(self, group: int, step: int) -> bool:
-        return all(seed in self.failures and self._failed_at[seed] <= step for seed in self.groups[group])
+        """Whether a group has nothing at a step, and all that it made before has been heard."""
+        failed = all(seed in self.failures and self._failed_at[seed] <= step for seed in self.groups[group])
+        return failed and self._passed[group] >= step
 
     def _commit(self, step: int) -> None:
         assert self.checkpoints
@@ -266,9 +272,10 @@ class Recorder:
 
     def _save(self, policies: dict[int, Policy]) -> None:
         for seed, policy in policies.items():
-            if not self.run.contract.exists():
+            if not self._has_contract:
                 self.run.contract.parent.mkdir(exist_ok=True)
                 policy.contract.save(self.run.contract)
+                self._has_contract = True
             policy.save_layers(self.run.policy(seed))
 
     def _flush(self, until: int = OVER) -> None:

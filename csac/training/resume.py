@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
-from csac.record.manifest import Continuation, Origin, differences
+from csac.record.manifest import OTHER_TASK, Continuation, Origin, differences
 from csac.record.run import RunDirectory, Table, now
 from csac.tasks.perturbations import continued, perturbations_of
 from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, sound_at, steps_in, taken_back
@@ -236,14 +236,19 @@ class Source(NamedTuple):
     def described(self, wanted: Manifest, defaults: Mapping[str, Any]) -> Origin:
         """Return what the manifest says of where the new run began, and of what is different in it."""
         changes = differences(_fixed(self.run.manifest, defaults), _fixed(wanted, defaults))
-        return Origin(os.path.abspath(self.run.path), self.checkpoint.step, tuple(changes))
+        origin, before = Origin(os.path.abspath(self.run.path), self.checkpoint.step, tuple(changes)), self.run.manifest
+        if before.forked_from and before.forked_from.step == origin.step and not origin.has_other_task:
+            # The checkpoint with which that run began: its episodes are those of the task before.
+            of_task = [text for text in before.forked_from.changes if text.startswith(OTHER_TASK)]
+            return replace(origin, changes=(*of_task, *changes))
+        return origin
 
     def begun(self, wanted: Manifest, defaults: Mapping[str, Any]) -> Manifest:
         """Return the manifest with which the new run is made: which seeds begin their episode anew is known by now."""
-        before = self.run.manifest
-        anew = self._living(wanted) if before.task != wanted.task else before.inexact_seeds
+        origin = self.described(wanted, defaults)
+        anew = self._living(wanted) if origin.has_other_task else self.run.manifest.inexact_seeds
         inexact = tuple(seed for seed in wanted.seeds if seed in anew)
-        return replace(wanted, forked_from=self.described(wanted, defaults), inexact_seeds=inexact)
+        return replace(wanted, forked_from=origin, inexact_seeds=inexact)
 
     def _living(self, wanted: Manifest) -> list[int]:
         return [seed for seed in wanted.seeds if str(seed) not in self.checkpoint.values["failures"]]

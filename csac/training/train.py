@@ -270,6 +270,8 @@ def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, re
         with caught_signals(told) as (stop, received):
             recorder = _follow(run, plan, notes, watchers, restart, stop, received)
     except KeyboardInterrupt as second:
+        if run.manifest.state in ("finished", "failed"):  # it had ended, and only its picture is missing
+            return run
         raise StoppedAtOnce(run, can_go_on(run), *second.args) from second
     if run.manifest.state == "interrupted":
         newest = recorder.checkpoints.newest if recorder.checkpoints else None
@@ -326,7 +328,7 @@ def _follow(
 def _begins_on_another_task(run: RunDirectory, begin: int) -> bool:
     """Whether the checkpoint at this step came from a run of another task."""
     origin = run.manifest.forked_from
-    return origin is not None and origin.step == begin and any(text.startswith("task is ") for text in origin.changes)
+    return origin is not None and origin.step == begin and origin.has_other_task
 
 
 def _logs(run: RunDirectory, labels: list[int], begin: int, watchers: Watchers) -> list[Log]:
@@ -355,6 +357,8 @@ def _as_dicts(rows: np.ndarray) -> list[dict[str, Any]]:
 
 def _leave(run: RunDirectory, recorder: Recorder) -> None:
     """Write what can still be written of a run that an error ends; it can go on from its last checkpoint."""
+    if run.manifest.state != "running":
+        return  # it had ended before
     with suppress(OSError):
         recorder.close()
         run.update_manifest(state="interrupted")

@@ -20,7 +20,7 @@ ALGORITHMS = {
     "sac": SAC(**SMALL),
     "sac, normalised critics": SAC(critic_normalisation="batch", **SMALL),
     "td3": TD3(**SMALL),
-    "sd3": SD3(noise_samples=3, **SMALL | {"batch_size": 8}),  # a mini-batch for each of its pairs
+    "sd3": SD3(noise_samples=3, **{**SMALL, "batch_size": 8}),  # a mini-batch for each of its pairs
 }
 NAMES = ("actor", "critics")
 STILL = 1e-20  # a learning rate, or a bound on a gradient, by which no parameter of 32 bits moves

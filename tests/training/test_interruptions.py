@@ -104,7 +104,7 @@ def test_a_signal_that_comes_too_late_for_a_run_alone_is_over_with_it():
         assert (stop.is_set(), received) == (False, [])
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.ESTALE, errno.ETIMEDOUT])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN])
 def test_a_file_system_that_has_gone_is_told_in_a_line(number):
     run: Any = SimpleNamespace(path="runs/one")
     told = pytest.raises(StorageFailure, match=f"runs/one cannot be written: {os.strerror(number)}")

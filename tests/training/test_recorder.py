@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from policies import contract, random_policy
 from probes import Endless
 from resuming import SMALL
 
 from csac.algorithms import SAC
-from csac.record.manifest import Manifest
+from csac.record.manifest import Manifest, Origin, differences
 from csac.record.run import RunDirectory
 from csac.training.checkpoint import Checkpoint, Checkpoints, steps_in
-from csac.training.messages import Ended, Failed, GroupCrashed, GroupRestarted, Progress, Refused, Rows, Saved
+from csac.training.messages import (
+    Ended,
+    Evaluated,
+    Failed,
+    GroupCrashed,
+    GroupRestarted,
+    Progress,
+    Refused,
+    Rows,
+    Saved,
+)
 from csac.training.recorder import Recorder
 from csac.training.seed_files import SeedFiles
 from csac.training.train import train
@@ -78,6 +89,18 @@ def test_the_last_checkpoint_comes_though_every_seed_of_the_slower_group_failed(
     assert steps_in(recorder.run.path / "checkpoint") == [300, 600]
 
 
+def test_a_checkpoint_waits_for_the_rows_of_a_group_whose_failure_is_told_before_them(recorder):
+    saves(recorder, 0, 300)
+    saves(recorder, 1, 300)
+    recorder.handle(1, Failed(1, 450, "a reward is NaN", "", None))
+    saves(recorder, 0, 600)
+    assert steps_in(recorder.run.path / "checkpoint") == [300]
+    recorder.handle(1, Rows("episodes", [{"seed": 1, "step": 440, "return": 1.0, "length": 5}]))
+    recorder.handle(1, Ended(450, {}))
+    assert steps_in(recorder.run.path / "checkpoint") == [300, 600]
+    assert rows_in(recorder, 600) == [290, 290, 440, 590]
+
+
 def test_the_checkpoint_before_a_failure_stays_though_it_became_whole_after_it(recorder):
     saves(recorder, 0, 300)
     recorder.handle(0, Failed(0, 350, "a reward is NaN", "", None))
@@ -133,3 +156,26 @@ def test_a_task_that_cannot_be_made_again_for_an_evaluation_costs_no_run(tmp_pat
     assert run.manifest.state == "failed"
     assert "port 5555 is taken" in run.manifest.failures[0]
     assert (run.policy(0).exists(), len(run.rows("episodes"))) == (True, 5)
+
+
+@pytest.mark.parametrize("is_other", [False, True])
+def test_the_best_policy_of_another_task_gives_way_to_the_first_of_this(tmp_path, is_other):
+    evaluations = [{"seed": 0, "step": step, "episode": 0, "return": 900.0, "length": 9} for step in (50, 100)]
+    origin = Origin("runs/one", 100, ("task is 'A-v4', not 'B-v4'",) * is_other)
+    manifest = Manifest(task="B-v4", algorithm="sac", seeds=(0,), steps=300, forked_from=origin)
+    forked = RunDirectory.create(tmp_path / "run", manifest)
+    forked.append("evaluations", evaluations)
+    policy = random_policy(contract())
+    forked.policy(0, "best").parent.mkdir(parents=True)
+    policy.save_layers(forked.policy(0, "best"))
+    before = forked.policy(0, "best").read_bytes()
+    recorder = Recorder(forked, [[0]], None, (), begin=100)
+    row = {"seed": 0, "step": 150, "episode": 0, "return": 3.0, "length": 9}
+    recorder.handle(0, Evaluated(150, [row], {0: random_policy(contract(), seed=5)}))
+    assert (forked.policy(0, "best").read_bytes() != before) == is_other
+
+
+def test_an_environment_argument_called_task_is_no_other_task():
+    now, before = ({"task": "Reach-v1", "environment_arguments": {"task": word}} for word in ("push", "reach"))
+    origin = Origin("runs/one", 100, tuple(differences(before, now)))
+    assert (origin.changes, origin.has_other_task) == (("environment_arguments.task is 'reach', not 'push'",), False)

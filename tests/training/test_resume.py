@@ -21,6 +21,7 @@ from plans import settings
 from resuming import ADAPTIVE, LEARNERS, ROLLOUT, Crash, contents, crash_at, run
 
 from csac.algorithms import CSAC, PPO
+from csac.deploy.contract import Contract
 from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.training import messages
@@ -199,6 +200,15 @@ def test_a_second_signal_leaves_a_run_as_sound_as_a_kill(tmp_path, uninterrupted
     if can_go_on:
         assert resume(tmp_path / "run").manifest.history[0].step == 240
         assert contents(tmp_path / "run") == uninterrupted
+
+
+def test_a_second_signal_while_the_picture_is_drawn_loses_nothing(tmp_path, monkeypatch):
+    def interrupt(_: RunDirectory) -> None:
+        raise KeyboardInterrupt(signal.SIGINT)
+
+    monkeypatch.setattr("csac.training.train._draw", interrupt)
+    finished = run(tmp_path / "run", steps=130)
+    assert (finished.manifest.state, finished.manifest.steps_done) == ("finished", 130)
 
 
 def test_a_run_that_crashed_before_its_first_checkpoint_begins_anew(tmp_path, uninterrupted):
@@ -648,6 +658,11 @@ def test_a_fork_to_another_task_begins_its_episode_anew(tmp_path):
     changes = ("task is 'HalfCheetah-v4', not 'Walker2d-v4'",)
     assert forked.manifest.forked_from == Origin(str(tmp_path / "first"), 130, changes)
     assert [entry.exact for entry in forked.manifest.history] == [False]
+    assert Contract.load(forked.contract).task == "Walker2d-v4"
+    # Its own first checkpoint still holds the other task's episode.
+    again = run(tmp_path / "third", steps=150, task="Walker2d-v4", start_from=f"{tmp_path / 'second'}@130")
+    assert again.manifest.forked_from == Origin(str(tmp_path / "second"), 130, changes)
+    assert [entry.exact for entry in again.manifest.history] == [False]
 
 
 def test_a_fork_says_where_it_is_not_what_its_source_would_have_gone_on_to_be(tmp_path):
