@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -267,7 +267,7 @@ def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, re
     reporter = watchers.reporter
     told = functools.partial(reporter.note, _STOPPING) if reporter else None
     try:
-        with caught_signals(told) as (stop, received):
+        with caught_signals(told) as (stop, received), closing(reporter) if reporter else nullcontext():
             recorder = _follow(run, plan, notes, watchers, restart, stop, received)
     except KeyboardInterrupt as second:
         if run.manifest.state in ("finished", "failed"):  # it had ended, and only its picture is missing
@@ -320,8 +320,6 @@ def _follow(
             lines = log.close()
             with suppress(OSError):
                 recorder.tell(lines)
-        if reporter:
-            reporter.close()
     return recorder
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -21,9 +22,10 @@ from plans import settings
 from resuming import ADAPTIVE, LEARNERS, ROLLOUT, Crash, contents, crash_at, run
 
 from csac.algorithms import CSAC, PPO
+from csac.console.progress import Reporter
 from csac.deploy.contract import Contract
 from csac.record.manifest import Manifest, Origin
-from csac.record.run import RunDirectory
+from csac.record.run import RunDirectory, StorageFailure
 from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, steps_in
 from csac.training.group import Group
@@ -209,6 +211,18 @@ def test_a_second_signal_while_the_picture_is_drawn_loses_nothing(tmp_path, monk
     monkeypatch.setattr("csac.training.train._draw", interrupt)
     finished = run(tmp_path / "run", steps=130)
     assert (finished.manifest.state, finished.manifest.steps_done) == ("finished", 130)
+
+
+def test_a_disk_that_is_full_before_the_first_step_leaves_the_terminal_as_it_was(tmp_path, monkeypatch):
+    def make_logs(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    reporter, closed = Reporter(), []
+    monkeypatch.setattr("csac.training.train._logs", make_logs)
+    monkeypatch.setattr(reporter, "close", lambda: closed.append(True))
+    with pytest.raises(StorageFailure, match="No space left"):
+        run(tmp_path / "run", steps=130, reporter=reporter)
+    assert closed == [True]
 
 
 def test_a_run_that_crashed_before_its_first_checkpoint_begins_anew(tmp_path, uninterrupted):
