@@ -45,7 +45,7 @@ def copied(tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.parent.name)
 def test_the_commands_of_a_page_write_its_tables(copied, page):
     there = copied / page.relative_to(ROOT)
-    others = EVIDENCE.get(page.parent.name, [])  # which another command writes, and another test
+    others = [*EVIDENCE.get(page.parent.name, []), "equal-time"]  # which other commands write, and other tests
     emptied = re.sub(
         r"(<!-- (\S+): begin -->\n)(.*?)(<!-- \2: end -->)",
         lambda found: found[0] if found[2] in others else found[1] + found[4],
@@ -117,6 +117,20 @@ def test_the_tables_of_the_evidence_follow_from_its_cells(copied, monkeypatch, n
     for line in lines:
         monkeypatch.setattr(sys, "argv", shlex.split(line))
         runpy.run_path(sys.argv[0], run_name="__main__")
+    assert page.read_text() == before
+
+
+def test_the_tables_of_equal_time_follow_from_its_files(copied, monkeypatch):
+    page = copied / "results" / "strong" / "README.md"
+    before = page.read_text()
+    emptied, count = re.subn(
+        r"(<!-- equal-time: begin -->\n).*?(<!-- equal-time: end -->)", r"\1\2", before, flags=re.DOTALL
+    )
+    assert count == 1
+    page.write_text(emptied)
+    (line,) = re.findall(r"^python (results/strong/equal_time.py .*)$", before, re.MULTILINE)
+    monkeypatch.setattr(sys, "argv", shlex.split(line))
+    runpy.run_path(sys.argv[0], run_name="__main__")
     assert page.read_text() == before
 
 
