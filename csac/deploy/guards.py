@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 Fallback = Literal["zero", "middle", "last", "given"]
 
+ROUNDING = 1e-6  # of a bound: a few times what float32 rounds by
 LONGEST_WATCHDOG = 2**24  # an ONNX graph counts in float32, where one more would be no more
 
 
@@ -201,6 +202,8 @@ def _fallback(text: str, contract: Contract) -> tuple[Fallback, np.ndarray]:
         raise InputError(f"--fallback {text}: it is zero, middle, last, or numbers such as 0,0.5") from None
     if action.shape != middle.shape:
         raise InputError(f"--fallback {text} is {len(action)} numbers where the task has {len(middle)} actions")
-    if not ((action >= contract.action_low) & (action <= contract.action_high)).all():
+    low, high = contract.action_low, contract.action_high
+    bounded = np.clip(action, low, high)  # the contract's bounds are the task's, rounded inwards to float32
+    if not (np.abs(action - bounded) <= ROUNDING * np.maximum(np.abs(low), np.abs(high))).all():
         raise InputError(f"--fallback {text} is outside of the action's bounds")
-    return "given", action
+    return "given", bounded

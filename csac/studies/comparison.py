@@ -205,7 +205,8 @@ def _given_run(label: str | None, run: RunDirectory) -> Given:
 def _given_cell(label: str | None, path: Path) -> Given:
     cell = read_collected(path)
     one = cell.manifest
-    took = (Time(cell.seconds, one.steps, tuple(one.seeds), cell.interrupted),) if cell.seconds else ()
+    is_whole = cell.seconds and not cell.failure
+    took = (Time(cell.seconds, one.steps, tuple(one.seeds), cell.interrupted),) if is_whole else ()
     return Given(label, path.with_suffix(".csv"), cell.evaluations, one, rollouts_of(path), took)
 
 

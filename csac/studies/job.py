@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from csac.record.csv_tables import COLUMNS, read_rows, write_rows
-from csac.record.run import RunDirectory
+from csac.record.run import RunDirectory, is_run
 from csac.studies.cells import LOST_EPISODE, Cell, is_final, is_in_use, read_history, restarting_seeds, write_history
 from csac.studies.collected import ROLLOUTS
 from csac.tasks.perturbations import Perturbation, perturbations_of, values_at
@@ -109,7 +109,8 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
     if is_over(job):  # another process has been here since the jobs were chosen
         return _ended(key, RunDirectory.open(job.path))
     before = read_history(job.path)
-    seconds, began = float(before.get("seconds", 0.0)), time.monotonic()
+    seconds = float(before.get("seconds", 0.0)) if is_run(job.path) else 0.0  # else of a run that was removed
+    began = time.monotonic()
 
     def spent() -> dict[str, float]:
         return {"seconds": round(seconds + time.monotonic() - began, 1)}
@@ -196,7 +197,12 @@ def _roll_out(job: Job, run: RunDirectory) -> None:
             return
         stop_if_asked(0, job.rollouts)
         ((seed, episodes),) = evaluate_run(
-            job.path, episodes=job.rollouts, perturbations=perturbed, processes=1, on_progress=stop_if_asked
+            job.path,
+            episodes=job.rollouts,
+            perturbations=perturbed,
+            processes=1,
+            trust_task=run.manifest.task == job.cell.task,  # which the study names, on whatever machine it was trained
+            on_progress=stop_if_asked,
         )
         rows = [episode.row(seed, job.cell.steps) for episode in episodes]
         write_rows(job.path / ROLLOUTS, COLUMNS["evaluations"], rows)

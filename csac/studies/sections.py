@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
 
 MOST_CURVES = 7  # that are told apart in one picture
 MOST_PANELS = 3  # side by side
+LONGEST_FILE = 150  # bytes of a picture's name, before a hash: a condition of many steps would not fit into 255
 SYMBOLS = {"relative_entropy_weight": "tau", "entropy_weight": "sigma"}
 _BOUNDARY = (
     "The boundary is the lowest maximum average return, as measured here, of the methods that the paper has too. A "
@@ -79,7 +81,11 @@ class Scope(NamedTuple):
         """Return what the files of a picture are called, without a suffix."""
         words = "".join(letter if letter.isalnum() or letter == "." else " " for letter in f"{kind} {text}").split()
         scale = ["scale", f"{self.scale:g}"] if self.scale < 1 else []
-        return "-".join([self.name, *words, *scale]).lower()
+        name = "-".join([self.name, *words, *scale]).lower()
+        if len(name.encode()) <= LONGEST_FILE:
+            return name
+        digest = hashlib.sha256(name.encode()).hexdigest()[:8]
+        return f"{name.encode()[:LONGEST_FILE].decode(errors='ignore')}-{digest}"
 
     def figure(self, kind: str, text: str, drawing: Drawing, title: str = "") -> Figure:
         """Return a figure about `text`, which is its title too where it is given none."""

@@ -62,6 +62,13 @@ def test_a_rate_limit_alone_falls_back_on_the_last_action_whatever_else_is_asked
     assert run_guards(guards(**given), steps) == [[2, 2]] * 4
 
 
+def test_the_bound_of_a_task_in_float64_is_within_its_bounds():
+    task = contract(((None, (2,)),), (1,), low=-np.pi, high=float(np.nextafter(np.float32(0.8), np.float32(0))))
+    assert make_guards(task, fallback="0.8").fallback_action == task.action_high
+    with pytest.raises(InputError, match="outside of the action's bounds"):
+        make_guards(task, fallback="0.80001")
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

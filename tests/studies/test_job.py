@@ -154,6 +154,20 @@ def test_a_policy_is_tested_on_the_task_as_it_was_last(tmp_path, stand):
     assert [str(one) for one in test["perturbations"]] == ["gravity=0.5", "friction=3"]
 
 
+def test_the_time_of_a_run_that_was_removed_is_forgotten(tmp_path, stand):
+    (job,) = jobs(tmp_path, cell())
+    write_history(job.path, {"seconds": 500.0})
+    execute(job, print)
+    assert read_history(job.path) == {"seconds": 100.0}
+
+
+def test_the_task_of_a_study_is_trusted_where_its_policies_are_tested(tmp_path, stand):
+    (job,) = jobs(tmp_path, cell(), rollouts=1)
+    execute(job, print)
+    (test,) = stand.tests
+    assert test["trust_task"] is True
+
+
 def test_what_died_after_its_training_is_looked_at_again(tmp_path, stand):
     (job,) = jobs(tmp_path, cell(), keep_checkpoints=False)
     run = make_run(Store(tmp_path), job.cell, state="finished", steps_done=300)

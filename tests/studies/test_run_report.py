@@ -12,7 +12,8 @@ from made import make_run_of
 from csac.cli import main
 from csac.record import manifest as manifests
 from csac.record.manifest import EvaluationPlan
-from csac.studies.comparison import _times
+from csac.studies.collected import read_collected
+from csac.studies.comparison import _given_cell, _times
 
 ROWS = "seed,step,episode,return,length,success"
 
@@ -373,6 +374,16 @@ def test_the_time_of_a_run_that_had_enough_is_of_the_steps_that_it_made():
     (run.path / "log.txt").write_text("2026-01-01T00:03:00+00:00 finished\n")
     (time,) = _times(run.path, run.manifest)
     assert (time.seconds, time.steps) == (180, 30)
+
+
+def test_the_time_of_a_collected_cell_counts_unless_it_failed():
+    collected("cells", [[10.0]])
+    path = Path("cells/seed-0.json")
+    for failures, counted in (({}, [60.0]), ({0: "step 5: a reward is NaN"}, [])):
+        state = "failed" if failures else "finished"
+        one = replace(read_collected(path).manifest, state=state, failures=failures)
+        path.write_bytes(manifests.written(one)[:-2] + b', "seconds": 60.0}\n')
+        assert [time.seconds for time in _given_cell(None, path).times] == counted
 
 
 def test_a_damaged_run_is_named_and_left_out(capsys):

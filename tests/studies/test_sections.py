@@ -171,3 +171,11 @@ def test_a_sweep_is_of_methods_that_differ_in_that_number_alone(others):
     study = replace(study.narrowed(seeds=1), methods=(first, replace(second, **others)))
     arms = gather(study, MadeRecords(lambda *_: 1.0))
     assert len(drawn(returns(arms, Scope("it")), Trend)) == (not others)
+
+
+def test_the_name_of_a_picture_fits_into_a_folder_however_many_changes_it_is_of():
+    changes = [f"friction x 1.{n} after step {n}00,000" for n in range(1, 10)]
+    one, other = (Scope("ramp").file("curve", f"HalfCheetah-v4, {', '.join(some)}") for some in (changes, changes[:-1]))
+    assert one != other
+    assert max(map(len, (one, other))) < 255 - len(".png") - len("..12345678.1234567890")
+    assert Scope("ramp").file("curve", "Hopper-v4") == "ramp-curve-hopper-v4"
