@@ -7,12 +7,14 @@ import shlex
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from optuna.storages.journal import JournalFileOpenLock
 from tuning import FakeTrain, Told, question
 
 import csac.training.train as training
@@ -303,8 +305,11 @@ def test_a_trial_is_ended_and_let_go_of_at_one_stroke(tmp_path, ending):
     assert not is_locked(tmp_path / "study" / ".lock")
 
 
-def test_a_study_that_another_process_begins_at_this_moment_is_no_stranger_s(tmp_path):
+@pytest.mark.filterwarnings("ignore:The value of `grace_period`:UserWarning")
+def test_a_study_that_another_process_begins_at_this_moment_is_no_stranger_s(tmp_path, monkeypatch):
     """Its lock of the journal is there before the journal."""
+    impatient = partial(JournalFileOpenLock, grace_period=1)  # which waits for half a minute
+    monkeypatch.setattr("optuna.storages.journal.JournalFileOpenLock", impatient)
     begun = tmp_path / "study"
     (begun / "trials").mkdir(parents=True)
     (begun / ".lock").touch()
