@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 MOST_AXES = 31  # of a shape; a batch has one more, and NumPy 1 holds 32
 FLOAT32_MAX = float(np.finfo(np.float32).max)
+BOUNDS_ROUNDING = 1e-6  # of a bound: a few times what float32 rounds by
 
 Activation = Literal["relu", "tanh"]
 Head = Literal["tanh_gaussian", "tanh", "clipped_gaussian"]

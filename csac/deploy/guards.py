@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from csac.deploy.contract import FLOAT32_MAX
+from csac.deploy.contract import BOUNDS_ROUNDING, FLOAT32_MAX
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 Fallback = Literal["zero", "middle", "last", "given"]
 
-ROUNDING = 1e-6  # of a bound: a few times what float32 rounds by
 LONGEST_WATCHDOG = 2**24  # an ONNX graph counts in float32, where one more would be no more
 
 
@@ -204,6 +203,6 @@ def _fallback(text: str, contract: Contract) -> tuple[Fallback, np.ndarray]:
         raise InputError(f"--fallback {text} is {len(action)} numbers where the task has {len(middle)} actions")
     low, high = contract.action_low, contract.action_high
     bounded = np.clip(action, low, high)  # the contract's bounds are the task's, rounded inwards to float32
-    if not (np.abs(action - bounded) <= ROUNDING * np.maximum(np.abs(low), np.abs(high))).all():
+    if not (np.abs(action - bounded) <= BOUNDS_ROUNDING * np.maximum(np.abs(low), np.abs(high))).all():
         raise InputError(f"--fallback {text} is outside of the action's bounds")
     return "given", bounded

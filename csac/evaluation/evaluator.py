@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from csac.checks import check_flag, check_whole
+from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy, noise_generator
 from csac.record.manifest import SEED_LIMIT
 from csac.tasks.environment import Environment
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
 
 EPISODES_AT_ONCE = 10  # rows of every batch that the policy sees: rounding depends on its shape
-BOUNDS_ROUNDING = 1e-6  # of a bound: a few times what float32 rounds by
 LONGEST_EPISODE = 100_000  # steps; a task that never ends would never let training go on
 
 
