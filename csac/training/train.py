@@ -15,6 +15,7 @@ from csac.checks import check_callable, check_flag, check_path
 from csac.processes import end_if_unguarded
 from csac.record.manifest import as_kept
 from csac.record.run import RunDirectory
+from csac.record.statistics import mean_returns
 from csac.record.wandb import WandbLog, import_wandb, logs_to_wandb
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.tasks.trust import refuse_untrusted
@@ -85,7 +86,9 @@ def train(
         reporter: where progress is shown; None is silent, but for a warning about each seed that fails.
         command: the command line, for the manifest.
         on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation.
-        stop_when: called in the same way; training ends early, and counts as finished, once it returns True.
+        stop_when: called in the same way; training ends early, and counts as finished, once it returns True. With
+            `resume` it is asked once more of the last evaluation of a run that had ended early, which ends there again
+            unless it has become more demanding.
         **options: `steps`, `seeds`, `first_seed`, `device`, `evaluation_interval`, `evaluation_episodes`,
             `checkpoint_interval` and `keep_checkpoints`, as `csac.training.options.Options` explains them, and
 
@@ -241,6 +244,15 @@ class Watchers(NamedTuple):
                 enough = bool(self.stop_when and self.stop_when(step, returns)) or enough
         return enough
 
+    def had_enough(self, run: RunDirectory) -> bool:
+        """Return whether a run that is over had ended early, and `stop_when` still says so of its last evaluation."""
+        rows = run.evaluations
+        if self.stop_when is None or run.manifest.state != "finished" or not len(rows):
+            return False
+        step = int(rows["step"].max())
+        with callers_own(self.failures):
+            return bool(self.stop_when(step, mean_returns(rows[rows["step"] == step])))
+
 
 def _go_on(
     run: RunDirectory, plan: Plan, before: Manifest, wanted: Manifest, notes: list[str], watchers: Watchers
@@ -249,6 +261,10 @@ def _go_on(
     if run.manifest.state in ("finished", "failed") and run.manifest.steps_done >= plan.steps:
         if watchers.reporter:
             watchers.reporter.note(f"{run.path} has made its {plan.steps:,} steps already; more: --steps")
+        return run
+    if watchers.had_enough(run):
+        if watchers.reporter:
+            watchers.reporter.note(f"{run.path} had enough after {run.manifest.steps_done:,} steps")
         return run
     restart = roll_back(run)
     current = ("machine", "versions", "commit", "groups", "steps", "process", "device", "checkpoints")

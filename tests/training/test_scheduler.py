@@ -59,6 +59,29 @@ def test_a_run_that_has_enough_ends_at_that_very_step(tmp_path, interval):
     assert (finished.manifest.steps_done, finished.manifest.state) == (2 * interval, "finished")
 
 
+def test_a_run_that_had_enough_goes_on_only_where_more_is_asked(tmp_path):
+    told: list[int] = []
+
+    def enough_after(steps: int) -> Callable[[int, dict[int, float]], bool]:
+        def enough(step: int, returns: dict[int, float]) -> bool:
+            told.append(step)
+            assert list(returns) == [0]
+            return step >= steps
+
+        return enough
+
+    def again(stop_when: Any) -> tuple[int, int]:
+        finished = run(tmp_path / "run", SAC(**SMALL), 500, "Pendulum-v1", stop_when=stop_when, **settings)
+        return finished.manifest.steps_done, len(finished.manifest.history)
+
+    settings: dict[str, Any] = {"evaluation_interval": 100, "resume": True}
+    assert again(enough_after(200)) == (200, 0)
+    assert again(enough_after(200)) == (200, 0)
+    assert again(enough_after(300)) == (300, 1)
+    assert again(None) == (500, 2)
+    assert told == [100, 200, 200, 200, 300]
+
+
 class SlowWorkers:
     """Workers that make their turns at once, on a clock of their own: each turn takes so many seconds."""
 
