@@ -125,7 +125,14 @@ def _listed(seeds: list[int]) -> str:
 
 
 def step_of_policy(run: RunDirectory, seed: int, which: Which) -> int:
-    """Return the environment step at which a seed's last or best policy was saved."""
+    """Return how many environment steps a seed had made when its last or best policy was taken.
+
+    The file of the policy says so. One from before it did is taken for that of the best evaluation, or for as old as
+    its seed. Raises InputError for a file that is not there or damaged.
+    """
+    step = Policy.load(run.policy(seed, which), Contract.load(run.contract)).step
+    if step is not None:
+        return step
     rows = run.evaluations
     return best_step(rows[rows["seed"] == seed]) if which == "best" else run.manifest.steps_of(seed)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from csac.types import InputError, Layer, Normaliser, PolicyNetwork
 CONTRACT, SAVED = "contract.json", "policy.safetensors"  # in the folder of a policy that was saved by itself
 LOG_STD_RANGE = (-20.0, 2.0)
 
+_STEP = "step"  # of a file's metadata: what a run before this had not got
 _STREAM = 0x706F6C69  # far from what a task that spawns generators of its own would use: 0, 1, 2, ...
 
 
@@ -36,14 +38,15 @@ class Policy:
         network: the layers; copied, so that the caller may donate or change them afterwards.
         contract: how observations become flat and actions leave [-1, 1].
         seed: of the generator that stochastic actions draw from.
+        step: how many environment steps of its own its seed had made when it was taken, where that is known.
 
     Raises:
         InputError: layers that do not fit each other or the contract.
     """
 
-    def __init__(self, network: PolicyNetwork, contract: Contract, seed: int = 0) -> None:
+    def __init__(self, network: PolicyNetwork, contract: Contract, seed: int = 0, step: int | None = None) -> None:
         self.network = network._replace(parameters=copied(network.parameters))
-        self.contract = contract
+        self.contract, self.step = contract, step
         check_network(self.network, contract)
         self._generator = noise_generator(seed)
         self._actors = [_split_actor(actor, contract) for actor in self.network.parameters.actors]
@@ -129,8 +132,9 @@ class Policy:
             raise InputError(f"{folder} cannot be written: {error.strerror}") from error
 
     def save_layers(self, path: str | Path) -> None:
-        """Write the layers alone as safetensors, whole or not at all; a contract belongs to them."""
-        write_atomically(Path(path), tensors.encode(to_tensors(self.network.parameters)))
+        """Write the layers alone as safetensors, and the step, whole or not at all; a contract belongs to them."""
+        metadata = {} if self.step is None else {_STEP: str(self.step)}
+        write_atomically(Path(path), tensors.encode(to_tensors(self.network.parameters), metadata))
 
     @staticmethod
     def load(path: str | Path, contract: Contract, seed: int = 0) -> Policy:
@@ -141,14 +145,24 @@ class Policy:
         """
         content = read_file(Path(path))
         try:
-            arrays = tensors.decode(content)
+            arrays, step = tensors.decode(content), _step_in(content)
         except ValueError as error:
             raise InputError(f"{path} is damaged ({error}): restore it from a copy") from error
         try:
             network = PolicyNetwork(from_tensors(arrays), contract.activation, contract.head)
-            return Policy(network, contract, seed)
+            return Policy(network, contract, seed, step)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
+
+
+def _step_in(content: bytes) -> int | None:
+    """Return the step in a policy's file, or None where it has none. Raises ValueError for one that is no number."""
+    step = tensors.metadata_of(content).get(_STEP)
+    if step is None:
+        return None
+    if not re.fullmatch(r"\d{1,15}", step, re.ASCII):
+        raise ValueError(f"its step is {step!r:.40}")
+    return int(step)
 
 
 class _Actor(NamedTuple):

@@ -1,13 +1,15 @@
 """The safetensors format for float32 arrays, by NumPy alone: https://github.com/huggingface/safetensors#format.
 
 A file is the length of its header (8 bytes, little endian), the header (JSON: name -> dtype, shape, and where its bytes
-begin and end), then the bytes. What is written is byte for byte what the library `safetensors` writes.
+begin and end; `__metadata__` -> texts by name), then the bytes. What is written is byte for byte what the library
+`safetensors` writes.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,11 +21,13 @@ LONGEST_HEADER = 2**20  # bytes; a policy needs about a hundred for each array
 
 _FLOAT32 = np.dtype("<f4")
 _FIELDS = {"dtype", "shape", "data_offsets"}
+_METADATA = "__metadata__"
 
 
-def encode(tensors: Mapping[str, np.ndarray]) -> bytes:
-    """Return the file that holds these float32 arrays."""
-    header, parts, end = {}, [], 0
+def encode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str] = MappingProxyType({})) -> bytes:
+    """Return the file that holds these float32 arrays, and texts by name."""
+    header: dict[str, Any] = {_METADATA: dict(metadata)} if metadata else {}
+    parts, end = [], 0
     for name, array in sorted(tensors.items()):
         part = np.asarray(array, _FLOAT32).tobytes()
         begin, end = end, end + len(part)
@@ -40,6 +44,26 @@ def decode(content: bytes) -> dict[str, np.ndarray]:
     Raises:
         ValueError: anything that is not exactly this format, or arrays that are not float32; the message is one line.
     """
+    header, data = _parts(content)
+    header.pop(_METADATA, None)
+    spans = {name: _span(name, entry) for name, entry in header.items()}
+    tensors, end = {}, 0
+    for name, (begin, after, shape) in sorted(spans.items(), key=lambda item: item[1][:2]):
+        if begin != end or after > len(data):
+            raise ValueError(f"the bytes of {name!r} do not follow those before")
+        tensors[name], end = np.frombuffer(data[begin:after], _FLOAT32).reshape(shape), after
+    if end != len(data):
+        raise ValueError(f"it holds {len(data)} bytes of numbers where its header has {end}")
+    return tensors
+
+
+def metadata_of(content: bytes) -> dict[str, str]:
+    """Return the texts of a file by name. Raises ValueError for a header that is not of this format."""
+    return _parts(content)[0].get(_METADATA, {})
+
+
+def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return a file's header, whose metadata are texts where it has any, and what follows it."""
     length = int.from_bytes(content[:8], "little")
     if len(content) < 8 or not 2 <= length <= min(LONGEST_HEADER, len(content) - 8):
         raise ValueError("it has no header of a safe length")
@@ -49,19 +73,10 @@ def decode(content: bytes) -> dict[str, np.ndarray]:
         raise ValueError("its header is nested too deeply") from None
     if not isinstance(header, dict):
         raise ValueError("its header is not a JSON object")
-    metadata = header.pop("__metadata__", {})
+    metadata = header.get(_METADATA, {})
     if not isinstance(metadata, dict) or not all(isinstance(value, str) for value in metadata.values()):
         raise ValueError("its metadata are not texts by name")
-    spans = {name: _span(name, entry) for name, entry in header.items()}
-    data, end = content[8 + length :], 0
-    tensors = {}
-    for name, (begin, after, shape) in sorted(spans.items(), key=lambda item: item[1][:2]):
-        if begin != end or after > len(data):
-            raise ValueError(f"the bytes of {name!r} do not follow those before")
-        tensors[name], end = np.frombuffer(data[begin:after], _FLOAT32).reshape(shape), after
-    if end != len(data):
-        raise ValueError(f"it holds {len(data)} bytes of numbers where its header has {end}")
-    return tensors
+    return header, content[8 + length :]
 
 
 def _span(name: str, entry: Any) -> tuple[int, int, list[int]]:

@@ -14,7 +14,7 @@ from csac.deploy.artefact import compiler, open_artefact
 from csac.deploy.artefact_contract import ArtefactContract, Format, Weights
 from csac.deploy.c_size import Size, sizes
 from csac.deploy.card import model_card
-from csac.deploy.choosing import best_step, choose_seed
+from csac.deploy.choosing import choose_seed, step_of_policy
 from csac.deploy.contract import FLOAT32_MAX, Contract
 from csac.deploy.guards import Guards, make_guards
 from csac.deploy.policy import Policy
@@ -216,20 +216,19 @@ def control_rate(raw: Any) -> float | None:
 def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
     """Return where a policy comes from and how good it was in training, as JSON holds it.
 
-    The returns are those of the evaluation that belongs to the policy: the seed's last one, which a run that stopped
-    between two has left behind (`step` and `steps` tell), or its best; the interval
-    is over that evaluation's episodes. Those of `all_seeds` are of their last evaluations, and the interval over seeds,
+    The returns are those of the seed's newest evaluation up to the policy, which is `steps` old: the policy's own, but
+    for the last policy of a run that stopped between two (`step` tells). The interval is over that evaluation's
+    episodes. Those of `all_seeds` are of their last evaluations, and the interval over seeds,
     of which those that failed in training are left out as in every table. `failure` says where and how the policy's own
     seed failed, and is None where it did not. `learnt_weights` are those of entropy and relative entropy that the
     hyperparameters leave to be learnt, as metrics.csv last told of them by then.
     """
     manifest, rows = run.manifest, run.evaluations
     own = rows[rows["seed"] == seed] if len(rows) else rows
-    evaluation: dict[str, Any] = {}
-    if len(own):
-        step = best_step(own) if which == "best" else int(own["step"].max())
+    at, evaluation = step_of_policy(run, seed, which), {}
+    if len(own := own[own["step"] <= at]):
+        step = int(own["step"].max())
         evaluation = {"step": step, **returns_as_fields(own["return"][own["step"] == step])}
-    at = evaluation.get("step", manifest.steps_done) if which == "best" else manifest.steps_of(seed)
     last = last_evaluations(rows, points=1) if len(rows) else {}
     sound = [value for label, value in last.items() if label not in manifest.failures]
     over = returns_as_fields(np.array(sound)) if sound else {}

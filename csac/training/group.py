@@ -165,7 +165,7 @@ class Group:
         """Return the policies of the seeds that are alive and sound."""
         networks = self.learner.networks()
         return {
-            seed: Policy(networks[i], self._contract)
+            seed: Policy(networks[i], self._contract, step=self.step)
             for i, seed in enumerate(self.seeds)
             if self.environments.alive[i] and _is_finite(networks[i])
         }
@@ -206,7 +206,7 @@ class Group:
         self.step += 1
         for failure in outcome.failures:
             network = self.learner.networks()[failure.place]
-            policy = Policy(network, self._contract) if _is_finite(network) else None
+            policy = Policy(network, self._contract, step=self.step) if _is_finite(network) else None
             yield Failed(self.seeds[failure.place], self.step, failure.reason, failure.details, policy)
         if outcome.episodes:
             yield Rows("episodes", [_episode_row(self.seeds[e.place], self.step, e) for e in outcome.episodes])

@@ -17,7 +17,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from policies import DICT_PARTS, contract, random_layers, random_network, random_policy
 
+from csac.deploy import tensors
 from csac.deploy.contract import Activation, Contract
+from csac.deploy.parameters import to_tensors
 from csac.deploy.policy import Policy
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
@@ -266,6 +268,21 @@ def test_a_policy_is_the_same_after_saving_and_loading(tmp_path):
     np.testing.assert_array_equal(again.predict(observations)[0], policy.predict(observations)[0])
     assert again.contract.observation_parts == DICT_PARTS
     assert sorted(path.name for path in tmp_path.iterdir()) == ["contract.json", "policy.safetensors"]
+
+
+@pytest.mark.parametrize("step", [None, 0, 12_345])
+def test_a_policy_knows_how_many_steps_it_learnt_for(tmp_path, step):
+    policy = random_policy(contract())
+    Policy(policy.network, policy.contract, step=step).save_layers(tmp_path / "policy")
+    assert Policy.load(tmp_path / "policy", contract()).step == step
+
+
+@pytest.mark.parametrize("step", ["", "-1", "1.0", "²", "9" * 16])
+def test_a_step_that_is_none_is_damage(tmp_path, step):
+    arrays = to_tensors(random_policy(contract()).network.parameters)
+    (tmp_path / "policy").write_bytes(tensors.encode(arrays, {"step": step}))
+    with pytest.raises(InputError, match=r"policy is damaged \(its step is"):
+        Policy.load(tmp_path / "policy", contract())
 
 
 def test_equal_policies_are_equal_files(tmp_path):

@@ -45,9 +45,13 @@ def test_the_names_of_a_policy_are_written_as_the_library_does():
     assert tensors.encode(arrays) == safetensors.numpy.save(arrays)
 
 
-def test_what_the_library_writes_with_metadata_is_read():
+def test_metadata_are_written_and_read_as_the_library_does():
     arrays = {"b": np.arange(6, dtype=np.float32).reshape(2, 3), "a": np.ones(1, np.float32)}
-    assert equal(tensors.decode(safetensors.numpy.save(arrays, {"made by": "another"})), arrays)
+    for metadata in ({}, {"made by": "another"}, {"ü": '"'}):
+        content = safetensors.numpy.save(arrays, metadata or None)
+        assert tensors.encode(arrays, metadata) == content
+        assert equal(tensors.decode(content), arrays)
+        assert tensors.metadata_of(content) == metadata
 
 
 def file(header: Any, data: bytes = b"") -> bytes:

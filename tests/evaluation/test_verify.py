@@ -21,6 +21,7 @@ from csac.cli import main
 from csac.deploy import writing
 from csac.deploy.artefact import open_artefact
 from csac.deploy.artefact_contract import ArtefactContract
+from csac.deploy.choosing import load, step_of_policy
 from csac.deploy.policy import Policy
 from csac.deploy.writing import write_artefact
 from csac.evaluation import verify
@@ -295,6 +296,21 @@ def test_the_best_policy_of_a_seed_comes_with_its_own_evaluation(tmp_path):
     origin = export(tmp_path / "run", seed=0, which="best", options=QUICK).contract.provenance
     assert (origin["seed"], origin["steps"]) == (0, 100)
     assert origin["evaluation"]["mean_return"] == 7.0
+
+
+def test_a_policy_is_as_old_as_its_file_says_and_not_as_its_run(tmp_path):
+    """After a stop between two evaluations, and a kill: the manifest's count moves at other times than the policies."""
+    run = make_run(tmp_path / "run")
+    saved = load(run.path, seed=0)
+    for path, step in ((run.policy(0), 230), (run.policy(0, "best"), 100)):
+        Policy(saved.network, saved.contract, step=step).save_layers(path)
+    origin = provenance(run, 0, "last")
+    assert (origin["steps"], origin["evaluation"]["step"]) == (230, 200)
+    assert step_of_policy(run, 0, "last") == 230
+    run.policy(0).write_bytes(run.policy(0, "best").read_bytes())
+    for which in ("last", "best"):
+        origin = provenance(run, 0, which)
+        assert (origin["steps"], origin["evaluation"]["step"], origin["evaluation"]["mean_return"]) == (100, 100, 7.0)
 
 
 def test_seeds_that_failed_count_in_no_mean_and_end_where_they_failed(tmp_path):
