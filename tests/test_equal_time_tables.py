@@ -183,6 +183,23 @@ def test_the_machine_and_what_else_ran_there_are_told(folder):
     assert f"- processor: a fast one\n- {load}\n" in page
 
 
+def test_the_picture_shows_means_and_ranges_by_the_wall_clock(folder, monkeypatch):
+    write_peer(folder / "Ant-v4" / "sbx-crossq" / "seed-101.csv", LIMITS["Ant-v4"], 40.0, 180.0)  # the others: 80
+    drawn = []
+    monkeypatch.setitem(TABLES.draw.__globals__, "save", lambda figure, *_: drawn.append(figure))
+    TABLES.draw(CONFIRMED, MadeRecords(candidate), folder, Path("picture.png"))
+
+    walker, ant = drawn[0].axes
+    assert (walker.get_title("left"), walker.get_xlim(), ant.get_xlim()) == ("Walker2d-v4", (0, 20), (0, 30))
+    assert len(walker.lines) == len(ant.lines) == len(PEERS) + len(OWN)
+    mean = dict(zip(ant.lines[PEERS.index("sbx-crossq")].get_xdata(), ant.lines[3].get_ydata(), strict=True))
+    assert (mean[3.0], mean[30.0]) == (40.0, 1.5 * (4 * 80 + 180) / 5)  # after 0.1 and 1 of 30 s
+    band = ant.collections[3].get_paths()[0].vertices
+    assert (band[:, 1].max(), band[:, 1].min()) == (1.5 * 180, 40.0)
+    texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert texts == ["CSAC, preset strong", "SAC, preset strong", *TABLES.PEERS.values()]
+
+
 def test_without_the_candidate_s_stage_nothing_is_compared(folder):
     lines = told(folder, lambda cell, step: None).splitlines()
 

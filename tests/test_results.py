@@ -132,6 +132,7 @@ def test_the_tables_of_equal_time_follow_from_its_files(copied, monkeypatch):
     monkeypatch.setattr(sys, "argv", shlex.split(line))
     runpy.run_path(sys.argv[0], run_name="__main__")
     assert page.read_text() == before
+    assert (copied / "results" / "strong" / "equal-time.png").exists()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)

@@ -200,6 +200,11 @@ def head(figure: Figure, title: str, titles: Sequence[str] = ("",), text: str = 
         figure.text(left, 1 - above / figure.get_figheight(), text, va="top", **NOTE_FONT)
 
 
+def grouped(value: float, _position: float | None = None) -> str:
+    """Return the words of a tick on the axis of a quantity: thousands apart, and a minus instead of a hyphen."""
+    return f"{value:,.10g}".replace("-", "−")
+
+
 def draw_legend(figure: Figure, looks: Mapping[str, Look], more: Sequence[Artist] = ()) -> None:
     """Put the legend below the axes, where it covers no curve, in as few lines as it fits into.
 
@@ -241,7 +246,7 @@ def _dress(axes: Axes, curves: Sequence[Curve], ticks: int) -> None:
     axes.set_xlabel("environment steps per seed")
     axes.xaxis.set_major_locator(MaxNLocator(ticks, steps=[1, 2, 2.5, 5, 10]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda step, _: short(step)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace("-", "−")))
+    axes.yaxis.set_major_formatter(grouped)
     if not curves:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, "no evaluations yet", transform=axes.transAxes, ha="center", color="#777777")

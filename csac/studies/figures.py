@@ -15,6 +15,7 @@ from csac.record.plots import (
     Format,
     Panel,
     draw_legend,
+    grouped,
     head,
     learning_curves,
     looks_of,
@@ -165,7 +166,7 @@ class Trend(NamedTuple):
             axes.xaxis.set_minor_locator(NullLocator())
             axes.set_xlabel(self.name)
             axes.set_ylabel(self.quantity)
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace("-", "−")))
+            axes.yaxis.set_major_formatter(grouped)
             draw_legend(figure, looks)
             head(figure, title, text=self.note)
             save(figure, path, FORMATS)

@@ -13,10 +13,10 @@ import matplotlib.style
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from csac.record.atomic import write_atomically
-from csac.record.plots import COLOURS, STYLE, save
+from csac.record.plots import COLOURS, STYLE, grouped, save
 from csac.record.rendering import EMPTY, Cell, Row, Table, markdown, number, numeric
 from csac.studies.cells import complete
 from csac.studies.command_words import changed
@@ -124,7 +124,7 @@ def history(path: Path, question: Question, results: Sequence[Result]) -> None:
         axes.set_xlabel("trial")
         axes.set_ylabel(f"objective ({question.seeds} seed{'s' * (question.seeds > 1)})")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace("-", "−")))
+        axes.yaxis.set_major_formatter(grouped)
         figure.legend(loc="outside lower center", ncols=3, frameon=False)
         save(figure, path, FORMATS)
 

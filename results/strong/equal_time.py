@@ -1,7 +1,7 @@
 """What csac's candidate and its peers have learnt in equal time: what PROTOCOL.md asks for in stage 4.
 
     python results/strong/equal_time.py
-    python results/strong/equal_time.py --into PAGE.md#NAME
+    python results/strong/equal_time.py --into PAGE.md#NAME --curve PICTURE.png
 
 The runs are those of `python -m benchmarks.equal_time`, in equal-time/; those of csac's arms are of stage 1, in
 results/studies. The return at equal time of a run is the mean of its evaluations in the last fifth: a peer's of the
@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from csac.record.plots import RETURN, draw_legend, grouped, head, looks_of, picture, save
 from csac.record.rendering import Cell, Row, Table, markdown, number, numeric
 from csac.record.statistics import (
     evaluation_matrix,
@@ -42,6 +43,7 @@ EVIDENCE = SimpleNamespace(**runpy.run_path(str(HERE.parent / "reference" / "evi
 CANDIDATE = "CSAC, candidate"  # of confirm.toml, and of plan.csv
 SECONDARY = "SAC, candidate"
 OWN = (CANDIDATE, SECONDARY)
+DRAWN = {CANDIDATE: "CSAC, preset strong", SECONDARY: "SAC, preset strong"}  # which is what the candidate has become
 STEPS = 100_000  # of the candidate, which take the time T; no run of csac's arms is longer
 LAST_SHARE = 0.2  # of T, or of the steps of csac's arms: the evaluations there are the return at equal time
 # By the folders of benchmarks/equal_time.py. The first is the SAC automatic of this stage: what scores are shares of.
@@ -265,12 +267,18 @@ def surroundings(folder: Path) -> list[str]:
     return lines
 
 
-def told(study: Study, results: Source, folder: Path) -> str:
-    """Return all that is known of stage 4, in Markdown. Raises InputError where T is not known."""
+def known_plans(study: Study, folder: Path) -> Plans:
+    """Return how far everyone comes in T. Raises InputError where that is not known of one on a task of the study."""
     plans = read_plan(folder / "plan.csv")
     for task, name in itertools.product(study.tasks, (*OWN, *PEERS)):
         if (name, task) not in plans:
             raise InputError(f"{name} on {task} was not measured: python -m benchmarks.equal_time speeds")
+    return plans
+
+
+def told(study: Study, results: Source, folder: Path) -> str:
+    """Return all that is known of stage 4, in Markdown. Raises InputError where T is not known."""
+    plans = known_plans(study, folder)
     study = dataclasses.replace(study, title="Equal time")
     found = gathered(study, results, folder, plans)
     over = measured(found)
@@ -289,6 +297,34 @@ def told(study: Study, results: Source, folder: Path) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
+# The picture.
+
+
+def draw(study: Study, results: Source, folder: Path, path: Path) -> None:
+    """Draw what each method has reached by the wall clock, task by task. Raises InputError as `told` does."""
+    plans = known_plans(study, folder)
+    found = gathered(study, results, folder, plans)
+    looks = looks_of([*DRAWN.values(), *PEERS.values()])
+    with picture(3.5, columns=len(found)) as figure:
+        for axes, (task, methods) in zip(figure.axes, found.items(), strict=True):
+            limit = plans[CANDIDATE, task].limit
+            for label, runs in methods.items():
+                shares = sorted({share for run in runs.values() for share in run.returns})
+                values = np.array([[run.returns[share] for share in shares] for run in runs.values()])
+                if not len(values):
+                    continue
+                colour, style = looks[DRAWN.get(label, label)]
+                times = np.multiply(shares, limit)
+                axes.fill_between(times, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.1, linewidth=0)
+                axes.plot(times, values.mean(axis=0), color=colour, linestyle=style, linewidth=2.2)
+            axes.set(xlim=(0, limit), xlabel="seconds of training on two cores")
+            axes.yaxis.set_major_formatter(grouped)
+        figure.axes[0].set_ylabel(RETURN)
+        draw_legend(figure, looks)
+        head(figure, "What each has learnt by the wall clock", list(found), "line: mean over seeds · band: their range")
+        save(figure, path, ("png",))
+
+
 def _list(notes: Sequence[str]) -> str:
     return "\n".join(f"- {note}" for note in notes)
 
@@ -298,15 +334,19 @@ def _seeds(seeds: Iterable[int]) -> str:
 
 
 def main() -> None:
-    """Print the tables, or write them into a page."""
+    """Print the tables, or write them into a page; draw the picture where it is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, default=HERE / "equal-time", help="where the runs' files are")
     parser.add_argument("--results", type=Path, default=EVIDENCE.CELLS, help="where cells/ of csac's arms lies")
     parser.add_argument("--into", metavar="PAGE.md#NAME", help="write between the marks NAME of a page")
+    parser.add_argument("--curve", metavar="PICTURE.png", type=Path, help="draw the returns by the wall clock")
     arguments = parser.parse_args()
     try:
         source = Results(arguments.results, may_be_empty=True)
-        text = told(read_study(HERE / "confirm.toml"), source, arguments.folder)
+        study = read_study(HERE / "confirm.toml")
+        text = told(study, source, arguments.folder)
+        if arguments.curve:
+            draw(study, source, arguments.folder, arguments.curve)
         if arguments.into:
             page, _, name = arguments.into.partition("#")
             write_between(Path(page), name, f"{text}\n")
