@@ -55,13 +55,20 @@ def worker(module: str, **arguments: Any) -> list[str]:
 
 
 def training(
-    algorithm: str, window: Window, seeds: int = 1, interval: int = 1, device: str = "cpu", task: str = TASK
+    algorithm: str,
+    window: Window,
+    seeds: int = 1,
+    interval: int = 1,
+    device: str = "cpu",
+    task: str = TASK,
+    preset: str = "paper",
 ) -> list[str]:
     """Return the command that trains until the window is over; `interval` updates are made in one dispatch."""
     return worker(
         "training",
         algorithm=algorithm,
         task=task,
+        preset=preset,
         seeds=seeds,
         interval=interval,
         device=device,

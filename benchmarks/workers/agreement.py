@@ -8,10 +8,12 @@ import jax
 import numpy as np
 
 from benchmarks.driver import Driver, make_learner
+from benchmarks.measuring import TASK
+from csac.presets import hyperparameters
 
 
-def measure(updates: int) -> dict[str, Any]:
-    """Return which GPU there is, and how far it is from the CPU after so many updates from the same beginning.
+def measure(updates: int, preset: str = "paper") -> dict[str, Any]:
+    """Return which GPU there is, and how far CSAC is there from the CPU after so many updates from the same beginning.
 
     The difference is relative to the size of each array of the learner's state, and the largest of all. Where JAX can
     use no GPU, `device` is "".
@@ -22,15 +24,17 @@ def measure(updates: int) -> dict[str, Any]:
         return {"device": ""}
     if not updates:
         return {"device": gpu.device_kind}
-    ours, theirs = (learnt(device, updates) for device in (jax.devices("cpu")[0], gpu))
-    return {"device": gpu.device_kind, "updates": updates, "largest_difference": largest_difference(ours, theirs)}
+    ours, theirs = (learnt(device, updates, preset) for device in (jax.devices("cpu")[0], gpu))
+    difference = largest_difference(ours, theirs)
+    return {"device": gpu.device_kind, "preset": preset, "updates": updates, "largest_difference": difference}
 
 
-def learnt(device: Any, updates: int) -> list[Any]:
+def learnt(device: Any, updates: int, preset: str) -> list[Any]:
     """Return each seed's whole state, actor, critics and optimisers, after so many updates on this device."""
     seeds = 2
+    settings: dict[str, Any] = hyperparameters(preset, "csac", TASK) | {"replay_size": 1_000, "warmup_steps": 0}
     with jax.default_device(device):
-        driver = Driver(make_learner("csac", seeds=seeds, replay_size=1_000), seeds=seeds)
+        driver = Driver(make_learner("csac", seeds=seeds, **settings), seeds=seeds)
         for _ in range(updates):
             driver.step += 1
             driver.learner.step(driver.observations, driver.actions, driver.outcome, driver.step)

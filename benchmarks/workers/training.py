@@ -84,28 +84,36 @@ def _peak_kib(process: int) -> int:
 
 
 def measure(
-    algorithm: str, task: str, seeds: int, interval: int, device: Literal["cpu", "gpu"], launched: float, **counted: Any
+    algorithm: str,
+    task: str,
+    preset: str,
+    seeds: int,
+    interval: int,
+    device: Literal["cpu", "gpu"],
+    launched: float,
+    **counted: Any,
 ) -> dict[str, float]:
     """Train until the window is over, and return what was measured.
 
     Args:
-        algorithm: its name; it has the settings of the preset `paper`, but for the warm-up.
+        algorithm: its name; it has the settings of the preset, but for the warm-up.
         task: a Gymnasium id.
+        preset: paper or strong.
         seeds: how many are trained, in groups as csac chooses them.
         interval: environment steps, and updates, in one dispatch; PPO's is its rollout.
         device: cpu or gpu.
         launched: `time.monotonic()` when this process was started.
         counted: the fields of `Window`.
     """
-    window, paper = Window(**counted), hyperparameters("paper", algorithm, task)
+    window, settings = Window(**counted), hyperparameters(preset, algorithm, task)
     if algorithm == "ppo":
         interval = ROLLOUT_STEPS
     else:
-        paper |= {"warmup_steps": window.warmup, "update_interval": interval}
+        settings |= {"warmup_steps": window.warmup, "update_interval": interval}
     clock = Clock(window, launched, seeds, interval)
     try:
         train(
-            ALGORITHMS[algorithm](**paper),
+            ALGORITHMS[algorithm](**settings),
             task,
             steps=STEPS,
             seeds=seeds,

@@ -20,7 +20,7 @@ class Device(NamedTuple):
 @pytest.fixture(scope="module")
 def state():
     """What two seeds have learnt in two updates."""
-    return agreement.learnt(jax.devices("cpu")[0], updates=2)
+    return agreement.learnt(jax.devices("cpu")[0], updates=2, preset="paper")
 
 
 def test_what_a_device_learns_agrees_with_itself(state):
@@ -42,6 +42,12 @@ def test_what_is_no_number_is_a_difference():
 
 def test_the_measurement_tells_of_the_gpu(state, monkeypatch):
     monkeypatch.setattr(jax, "devices", lambda kind: [Device("a GPU" if kind == "gpu" else kind)])
-    monkeypatch.setattr(agreement, "learnt", lambda device, updates: state)
+    monkeypatch.setattr(agreement, "learnt", lambda device, updates, preset: state)
     assert agreement.measure(0) == {"device": "a GPU"}
-    assert agreement.measure(2) == {"device": "a GPU", "updates": 2, "largest_difference": 0.0}
+    told = {"device": "a GPU", "preset": "strong", "updates": 2, "largest_difference": 0.0}
+    assert agreement.measure(2, "strong") == told
+
+
+def test_the_preset_is_the_one_that_is_compared():
+    (first, _) = agreement.learnt(jax.devices("cpu")[0], updates=1, preset="strong")
+    assert first.target_critics is None
