@@ -41,7 +41,7 @@ def measure_agreement(preset: str, options: Options) -> list[Row]:
 def measure_speed(case: Seeds, options: Options) -> list[Row]:
     """Train so many seeds for a while."""
     device = "CPU" if options.device == "cpu" else on_gpu(updates=0)["device"]
-    window = options.window(10.0)._replace(settled=260)
+    window = options.window(5.0)._replace(settled=260)
     command = training("csac", window, case.seeds, case.interval, options.device, preset=case.preset)
     found = run_one(command, device=options.device)
     row = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 from benchmarks.driver import Driver, make_learner
 from benchmarks.measuring import TASK
 from csac.presets import hyperparameters
+from csac.training.devices import FLAGS, PRECISION, with_exact_kernels
 
 
 def measure(updates: int, preset: str = "paper") -> dict[str, Any]:
@@ -18,6 +20,7 @@ def measure(updates: int, preset: str = "paper") -> dict[str, Any]:
     The difference is relative to the size of each array of the learner's state, and the largest of all. Where JAX can
     use no GPU, `device` is "".
     """
+    compute_as_csac_does()
     try:
         gpu = jax.devices("gpu")[0]
     except RuntimeError:
@@ -27,6 +30,14 @@ def measure(updates: int, preset: str = "paper") -> dict[str, Any]:
     ours, theirs = (learnt(device, updates, preset) for device in (jax.devices("cpu")[0], gpu))
     difference = largest_difference(ours, theirs)
     return {"device": gpu.device_kind, "preset": preset, "updates": updates, "largest_difference": difference}
+
+
+def compute_as_csac_does() -> None:
+    """Ask for the numbers that `csac train --device gpu` has, in this process, whose devices JAX has not looked for."""
+    os.environ[FLAGS] = with_exact_kernels(os.environ.get(FLAGS, ""))
+    config: Any = jax.config
+    if config.jax_default_matmul_precision is None:
+        config.update("jax_default_matmul_precision", PRECISION)
 
 
 def learnt(device: Any, updates: int, preset: str) -> list[Any]:

@@ -11,6 +11,9 @@ from csac.types import InputError
 
 PRNG = "threefry2x32"  # runs are the same on every machine with the same keys
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda"}  # as JAX calls them
+FLAGS = "XLA_FLAGS"  # read by XLA when JAX first looks for devices
+EXACT_GPU = "--xla_gpu_deterministic_ops"  # of XLA: every run has the same kernels, none of which sums in any order
+PRECISION = "highest"  # of a GPU's matrix products; by default JAX rounds their float32 to TF32, of 10 bits
 
 
 def choose_device(device: str) -> None:
@@ -18,6 +21,9 @@ def choose_device(device: str) -> None:
 
     A CPU's programs are dispatched asynchronously, which is JAX's default: the client looks after a program's outputs
     while it runs already. `JAX_CPU_ENABLE_ASYNC_DISPATCH=0` changes that and no number.
+
+    A GPU computes as a CPU does, in float32 and the same in every run, unless the user's own XLA_FLAGS or
+    JAX_DEFAULT_MATMUL_PRECISION say otherwise.
 
     Raises:
         InputError: there is no such device, this process has computed on another one, or JAX is set to numbers or keys
@@ -30,15 +36,31 @@ def choose_device(device: str) -> None:
         raise InputError("csac computes in 32 bits and JAX is set to 64: unset JAX_ENABLE_X64 (jax_enable_x64)")
     if config.jax_default_prng_impl != PRNG:
         raise InputError(f"csac's keys are of JAX's {PRNG}: unset JAX_DEFAULT_PRNG_IMPL (jax_default_prng_impl)")
-    before = config.jax_platforms
+    before, flags = config.jax_platforms, os.environ.get(FLAGS, "")
     jax.config.update("jax_platforms", PLATFORMS[device])
+    if device == "gpu":
+        os.environ[FLAGS] = with_exact_kernels(flags)
     try:
         chosen = jax.default_backend()
     except Exception as error:  # which one depends on what is missing, and on JAX's version
-        jax.config.update("jax_platforms", before)
+        _forget(before, flags)
         hint = "pip install '.[cuda]' in a clone of csac, or choose the cpu"
         raise InputError(f"no GPU that JAX can use: {hint}") from error
     if chosen != device:
-        jax.config.update("jax_platforms", before)
+        _forget(before, flags)
         raise InputError(f"this process computes on the {chosen} already: train on the {device} in a new one")
     os.environ["JAX_PLATFORMS"] = PLATFORMS[device]  # for the workers
+    if device == "gpu" and config.jax_default_matmul_precision is None:
+        jax.config.update("jax_default_matmul_precision", PRECISION)
+        os.environ["JAX_DEFAULT_MATMUL_PRECISION"] = PRECISION  # for the workers
+
+
+def with_exact_kernels(flags: str) -> str:
+    """Return XLA's flags with a GPU's numbers the same in every run; what the flags say of that already stays."""
+    return flags if EXACT_GPU in flags else f"{flags} {EXACT_GPU}=true".strip()
+
+
+def _forget(platforms: str | None, flags: str) -> None:
+    jax.config.update("jax_platforms", platforms)
+    if os.environ.pop(FLAGS, "") and flags:
+        os.environ[FLAGS] = flags

@@ -37,6 +37,48 @@ def test_a_process_that_has_computed_on_the_cpu_refuses_the_gpu():
     choose_device("cpu")
 
 
+SETTINGS = ("XLA_FLAGS", "JAX_DEFAULT_MATMUL_PRECISION", "JAX_PLATFORMS")
+
+
+@pytest.fixture
+def a_gpu(monkeypatch):
+    """JAX's settings: it finds a GPU, and nothing is set of its numbers."""
+    config: Any = jax.config
+    before = config.jax_default_matmul_precision
+    for name in SETTINGS:
+        monkeypatch.setenv(name, "")
+    jax.config.update("jax_default_matmul_precision", None)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    yield config
+    jax.config.update("jax_default_matmul_precision", before)
+
+
+def test_a_gpu_computes_in_float32_and_the_same_in_every_run(a_gpu):
+    config = a_gpu
+    choose_device("gpu")
+    assert [os.environ[name] for name in SETTINGS] == ["--xla_gpu_deterministic_ops=true", "highest", "cuda"]
+    assert config.jax_default_matmul_precision == "highest"
+
+
+def test_what_the_user_has_set_of_a_gpu_s_numbers_stays(a_gpu, monkeypatch):
+    own = "--xla_gpu_deterministic_ops=false --xla_gpu_autotune_level=1"
+    monkeypatch.setenv("XLA_FLAGS", own)
+    jax.config.update("jax_default_matmul_precision", "tensorfloat32")
+    choose_device("gpu")
+    assert os.environ["XLA_FLAGS"] == own
+    assert a_gpu.jax_default_matmul_precision == "tensorfloat32"
+
+
+@pytest.mark.parametrize("flags", ["", "--xla_some_flag=1"])
+def test_a_gpu_that_is_not_to_be_had_leaves_no_setting_behind(a_gpu, monkeypatch, flags):
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    with pytest.raises(InputError, match="this process computes on the cpu already"):
+        choose_device("gpu")
+    assert os.environ.get("XLA_FLAGS", "") == flags
+    assert a_gpu.jax_default_matmul_precision is None
+
+
 def test_another_device_is_refused():
     with pytest.raises(InputError, match="device must be cpu or gpu, not 'tpu'"):
         choose_device("tpu")
