@@ -246,8 +246,13 @@ class Watchers(NamedTuple):
 
     def had_enough(self, run: RunDirectory) -> bool:
         """Return whether a run that is over had ended early, and `stop_when` still says so of its last evaluation."""
-        rows = run.evaluations
-        if self.stop_when is None or run.manifest.state != "finished" or not len(rows):
+        if self.stop_when is None or run.manifest.state != "finished":
+            return False
+        try:
+            rows = run.evaluations
+        except InputError:  # damaged: going on restores it
+            return False
+        if not len(rows):
             return False
         step = int(rows["step"].max())
         with callers_own(self.failures):

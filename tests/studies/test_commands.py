@@ -667,8 +667,7 @@ def test_a_kind_is_measured_once_whatever_its_weights(monkeypatch):
     one = cell(task="Pendulum-v1")
     assert Calibration().cost(one) is None
     cost = Calibration().measure(one)
-    assert cost.learning > 0
-    assert cost.evaluating > 0
+    assert cost.evaluating > 0 <= cost.learning  # a difference of two times, which a busy machine can make nothing of
     assert (cost.longest_episode, cost.transition_size) == (200, 3 + 1 + 3 + 3)
     other = cell(task="Pendulum-v1", seed=3, steps=999, hyperparameters={"discount": 0.9})
     assert Calibration().cost(other) == cost

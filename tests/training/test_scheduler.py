@@ -33,6 +33,7 @@ from csac.training.messages import (
     Saved,
 )
 from csac.training.scheduler import _Scheduler
+from csac.training.train import Watchers
 
 
 @pytest.mark.parametrize(("quota", "groups", "processes"), [(None, 20, 3), (1, 4, 0), (4, 16, 1)])
@@ -80,6 +81,14 @@ def test_a_run_that_had_enough_goes_on_only_where_more_is_asked(tmp_path):
     assert again(enough_after(300)) == (300, 1)
     assert again(None) == (500, 2)
     assert told == [100, 200, 200, 200, 300]
+
+
+def test_a_damaged_table_is_not_asked_whether_it_is_enough(tmp_path):
+    finished = run(tmp_path / "run", SAC(**SMALL), 200, "Pendulum-v1", evaluation_interval=100)
+    watchers = Watchers(None, False, False, None, lambda step, returns: True, [])
+    assert watchers.had_enough(finished)
+    (finished.path / "evaluations.csv").write_bytes(b"\xff\xfe")
+    assert not watchers.had_enough(finished)
 
 
 class SlowWorkers:
