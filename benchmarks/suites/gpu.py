@@ -35,7 +35,7 @@ class Seeds(NamedTuple):
 
 def measure_agreement(preset: str, options: Options) -> list[Row]:
     """Make the same updates on GPU and CPU; nothing where the CPU is measured."""
-    return [] if options.device == "cpu" else [on_gpu(updates=200, preset=preset)]
+    return [] if options.device == "cpu" else [on_gpu(updates=50, preset=preset)]
 
 
 def measure_speed(case: Seeds, options: Options) -> list[Row]:

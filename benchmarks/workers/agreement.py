@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.driver import Driver, make_learner
+from benchmarks.driver import HALF_CHEETAH, Driver, make_learner
 from benchmarks.measuring import TASK
 from csac.presets import hyperparameters
 from csac.training.devices import FLAGS, PRECISION, with_exact_kernels
@@ -46,9 +46,14 @@ def learnt(device: Any, updates: int, preset: str) -> list[Any]:
     settings: dict[str, Any] = hyperparameters(preset, "csac", TASK) | {"replay_size": 1_000, "warmup_steps": 0}
     with jax.default_device(device):
         driver = Driver(make_learner("csac", seeds=seeds, **settings), seeds=seeds)
-        for _ in range(updates):
-            driver.step += 1
-            driver.learner.step(driver.observations, driver.actions, driver.outcome, driver.step)
+        generator = np.random.default_rng(1)
+        for step in range(1, updates + 1):
+            # Transitions that differ: a batch of equal ones is nothing but its rounding errors once it is normalised.
+            observations, following = generator.standard_normal((2, seeds, HALF_CHEETAH.observation_size), np.float32)
+            actions = generator.uniform(-1.0, 1.0, (seeds, HALF_CHEETAH.action_size)).astype(np.float32)
+            reward = generator.standard_normal(seeds, np.float32)
+            outcome = driver.outcome._replace(next_observation=following, reward=reward, observation=following)
+            driver.learner.step(observations, actions, outcome, step)
         return [driver.learner.carry(index).state for index in range(seeds)]
 
 

@@ -54,6 +54,8 @@ class Machine:
     cores: int = 0
     """Cores that the process may use: XLA divides its work for so many."""
     host: str = ""
+    gpu: str = ""
+    """Its model, where the run computes on one."""
 
 
 OTHER_TASK = "task is "  # how a change of the task begins

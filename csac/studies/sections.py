@@ -390,4 +390,5 @@ def _case_bar(arm: Arm, rows: np.ndarray, name: str, is_beside_paper: bool) -> B
 
 
 def _device(manifest: Manifest) -> str:
-    return f"{manifest.device} ({manifest.machine.processor})" if manifest.machine.processor else manifest.device
+    model = manifest.machine.gpu or manifest.machine.processor
+    return f"{manifest.device} ({model})" if model else manifest.device

@@ -55,6 +55,11 @@ def choose_device(device: str) -> None:
         os.environ["JAX_DEFAULT_MATMUL_PRECISION"] = PRECISION  # for the workers
 
 
+def gpu_in_use() -> str:
+    """Return the model of the GPU that this process computes on; nothing on a CPU."""
+    return jax.devices()[0].device_kind if jax.default_backend() == "gpu" else ""
+
+
 def with_exact_kernels(flags: str) -> str:
     """Return XLA's flags with a GPU's numbers the same in every run; what the flags say of that already stays."""
     return flags if EXACT_GPU in flags else f"{flags} {EXACT_GPU}=true".strip()

@@ -13,15 +13,16 @@ from csac import __version__
 from csac.processes import usable_cores
 from csac.record.manifest import Machine
 from csac.tasks.known import adapter_of
+from csac.training.devices import gpu_in_use
 
 if TYPE_CHECKING:
     from csac.tasks.making import Task
 
 
 def provenance(task: Task, command: str | None) -> dict[str, Any]:
-    """Return these fields of a manifest."""
+    """Return these fields of a manifest, of a process whose device has been chosen."""
     return {
-        "machine": Machine(_processor(), len(usable_cores()), platform.node()),
+        "machine": Machine(_processor(), len(usable_cores()), platform.node(), gpu_in_use()),
         "versions": _versions(task),
         "commit": _commit(),
         "command": command,

@@ -317,7 +317,7 @@ def _machine_changes(before: Manifest, wanted: Manifest) -> list[str]:
         "processor": (before.machine.processor, wanted.machine.processor),
         "number of usable cores": (before.machine.cores, wanted.machine.cores),
         "grouping of the seeds": ([list(group) for group in before.groups], [list(group) for group in wanted.groups]),
-        "device": (before.device, wanted.device),
+        "device": (before.machine.gpu or before.device, wanted.machine.gpu or wanted.device),
     }
     for package in sorted(before.versions.keys() | wanted.versions.keys()):
         pairs[f"version of {package}"] = (before.versions.get(package), wanted.versions.get(package))

@@ -24,7 +24,7 @@ from resuming import ADAPTIVE, LEARNERS, ROLLOUT, Crash, contents, crash_at, run
 from csac.algorithms import CSAC, PPO
 from csac.console.progress import Reporter
 from csac.deploy.contract import Contract
-from csac.record.manifest import Manifest, Origin
+from csac.record.manifest import Machine, Manifest, Origin
 from csac.record.run import RunDirectory, StorageFailure
 from csac.training import messages
 from csac.training.checkpoint import Checkpoint, Checkpoints, steps_in
@@ -711,6 +711,7 @@ def test_a_continuation_is_exact_only_if_every_episode_goes_on():
         ({"versions": {"csac": "2", "python": "3.11.7"}}, "the version of csac was 1 and is 2"),
         ({"versions": {"csac": "1", "python": "3.12.0"}}, "the version of python was 3.11.7 and is 3.12.0"),
         ({"versions": {"csac": "1", "python": "3.11.7", "pybullet": "3"}}, "the version of pybullet was None and is 3"),
+        ({"device": "gpu", "machine": Machine(gpu="GPU B")}, "the device was cpu and is GPU B"),
     ],
 )
 def test_whatever_else_computes_is_noticed(change, said):
@@ -720,6 +721,14 @@ def test_whatever_else_computes_is_noticed(change, said):
     entry = restart.continuation(before, now)
     assert (entry.exact, entry.previous["commit"]) == (False, "a")
     assert any(said in note for note in restart.notes(before, now))
+
+
+def test_another_model_of_gpu_is_another_device():
+    plain = Manifest(task="Hopper-v4", algorithm="sac", seeds=(0,), steps=400)
+    one, other = (replace(plain, machine=Machine(gpu=name), device="gpu") for name in ("GPU A", "GPU B"))
+    assert Restart(100, {}, [], []).continuation(one, one).exact
+    (_, said) = Restart(100, {}, [], []).notes(one, other)
+    assert said == "note: not the same to the last bit from here on, because the device was GPU A and is GPU B"
 
 
 def test_the_commit_of_a_run_is_the_one_that_it_goes_on_with(finished):
