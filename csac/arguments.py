@@ -47,6 +47,8 @@ _MISWRITTEN = (
     (r"--temperature ([\d.]\S*).*", r"write --temperature fixed --entropy-weight \1"),
 )
 
+_PLACES = ("--directory", "--results", "--from")  # of folders that are written to, or learnt from
+
 _DASHED_NUMBER = re.compile("-(inf(inity)?|nan)", re.IGNORECASE)
 
 
@@ -186,6 +188,8 @@ def _mistake(arguments: list[str], command: type[Any]) -> str | None:
         option, text = option.replace("_", "-"), " ".join(values).replace("\0", " ")
         if option not in known and (hint := called_here(option, known)):
             return f"there is no option {option}; {hint}"
+        if option in _PLACES and values == [""]:
+            return f"{option} was given an empty value, which would be the folder that you are in: write . for that"
         if known.get(option) and text.split(" ")[0].lower() in ("true", "false"):
             return f"{option} takes no value; {known[option]}"
         for pattern, template in _MISWRITTEN:

@@ -154,10 +154,12 @@ def hyperparameters(preset: str, algorithm: str, task: str) -> dict[str, Any]:
     algorithm has in common on all tasks.
 
     Raises:
-        InputError: no such preset, or one that says nothing of the algorithm.
+        InputError: no such preset, one that says nothing of the algorithm, or a task that is no text.
     """
     if preset not in PRESETS:
         raise InputError(f"no preset is called {preset!r}: choose {' or '.join(PRESETS)}")
+    if not isinstance(task, str):
+        raise InputError(f"task is a Gymnasium id such as 'Hopper-v4', not {task!r:.40}")
     algorithms = _ALGORITHMS[preset]
     if algorithm not in algorithms:
         raise InputError(f"the preset {preset!r} has no {algorithm!r}: it has {' and '.join(algorithms)}")

@@ -42,6 +42,7 @@ _CALLED_OTHERWISE = MappingProxyType(
         "--gpu": ("--device gpu",),
         "--autotune": ("--temperature automatic",),
         "--out": ("--video",),
+        "--deterministic": ("the default, without --stochastic,",),
         "--env-kwargs": ("--environment-arguments",),  # in Python
         "--lr": _RATES,
         "--policy-lr": ("--actor-learning-rate",),

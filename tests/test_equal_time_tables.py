@@ -252,6 +252,8 @@ def test_the_tables_are_written_between_the_marks_of_a_page(folder, tmp_path, mo
     assert tables.strip() == capsys.readouterr().out.strip() != ""
     with pytest.raises(SystemExit, match="the page lacks the lines <!-- other: begin -->"):
         run_script(monkeypatch, *given, f"{page}#other")
+    with pytest.raises(SystemExit, match=r"say between which marks to write: .*page\.md#NAME"):
+        run_script(monkeypatch, *given, page)
 
 
 def test_the_tables_are_of_the_runs_that_are_made():

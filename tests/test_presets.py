@@ -1,5 +1,6 @@
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -163,3 +164,9 @@ def test_a_run_is_of_the_preset_that_all_its_hyperparameters_follow():
     assert presets.matching_preset(csac, "PyFlyt/QuadX-Waypoints-v1", values) is None  # the paper's tau is another
     assert presets.matching_preset(csac, "Ant-v4", {**values, "reference_policy": "periodic"}) is None
     assert presets.matching_preset(csac, "Ant-v4", {**values, "critic_normalisation": "batch"}) is None
+
+
+def test_a_task_that_is_no_text_is_refused():
+    given: Any = None
+    with pytest.raises(InputError, match=r"task is a Gymnasium id such as 'Hopper-v4', not None"):
+        presets.hyperparameters("paper", "csac", given)

@@ -77,7 +77,8 @@ def over_tasks(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
 def largest_block(complete: Mapping[tuple[str, str], frozenset[int]]) -> Block | None:
     """Return the most runs that can be compared: of two tasks or more, with the same seeds of each method on each.
 
-    `complete` are the seeds of each method and task. Of equals, the one with more tasks, then with more seeds.
+    `complete` are the seeds of each method and task. Of equals, one with methods to compare, then with more tasks, then
+    with more seeds.
     """
     labels, tasks = (list(dict.fromkeys(names)) for names in zip(*complete, strict=True))
     seeds = sorted(set().union(*complete.values()))
@@ -92,7 +93,7 @@ def largest_block(complete: Mapping[tuple[str, str], frozenset[int]]) -> Block |
             able = tuple(label for label in labels if some <= common[label])
             blocks.append(Block(able, tuple(task for task in tasks if task in chosen), tuple(sorted(some))))
     blocks = [block for block in blocks if block.size]
-    return max(blocks, key=lambda block: (block.size, len(block.tasks), len(block.seeds)), default=None)
+    return max(blocks, key=lambda it: (it.size, len(it.labels) > 1, len(it.tasks), len(it.seeds)), default=None)
 
 
 def _over_tasks(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:

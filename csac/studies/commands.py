@@ -216,7 +216,8 @@ def run(options: Run) -> int:
     statuses = {cell.key: store.status(cell) for cell in cells} | collected
     told = set(progress.outcomes) if len(jobs) == 1 else set[str]()  # of several, the lines are far apart
     code = _conclude(_with_failures(statuses, progress.outcomes), labels, told, console)
-    return 3 if not_collected else code
+    left = options.cell is not None and any(one.outcome == "elsewhere" for one in progress.outcomes.values())
+    return 3 if not_collected or left else code
 
 
 def _collect_over(jobs: Iterable[Job], store: Store, results: Results, labels: Mapping[str, str]) -> None:

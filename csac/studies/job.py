@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from csac.record.csv_tables import COLUMNS, read_rows, write_rows
-from csac.record.run import RunDirectory, is_run
+from csac.record.run import Occupied, RunDirectory, is_run
 from csac.studies.cells import LOST_EPISODE, Cell, is_final, is_in_use, read_history, restarting_seeds, write_history
 from csac.studies.collected import ROLLOUTS
 from csac.tasks.perturbations import Perturbation, perturbations_of, values_at
@@ -125,7 +125,9 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
             _roll_out(job, run)
             write_history(job.path, spent())
     except InputError as error:
-        return Ended(key, "elsewhere") if is_in_use(job.path) else _failed(job, spent(), str(error))
+        # Another process has it, or has begun it since this one looked.
+        taken = is_in_use(job.path) or (isinstance(error, Occupied) and is_run(job.path))
+        return Ended(key, "elsewhere") if taken else _failed(job, spent(), str(error))
     except (Interrupted, Stopped) as stop:
         write_history(job.path, spent())
         raise Stopped(stop.signal_number) from None

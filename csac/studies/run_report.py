@@ -76,8 +76,10 @@ def write_between(page: Path, name: str, text: str) -> None:
     """Write `text` between the marks `name` of a page in Markdown.
 
     Raises:
-        InputError: the page lacks them or cannot be written.
+        InputError: no name is given, or the page lacks its marks or cannot be written.
     """
+    if not name:
+        raise InputError(f"say between which marks to write: {page}#NAME")
     try:
         new = between_markers(page.read_text(encoding="utf-8"), name, text)
         write_atomically(page, new.encode())

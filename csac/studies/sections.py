@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -79,6 +80,7 @@ class Scope(NamedTuple):
 
     def file(self, kind: str, text: str) -> str:
         """Return what the files of a picture are called, without a suffix."""
+        text = re.sub(r"(?<![\w.])[-−](?=[\d.])", "minus ", text)  # two signs of a number are two pictures
         words = "".join(letter if letter.isalnum() or letter == "." else " " for letter in f"{kind} {text}").split()
         scale = ["scale", f"{self.scale:g}"] if self.scale < 1 else []
         name = "-".join([self.name, *words, *scale]).lower()

@@ -94,6 +94,15 @@ from typed import csac
             "evaluate nowhere --episode 3",
             "there is no option --episode; did you mean --episodes? (csac evaluate --help)",
         ),
+        (
+            "evaluate X --deterministic",
+            "there is no option --deterministic; it is the default, without --stochastic, here (csac evaluate --help)",
+        ),
+        (
+            "train X --directory=",
+            "--directory was given an empty value, which would be the folder that you are in: write . for that "
+            "(csac train --help)",
+        ),
         ("play nowhere", "nowhere does not exist; give a run directory ('csac runs' lists them)"),
         ("runs nowhere", "there is no directory nowhere; give one that holds runs"),
     ],

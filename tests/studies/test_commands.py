@@ -462,6 +462,17 @@ def test_one_cell_of_an_array(engine):
     assert [job.cell.seed for job in engine] == [1]
 
 
+def test_the_one_cell_of_a_job_that_another_process_has_is_not_done(engine, monkeypatch, capsys):
+    def left(jobs, tell):
+        for job in jobs:
+            tell(Ended(job.cell.key, "elsewhere"))
+
+    monkeypatch.setattr(commands, "run_here", left)
+    assert csac("study run tiny.toml --cell 1") == 3
+    assert "run by another process: " in capsys.readouterr().out
+    assert csac("study run tiny.toml --engine local") == 0
+
+
 @pytest.mark.parametrize("names", ["SAC, 0.2,SAC, automatic", " SAC, 0.2 , SAC, automatic "])
 def test_a_method_whose_name_has_a_comma_is_found(engine, names):
     assert csac(f"study run reference --tasks 'Hopper-v4, Walker2d-v4' --algorithms '{names}' --seeds 1") == 0

@@ -83,6 +83,22 @@ def test_a_cell_that_another_process_has_is_left_to_it(tmp_path):
     assert outcomes(messages) == {job.cell.key: "elsewhere"}
 
 
+def test_a_cell_that_another_process_begins_in_the_same_moment_is_left_to_it(tmp_path, monkeypatch):
+    """It creates the run between this process's look at the folder and its own creation, and is through with that."""
+    (job,) = jobs(tmp_path, cell())
+    create = RunDirectory.create
+
+    def second(path, manifest):
+        create(path, manifest)
+        return create(path, manifest)
+
+    monkeypatch.setattr(RunDirectory, "create", second)
+    messages = []
+    run_here([job], messages.append)
+    assert outcomes(messages) == {job.cell.key: "elsewhere"}
+    assert Store(tmp_path).status(job.cell).state != "failed"
+
+
 @pytest.mark.parametrize("run", [run_here, lambda jobs, tell: run_in_processes(jobs, tell, workers=1)])
 def test_a_signal_saves_the_cell_and_leaves_the_rest(tmp_path, uninterrupted, run):
     two, messages = jobs(tmp_path, cell(0), cell(1)), []

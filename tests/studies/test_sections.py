@@ -179,3 +179,8 @@ def test_the_name_of_a_picture_fits_into_a_folder_however_many_changes_it_is_of(
     assert one != other
     assert max(map(len, (one, other))) < 255 - len(".png") - len("..12345678.1234567890")
     assert Scope("ramp").file("curve", "Hopper-v4") == "ramp-curve-hopper-v4"
+    assert (
+        Scope("ramp").file("curve", "gain = -.5")
+        == "ramp-curve-gain-minus-.5"
+        != Scope("ramp").file("curve", "gain = .5")
+    )
