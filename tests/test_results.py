@@ -29,7 +29,7 @@ def commands(page: Path) -> list[list[str]]:
 # The tables that evidence.py writes, by the folders of their pages.
 EVIDENCE = {
     "reference": ["fresh", "ant", "recovery", "screen", "stage-0", "stage-0-fresh"],
-    "strong": ["primary", "whose", "stage-1", "aims", "pieces", "leaner"],
+    "strong": ["primary", "whose", "stage-1", "aims", "pieces", "leaner", "longer", "again"],
 }
 WITH_COMMANDS = [page for page in PAGES if commands(page)]
 
