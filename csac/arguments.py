@@ -188,7 +188,7 @@ def _mistake(arguments: list[str], command: type[Any]) -> str | None:
         option, text = option.replace("_", "-"), " ".join(values).replace("\0", " ")
         if option not in known and (hint := called_here(option, known)):
             return f"there is no option {option}; {hint}"
-        if option in _PLACES and values == [""]:
+        if option in _PLACES and values and not values[0].partition("\0")[0]:
             return f"{option} was given an empty value, which would be the folder that you are in: write . for that"
         if known.get(option) and text.split(" ")[0].lower() in ("true", "false"):
             return f"{option} takes no value; {known[option]}"

@@ -7,6 +7,7 @@ of all seeds, or for ten.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 from benchmarks.measuring import run_one, training, worker
@@ -40,7 +41,7 @@ def measure_agreement(preset: str, options: Options) -> list[Row]:
 
 def measure_speed(case: Seeds, options: Options) -> list[Row]:
     """Train so many seeds for a while."""
-    device = "CPU" if options.device == "cpu" else on_gpu(updates=0)["device"]
+    device = "CPU" if options.device == "cpu" else gpu_name()
     window = options.window(5.0)._replace(settled=260)
     command = training("csac", window, case.seeds, case.interval, options.device, preset=case.preset)
     found = run_one(command, device=options.device)
@@ -51,6 +52,12 @@ def measure_speed(case: Seeds, options: Options) -> list[Row]:
         "updates_in_one_dispatch": case.interval,
     }
     return [{**row, **{column: found[column] for column in ("steps_per_second", "start_seconds", "peak_mib")}}]
+
+
+@functools.cache
+def gpu_name() -> str:
+    """Return what the GPU is, which takes a process with JAX to find out. Raises InputError as `on_gpu` does."""
+    return on_gpu(updates=0)["device"]
 
 
 def on_gpu(updates: int, preset: str = "paper") -> Row:

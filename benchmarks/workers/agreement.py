@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.driver import HALF_CHEETAH, Driver, make_learner
 from benchmarks.measuring import TASK
 from csac.presets import hyperparameters
-from csac.training.devices import FLAGS, PRECISION, with_exact_kernels
+from csac.training.devices import FLAGS, multiply_in_float32, with_exact_kernels
 
 
 def measure(updates: int, preset: str = "paper") -> dict[str, Any]:
@@ -35,9 +35,7 @@ def measure(updates: int, preset: str = "paper") -> dict[str, Any]:
 def compute_as_csac_does() -> None:
     """Ask for the numbers that `csac train --device gpu` has, in this process, whose devices JAX has not looked for."""
     os.environ[FLAGS] = with_exact_kernels(os.environ.get(FLAGS, ""))
-    config: Any = jax.config
-    if config.jax_default_matmul_precision is None:
-        config.update("jax_default_matmul_precision", PRECISION)
+    multiply_in_float32()
 
 
 def learnt(device: Any, updates: int, preset: str) -> list[Any]:

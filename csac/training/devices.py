@@ -50,9 +50,8 @@ def choose_device(device: str) -> None:
         _forget(before, flags)
         raise InputError(f"this process computes on the {chosen} already: train on the {device} in a new one")
     os.environ["JAX_PLATFORMS"] = PLATFORMS[device]  # for the workers
-    if device == "gpu" and config.jax_default_matmul_precision is None:
-        jax.config.update("jax_default_matmul_precision", PRECISION)
-        os.environ["JAX_DEFAULT_MATMUL_PRECISION"] = PRECISION  # for the workers
+    if device == "gpu":
+        multiply_in_float32()
 
 
 def gpu_in_use() -> str:
@@ -63,6 +62,14 @@ def gpu_in_use() -> str:
 def with_exact_kernels(flags: str) -> str:
     """Return XLA's flags with a GPU's numbers the same in every run; what the flags say of that already stays."""
     return flags if EXACT_GPU in flags else f"{flags} {EXACT_GPU}=true".strip()
+
+
+def multiply_in_float32() -> None:
+    """Let products be of float32 in this process and in those that it starts, unless the user has set another one."""
+    config: Any = jax.config
+    if config.jax_default_matmul_precision is None:
+        config.update("jax_default_matmul_precision", PRECISION)
+        os.environ["JAX_DEFAULT_MATMUL_PRECISION"] = PRECISION
 
 
 def _forget(platforms: str | None, flags: str) -> None:

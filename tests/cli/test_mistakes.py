@@ -103,6 +103,11 @@ from typed import csac
             "--directory was given an empty value, which would be the folder that you are in: write . for that "
             "(csac train --help)",
         ),
+        (
+            "train --directory= X",
+            "--directory was given an empty value, which would be the folder that you are in: write . for that "
+            "(csac train --help)",
+        ),
         ("play nowhere", "nowhere does not exist; give a run directory ('csac runs' lists them)"),
         ("runs nowhere", "there is no directory nowhere; give one that holds runs"),
     ],
