@@ -62,14 +62,19 @@ def training(
     device: str = "cpu",
     task: str = TASK,
     preset: str = "paper",
+    groups: int | None = None,
 ) -> list[str]:
-    """Return the command that trains until the window is over; `interval` updates are made in one dispatch."""
+    """Return the command that trains until the window is over; `interval` updates are made in one dispatch.
+
+    The seeds are split over so many processes, `groups`; None for as many as csac chooses.
+    """
     return worker(
         "training",
         algorithm=algorithm,
         task=task,
         preset=preset,
         seeds=seeds,
+        groups=groups,
         interval=interval,
         device=device,
         launched=time.monotonic(),

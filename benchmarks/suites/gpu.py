@@ -1,8 +1,8 @@
 """Training on a GPU: seed-steps per second against seeds, and whether its numbers are those of the CPU.
 
 What runs is `csac.train` on HalfCheetah-v4 with evaluation off: CSAC at the paper's settings, or those of the preset
-`strong`. All seeds are in one program, the replay is on the device, and there is one dispatch for each environment step
-of all seeds, or for ten.
+`strong`. The seeds are in one program, or split over those of several processes. The replay is on the device, and
+there is one dispatch for each environment step of a program's seeds, or for ten.
 """
 
 from __future__ import annotations
@@ -10,28 +10,28 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-from benchmarks.measuring import run_one, training, worker
+from benchmarks.measuring import TASK, run_one, training, worker
 from benchmarks.parts import Options, Part
 from benchmarks.tables import Row, formatted
 from csac.types import InputError
 
 PAGE = "docs/gpu.md"
 PRESETS = ["paper", "strong"]
-SEEDS, INTERVALS = [1, 2, 5, 10, 25, 50], [1, 10]
 AIMS = {5: "10,000", 25: "25,000"}  # seed-steps per second on an H200
 
 
 class Seeds(NamedTuple):
-    """So many seeds in one program, and so many updates in one dispatch."""
+    """So many seeds, the processes that they are split over, and the updates in one dispatch."""
 
     seeds: int
-    interval: int
+    groups: int = 1
+    interval: int = 1
     preset: str = "paper"
 
     @property
     def name(self) -> str:
         """What --only looks in."""
-        return f"{self.seeds} seeds, {self.interval} in one dispatch, preset {self.preset}"
+        return f"{self.seeds} seeds, processes {self.groups}, {self.interval} in one dispatch, preset {self.preset}"
 
 
 def measure_agreement(preset: str, options: Options) -> list[Row]:
@@ -43,12 +43,13 @@ def measure_speed(case: Seeds, options: Options) -> list[Row]:
     """Train so many seeds for a while."""
     device = "CPU" if options.device == "cpu" else gpu_name()
     window = options.window(5.0)._replace(settled=260)
-    command = training("csac", window, case.seeds, case.interval, options.device, preset=case.preset)
+    command = training("csac", window, case.seeds, case.interval, options.device, TASK, case.preset, case.groups)
     found = run_one(command, device=options.device)
     row = {
         "device": device,
         "preset": case.preset,
         "seeds": case.seeds,
+        "processes": case.groups,
         "updates_in_one_dispatch": case.interval,
     }
     return [{**row, **{column: found[column] for column in ("steps_per_second", "start_seconds", "peak_mib")}}]
@@ -85,6 +86,7 @@ SPEED_COLUMNS = {
     "device": "{device}",
     "preset": "{preset}",
     "seeds": "{seeds}",
+    "processes": "{processes}",
     "updates in one dispatch": "{updates_in_one_dispatch}",
     "seed-steps/s": "{steps_per_second:,.0f}",
     "aim (H200)": "{aim}",
@@ -94,7 +96,7 @@ SPEED_COLUMNS = {
 
 
 def render_speed(rows: list[Row]) -> str:
-    """Return a row for each number of seeds and updates in one dispatch."""
+    """Return a row for each number of seeds, processes and updates in one dispatch."""
     return formatted([{**row, "aim": _aim(row)} for row in rows], SPEED_COLUMNS)
 
 
@@ -104,9 +106,10 @@ def _aim(row: Row) -> str:
     return AIMS.get(row["seeds"], "") if is_aimed_at else ""
 
 
-GROUPS = [Seeds(seeds, interval) for interval in INTERVALS for seeds in SEEDS]
-GROUPS += [Seeds(seeds, 1, "strong") for seeds in AIMS]
+CASES = [Seeds(seeds) for seeds in (1, 2, 5, 10, 25)]
+CASES += [Seeds(seeds, groups) for seeds, groups in ((10, 2), (25, 4), (50, 4))]
+CASES += [Seeds(25, interval=10), Seeds(5, preset="strong"), Seeds(25, 4, preset="strong")]
 PARTS = [
     Part("gpu-agreement", PAGE, "GPU and CPU after the same updates", PRESETS, measure_agreement, AGREEMENT_COLUMNS),
-    Part("gpu-speed", PAGE, "seed-steps per second of 1 to 50 seeds", GROUPS, measure_speed, render_speed),
+    Part("gpu-speed", PAGE, "seed-steps per second of 1 to 50 seeds", CASES, measure_speed, render_speed),
 ]

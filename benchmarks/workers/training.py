@@ -91,6 +91,7 @@ def measure(
     interval: int,
     device: Literal["cpu", "gpu"],
     launched: float,
+    groups: int | None = None,
     **counted: Any,
 ) -> dict[str, float]:
     """Train until the window is over, and return what was measured.
@@ -99,10 +100,11 @@ def measure(
         algorithm: its name; it has the settings of the preset, but for the warm-up.
         task: a Gymnasium id.
         preset: paper or strong.
-        seeds: how many are trained, in groups as csac chooses them.
+        seeds: how many are trained.
         interval: environment steps, and updates, in one dispatch; PPO's is its rollout.
         device: cpu or gpu.
         launched: `time.monotonic()` when this process was started.
+        groups: the processes that the seeds are split over; None for as many as csac chooses.
         counted: the fields of `Window`.
     """
     window, settings = Window(**counted), hyperparameters(preset, algorithm, task)
@@ -119,7 +121,7 @@ def measure(
             seeds=seeds,
             directory="run",
             device=device,
-            groups=None,
+            groups=groups,
             evaluation_interval=window.evaluation_interval or STEPS,
             evaluation_episodes=window.evaluation_episodes,
             reporter=clock,

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 
 from csac.types import InputError
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 PRNG = "threefry2x32"  # runs are the same on every machine with the same keys
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda"}  # as JAX calls them
 FLAGS = "XLA_FLAGS"  # read by XLA when JAX first looks for devices
 EXACT_GPU = "--xla_gpu_deterministic_ops"  # of XLA: every run has the same kernels, none of which sums in any order
+PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"  # of JAX: whether a process takes most of a GPU's memory as it begins
 PRECISION = "highest"  # of a GPU's matrix products; by default JAX rounds their float32 to TF32, of 10 bits
 
 
@@ -23,7 +27,8 @@ def choose_device(device: str) -> None:
     while it runs already. `JAX_CPU_ENABLE_ASYNC_DISPATCH=0` changes that and no number.
 
     A GPU computes as a CPU does, in float32 and the same in every run, unless the user's own XLA_FLAGS or
-    JAX_DEFAULT_MATMUL_PRECISION say otherwise.
+    JAX_DEFAULT_MATMUL_PRECISION say otherwise. A process takes the GPU's memory as it needs it, so that several share
+    one, unless XLA_PYTHON_CLIENT_PREALLOCATE says otherwise.
 
     Raises:
         InputError: there is no such device, this process has computed on another one, or JAX is set to numbers or keys
@@ -36,18 +41,19 @@ def choose_device(device: str) -> None:
         raise InputError("csac computes in 32 bits and JAX is set to 64: unset JAX_ENABLE_X64 (jax_enable_x64)")
     if config.jax_default_prng_impl != PRNG:
         raise InputError(f"csac's keys are of JAX's {PRNG}: unset JAX_DEFAULT_PRNG_IMPL (jax_default_prng_impl)")
-    before, flags = config.jax_platforms, os.environ.get(FLAGS, "")
+    before = config.jax_platforms, {name: os.environ.get(name) for name in (FLAGS, PREALLOCATE)}
     jax.config.update("jax_platforms", PLATFORMS[device])
     if device == "gpu":
-        os.environ[FLAGS] = with_exact_kernels(flags)
+        os.environ[FLAGS] = with_exact_kernels(os.environ.get(FLAGS, ""))
+        os.environ.setdefault(PREALLOCATE, "false")
     try:
         chosen = jax.default_backend()
     except Exception as error:  # which one depends on what is missing, and on JAX's version
-        _forget(before, flags)
+        _forget(*before)
         hint = "pip install '.[cuda]' in a clone of csac, or choose the cpu"
         raise InputError(f"no GPU that JAX can use: {hint}") from error
     if chosen != device:
-        _forget(before, flags)
+        _forget(*before)
         raise InputError(f"this process computes on the {chosen} already: train on the {device} in a new one")
     os.environ["JAX_PLATFORMS"] = PLATFORMS[device]  # for the workers
     if device == "gpu":
@@ -72,7 +78,9 @@ def multiply_in_float32() -> None:
         os.environ["JAX_DEFAULT_MATMUL_PRECISION"] = PRECISION
 
 
-def _forget(platforms: str | None, flags: str) -> None:
+def _forget(platforms: str | None, variables: Mapping[str, str | None]) -> None:
     jax.config.update("jax_platforms", platforms)
-    if os.environ.pop(FLAGS, "") and flags:
-        os.environ[FLAGS] = flags
+    for name, value in variables.items():
+        os.environ.pop(name, None)
+        if value is not None:
+            os.environ[name] = value

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from csac.training.plan import Plan
     from csac.types import Spec
 
-# Measured resident size of a worker process with JAX, MuJoCo and the compiled programs, before its replay.
-BYTES_PER_PROCESS = 600 * 2**20
+# Measured resident size of a worker process with JAX, MuJoCo and the compiled programs, before its replay; CUDA adds.
+BYTES_PER_PROCESS, BYTES_PER_GPU_PROCESS = 600 * 2**20, 1_300 * 2**20
 # Likewise of one that evaluates on MuJoCo, without JAX. PyBullet's environments take several times that, in line too.
 BYTES_PER_EVALUATION_PROCESS = 80 * 2**20
 
@@ -27,7 +27,8 @@ def memory_needed(plan: Plan, spec: Spec, goes_on: bool = False) -> str:
     """
     per_seed, seeds, groups = _bytes_per_seed(plan, spec, 2 if goes_on else 1), plan.seeds, len(plan.groups)
     evaluating = groups * plan.evaluation_processes
-    needed = seeds * per_seed + groups * BYTES_PER_PROCESS + evaluating * BYTES_PER_EVALUATION_PROCESS
+    per_process = BYTES_PER_GPU_PROCESS if plan.device == "gpu" else BYTES_PER_PROCESS
+    needed = seeds * per_seed + groups * per_process + evaluating * BYTES_PER_EVALUATION_PROCESS
     available, limit = psutil.virtual_memory().available, memory_left()
     available = available if limit is None else min(available, limit)
     if needed > available:

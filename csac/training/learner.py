@@ -10,7 +10,7 @@ import numpy as np
 
 from csac.algorithms.memory import pack, row_width
 from csac.training.compilation import keep_programs
-from csac.training.packing import Packing, SeedAxis, by_name
+from csac.training.packing import Packing, Parcel, SeedAxis, by_name
 from csac.types import InputError, PolicyNetwork, Ring, Snapshot, Transition
 
 if TYPE_CHECKING:
@@ -55,10 +55,12 @@ class Learner:
         begin = jax.jit(self._axis.map(self._one.begin), compiler_options={"xla_backend_optimization_level": 1})
         keys = [np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds]
         self._carry: Carry = begin(self._axis.stack(keys))
+        observations = np.zeros((len(seeds), spec.observation_size), np.float32)
+        self._parcel = Parcel(self._axis.strip(self._waiting).shape, self._axis.strip(observations).shape)
         # JAX pairs what is donated with what comes out by order and shape. So the carry comes out first, and is kept
         # whole where an algorithm does not read all of it: a shift by one would copy whole networks to and fro.
         self._explore, self._learn = (
-            jax.jit(self._axis.map(program, (0, 0, 0, None)), donate_argnums=0, keep_unused=True)
+            jax.jit(self._of_parcel(self._axis.map(program, (0, 0, 0, None))), donate_argnums=0, keep_unused=True)
             for program in (self._one.remember_and_explore, self._one.remember_and_learn)
         )
         self._explore_alone, self._act_alone = (
@@ -88,10 +90,14 @@ class Learner:
         if step >= self._cadence.warmup_steps:
             program = self._learn
             self._updates_summed += self._cadence.updates_per_interval
-        given = (self._axis.strip(self._waiting), self._axis.strip(outcome.observation), np.int32(step))
-        self._carry, next_actions = program(self._carry, *given)
-        self._waiting = np.zeros_like(self._waiting)  # JAX reads an argument where it lies, as long as the program runs
+        given = self._parcel.pack(step, self._axis.strip(self._waiting), self._axis.strip(outcome.observation))
+        self._carry, next_actions = program(self._carry, given)
+        self._waiting[...] = 0.0
         return self._axis.restore(np.asarray(next_actions))
+
+    def _of_parcel(self, program: Callable) -> Callable:
+        """Return the program of a carry, packed transitions, observations and a step as one of a carry and a parcel."""
+        return lambda carry, row: program(carry, *self._parcel.unpack(row))
 
     def networks(self) -> list[PolicyNetwork]:
         """Return each seed's policy as NumPy layers."""

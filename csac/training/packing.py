@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -45,6 +46,35 @@ class Packing:
             else:
                 leaves.append(next(others))
         return jax.tree.unflatten(self._structure, leaves)
+
+
+class Parcel:
+    """Float32 arrays and a whole number as one row on their way from the host to a program, and what they are there.
+
+    A GPU is sent each array for itself, which takes a tenth of the time of a step. The row is of integers: they reach
+    the program as they are, where a float that is the image of a small integer might be taken for zero.
+
+    Args:
+        shapes: those of the arrays.
+    """
+
+    def __init__(self, *shapes: tuple[int, ...]) -> None:
+        ends = np.cumsum([0, *map(math.prod, shapes)]).tolist()
+        self._parts = [(shape, slice(*ends[i : i + 2])) for i, shape in enumerate(shapes)]
+
+    def pack(self, number: int, *arrays: np.ndarray) -> np.ndarray:
+        """Return the row, int32: the bits of the arrays, then the number."""
+        row = np.empty(self._parts[-1][1].stop + 1, np.int32)
+        floats = row.view(np.float32)
+        for (shape, place), array in zip(self._parts, arrays, strict=True):
+            floats[place].reshape(shape)[...] = array
+        row[-1] = number
+        return row
+
+    def unpack(self, row: jax.Array) -> list[jax.Array]:
+        """Return the arrays, and last the number."""
+        floats = jax.lax.bitcast_convert_type(row[:-1], jnp.float32)
+        return [*(floats[place].reshape(shape) for shape, place in self._parts), row[-1]]
 
 
 class SeedAxis:

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 
 # More processes than this for each core only cost memory: the seeds of a larger run share processes.
 GROUPS_PER_CORE = 4
-
+# Of a GPU, so many share it, if each has so many seeds and processors.
+GROUPS_PER_GPU, SEEDS_PER_GPU_GROUP, CORES_PER_GPU_GROUP = 4, 5, 2
 
 # Steps that one group may be ahead of another when its turn begins: all can be saved at one step without a long wait.
 LONGEST_LEAD = 1_000
@@ -56,11 +57,16 @@ def split_seeds(seeds: Sequence[int], groups: int) -> list[list[int]]:
 
 
 def choose_groups(seeds: int, device: str) -> int:
-    """Return one group for a GPU; on a CPU one group per seed, as long as their processes are not too many.
+    """Return one group per seed on a CPU, as long as their processes are not too many, and a few groups on a GPU.
 
-    Two learners on a core each do about a fifth more than one learner of two seeds on both.
+    Two learners on a core each do about a fifth more than one learner of two seeds on both. A GPU computes for many
+    seeds at once, but their environments wait for each other in one process: four with a few seeds each do nearly twice
+    as much as one, and eight are in each other's way (docs/gpu.md).
     """
-    return 1 if device == "gpu" else min(seeds, GROUPS_PER_CORE * len(usable_cores()[: core_quota()]))
+    cores = len(usable_cores()[: core_quota()])
+    if device == "gpu":
+        return max(1, min(seeds // SEEDS_PER_GPU_GROUP, cores // CORES_PER_GPU_GROUP, GROUPS_PER_GPU))
+    return min(seeds, GROUPS_PER_CORE * cores)
 
 
 def choose_evaluation_processes(groups: Sequence[Sequence[int]], episodes: int) -> int:

@@ -126,7 +126,7 @@ def test_growth_compares_each_point_with_the_one_before():
 
 
 def test_only_the_paper_s_updates_in_strict_order_have_an_aim():
-    measured = {"device": "a GPU", "steps_per_second": 9_000.0, "start_seconds": 1.0, "peak_mib": 1.0}
+    measured = {"device": "a GPU", "steps_per_second": 9_000.0, "start_seconds": 1.0, "peak_mib": 1.0, "processes": 1}
     cases = [("paper", 1), ("paper", 10), ("strong", 1)]
     rows = [
         {**measured, "preset": preset, "seeds": seeds, "updates_in_one_dispatch": each}
@@ -135,7 +135,7 @@ def test_only_the_paper_s_updates_in_strict_order_have_an_aim():
     ]
 
     table = [[cell.strip() for cell in line.split("|")] for line in gpu.render_speed(rows).splitlines()[2:]]
-    assert [(line[2], line[3], line[4], line[6]) for line in table] == [
+    assert [(line[2], line[3], line[5], line[7]) for line in table] == [
         ("paper", "1", "1", ""),
         ("paper", "5", "1", "10,000"),
         ("paper", "1", "10", ""),

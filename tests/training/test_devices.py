@@ -38,6 +38,7 @@ def test_a_process_that_has_computed_on_the_cpu_refuses_the_gpu():
 
 
 SETTINGS = ("XLA_FLAGS", "JAX_DEFAULT_MATMUL_PRECISION", "JAX_PLATFORMS")
+MEMORY = "XLA_PYTHON_CLIENT_PREALLOCATE"
 
 
 @pytest.fixture
@@ -47,6 +48,8 @@ def a_gpu(monkeypatch):
     before = config.jax_default_matmul_precision
     for name in SETTINGS:
         monkeypatch.setenv(name, "")
+    monkeypatch.setenv(MEMORY, "")
+    monkeypatch.delenv(MEMORY)
     jax.config.update("jax_default_matmul_precision", None)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     yield config
@@ -58,6 +61,14 @@ def test_a_gpu_computes_in_float32_and_the_same_in_every_run(a_gpu):
     choose_device("gpu")
     assert [os.environ[name] for name in SETTINGS] == ["--xla_gpu_deterministic_ops=true", "highest", "cuda"]
     assert config.jax_default_matmul_precision == "highest"
+
+
+@pytest.mark.parametrize(("own", "then"), [(None, "false"), ("true", "true")])
+def test_processes_share_a_gpu_s_memory_unless_the_user_will_not(a_gpu, monkeypatch, own, then):
+    if own:
+        monkeypatch.setenv(MEMORY, own)
+    choose_device("gpu")
+    assert os.environ[MEMORY] == then
 
 
 def test_what_the_user_has_set_of_a_gpu_s_numbers_stays(a_gpu, monkeypatch):

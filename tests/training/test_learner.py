@@ -141,7 +141,7 @@ SETTINGS = [(name, {}) for name in ALGORITHMS] + [
 def test_what_a_seed_carries_is_updated_in_the_buffer_where_it_lies(name, changes):
     # An argument that JAX drops would shift all that follow: `algorithm1` never reads the reference that it keeps.
     learner = Learner(ALGORITHMS[name](**changes), SPEC, [0], 5_000)
-    given = jax.eval_shape(lambda: (learner._carry, learner.waiting(0), np.zeros(3, np.float32), np.int32(1)))
+    given = jax.eval_shape(lambda: (learner._carry, learner._parcel.pack(1, learner.waiting(0), np.zeros(3))))
     program = learner._learn.lower(*given).as_text()
     (signature,) = re.findall(r"func.func public @main\((.*)\) ->", program)
     outputs = [int(place) for place in re.findall(r"tf.aliasing_output = (\d+)", signature)]
@@ -162,7 +162,7 @@ def test_nothing_that_a_program_was_given_is_written_over(monkeypatch, interval)
 
         monkeypatch.setattr(learner, name, program)
     advance(learner, 1, 1, 12)
-    assert len(given) == 3 * 12 // interval
+    assert len(given) == 12 // interval
     for array, then in given:
         np.testing.assert_array_equal(array, then)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from csac.algorithms.networks import make_mlp
-from csac.training.packing import Packing, SeedAxis, by_name
+from csac.training.packing import Packing, Parcel, SeedAxis, by_name
 
 
 class Tree(NamedTuple):
@@ -85,3 +85,21 @@ def test_a_seed_that_is_alone_has_no_axis(seeds, inside):
         np.testing.assert_array_equal(axis.of({"row": stacked}, index)["row"], row)
         axis.of(stacked, index)[:] = -1.0  # a view
     np.testing.assert_array_equal(stacked, np.full((*inside, 2), -1.0))
+
+
+def test_a_parcel_arrives_to_the_last_bit():
+    # Denormals, both zeros, an infinity and a number that is not one, and an integer that as a float is denormal.
+    rows = np.array([[1.5, -0.0, 1e-45], [np.inf, np.nan, -3e38]], np.float32)
+    observation = np.array([2.0, 1e-40], np.float32)
+    parcel = Parcel((2, 3), (2,))
+    row = parcel.pack(7, rows, observation)
+    assert row.shape == (9,)
+    again, observed, number = jax.jit(parcel.unpack)(row)
+    np.testing.assert_array_equal(np.asarray(again).view(np.int32), rows.view(np.int32))
+    np.testing.assert_array_equal(np.asarray(observed).view(np.int32), observation.view(np.int32))
+    assert number.dtype == jnp.int32
+    assert int(number) == 7
+
+
+def test_a_parcel_s_number_is_exact_where_a_float_would_not_be():
+    assert int(Parcel((1,)).unpack(jnp.asarray(Parcel((1,)).pack(2**24 + 1, np.zeros(1))))[-1]) == 2**24 + 1

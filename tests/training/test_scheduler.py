@@ -46,6 +46,16 @@ def test_a_container_s_share_of_the_processors_decides_how_many_processes_there_
     assert scheduler_module.choose_evaluation_processes([[0], [1]], 1000) == processes
 
 
+@pytest.mark.parametrize(
+    ("cores", "seeds", "groups"),
+    [(16, 1, 1), (16, 9, 1), (16, 10, 2), (16, 19, 3), (16, 25, 4), (64, 100, 4), (4, 25, 2), (1, 25, 1)],
+)
+def test_a_few_groups_of_several_seeds_share_a_gpu(monkeypatch, cores, seeds, groups):
+    monkeypatch.setattr(scheduler_module, "usable_cores", lambda: list(range(cores)))
+    monkeypatch.setattr(scheduler_module, "core_quota", lambda: None)
+    assert scheduler_module.choose_groups(seeds, "gpu") == groups
+
+
 @pytest.mark.parametrize("interval", [100, 130])
 def test_a_run_that_has_enough_ends_at_that_very_step(tmp_path, interval):
     """Evaluations between the steps where a group can be saved were told of up to 250 steps later."""
