@@ -422,6 +422,7 @@ def main() -> None:
     tables.add_argument("studies", nargs="+", type=Path, metavar="STUDY.toml")
     tables.add_argument("--seeds", nargs="+", type=int, default=(), help="only these, where the study has them")
     tables.add_argument("--methods", nargs="+", help="only these: what is told is told on the seeds that they have")
+    tables.add_argument("--tasks", nargs="+", help="only these: what is over all tasks is over these")
     tables.add_argument("--into", metavar="PAGE.md#NAME", help="write between the marks NAME of a page")
     writing = commands.add_parser("write", help="write the arms of a stage, by the results of those before it")
     writing.add_argument("stage", choices=STAGES)
@@ -434,7 +435,7 @@ def main() -> None:
     try:
         if arguments.command == "tables":
             source = Results(arguments.results)
-            studies = [read_study(path).narrowed(algorithms=arguments.methods) for path in arguments.studies]
+            studies = [read_study(path).narrowed(arguments.tasks, arguments.methods) for path in arguments.studies]
             text = "\n\n".join(told(study, source, arguments.seeds) for study in studies) + "\n"
             if arguments.into:
                 page, _, name = arguments.into.partition("#")
