@@ -60,9 +60,14 @@ def choose_device(device: str) -> None:
         multiply_in_float32()
 
 
-def gpu_in_use() -> str:
-    """Return the model of the GPU that this process computes on; nothing on a CPU."""
-    return jax.devices()[0].device_kind if jax.default_backend() == "gpu" else ""
+def in_use() -> dict[str, str]:
+    """Return what decides the last bits of what this process computes, by the names that `Machine` has for it."""
+    config: Any = jax.config
+    return {
+        "gpu": jax.devices()[0].device_kind if jax.default_backend() == "gpu" else "",
+        "xla_flags": os.environ.get(FLAGS, ""),
+        "matmul_precision": config.jax_default_matmul_precision or "",
+    }
 
 
 def with_exact_kernels(flags: str) -> str:

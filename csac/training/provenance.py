@@ -13,7 +13,7 @@ from csac import __version__
 from csac.processes import usable_cores
 from csac.record.manifest import Machine
 from csac.tasks.known import adapter_of
-from csac.training.devices import gpu_in_use
+from csac.training.devices import in_use
 
 if TYPE_CHECKING:
     from csac.tasks.making import Task
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def provenance(task: Task, command: str | None) -> dict[str, Any]:
     """Return these fields of a manifest, of a process whose device has been chosen."""
     return {
-        "machine": Machine(_processor(), len(usable_cores()), platform.node(), gpu_in_use()),
+        "machine": Machine(_processor(), len(usable_cores()), platform.node(), **in_use()),
         "versions": _versions(task),
         "commit": _commit(),
         "command": command,

@@ -712,6 +712,8 @@ def test_a_continuation_is_exact_only_if_every_episode_goes_on():
         ({"versions": {"csac": "1", "python": "3.12.0"}}, "the version of python was 3.11.7 and is 3.12.0"),
         ({"versions": {"csac": "1", "python": "3.11.7", "pybullet": "3"}}, "the version of pybullet was None and is 3"),
         ({"device": "gpu", "machine": Machine(gpu="GPU B")}, "the device was cpu and is GPU B"),
+        ({"machine": Machine(xla_flags="--xla_a=1")}, "the XLA_FLAGS was not set and is --xla_a=1"),
+        ({"machine": Machine(matmul_precision="high")}, "the precision of products was not set and is high"),
     ],
 )
 def test_whatever_else_computes_is_noticed(change, said):
