@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from benchmarks.parts import Options, Part, shown
+from benchmarks.parts import RESULTS, Options, Part, shown
 from benchmarks.suites import checkpoint, gpu, growth, latency, limit, peers
 from benchmarks.suites import time as times
 from csac.processes import usable_cores
@@ -43,16 +43,17 @@ def named(name: str) -> list[Part]:
 def measure(part: Part, options: Options, write: bool) -> bool:
     """Measure one part, print its table and, if asked for, write it; return whether anything was measured."""
     began = time.monotonic()
-    rows = part.run(options)
+    is_written = write and not (options.quick or options.only)
+    rows = part.run(options, RESULTS / f"{part.name}.unfinished.csv" if is_written else None)
     if not rows:
         return False
     notes = part.all_notes(rows, options)
     print(f"\n{shown(part.table(rows), notes)}\n{(time.monotonic() - began) / 60:.1f} minutes", flush=True)
-    if write and (options.quick or options.only):
-        print(f"not written: only a part of {part.name} was measured, or quickly")
-    elif write:
+    if is_written:
         part.write(rows, notes)
         part.publish()
+    elif write:
+        print(f"not written: only a part of {part.name} was measured, or quickly")
     return True
 
 

@@ -56,8 +56,11 @@ class Part:
     notes: Callable[[list[Row], Options], list[str]] = lambda rows, options: []
     draw: Callable[[list[Row], Path], None] | None = None
 
-    def run(self, options: Options) -> list[Row]:
-        """Measure the cases in turns, A B C A B C, and say what comes out."""
+    def run(self, options: Options, unfinished: Path | None = None) -> list[Row]:
+        """Measure the cases in turns, A B C A B C, and say what comes out.
+
+        Until all is measured, `unfinished` has the rows so far: an hour's work outlives what cuts it off.
+        """
         chosen = [case for case in self.cases if options.only in getattr(case, "name", case)]
         repetitions = options.repetitions or self.repetitions if self.repetitions > 1 else 1
         if options.quick:
@@ -71,6 +74,10 @@ class Part:
                         values = (f"{key} {value:.4g}" for key, value in row.items() if isinstance(value, float))
                         print(f"{getattr(case, 'name', case)}: {', '.join(values)}", flush=True)
                     rows += [{"repetition": repetition, **row} if self.repetitions > 1 else row for row in measured]
+                    if unfinished and rows:
+                        write_rows(unfinished, rows)
+        if unfinished:
+            unfinished.unlink(missing_ok=True)
         return rows
 
     def table(self, rows: list[Row]) -> str:

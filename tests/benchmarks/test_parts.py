@@ -12,7 +12,7 @@ from benchmarks.__main__ import PARTS, SUITES, main, named
 from benchmarks.measuring import ROOT, Process, run, surroundings
 from benchmarks.parts import Options, Part
 from benchmarks.suites import gpu, growth
-from benchmarks.tables import formatted, read_rows, write_rows
+from benchmarks.tables import Row, formatted, read_rows, write_rows
 from csac import CSAC
 from csac.presets import hyperparameters
 from csac.processes import usable_cores
@@ -51,6 +51,20 @@ def test_cases_take_turns_and_some_come_once():
 )
 def test_which_cases_are_measured(options, expected):
     assert [row["case"] for row in part().run(options)] == expected
+
+
+def test_what_is_measured_outlives_what_cuts_it_off(tmp_path):
+    def measure(case: str, _: Options) -> list[Row]:
+        if case == "b":
+            raise RuntimeError("the machine is gone")
+        return [{"case": case, "speed": 2.5}]
+
+    unfinished = tmp_path / "rows.csv"
+    with pytest.raises(RuntimeError, match="the machine is gone"):
+        part(measure=measure).run(Options(), unfinished)
+    assert read_rows(unfinished) == [{"case": "a", "speed": 2.5}]
+    part().run(Options(), unfinished)
+    assert not unfinished.exists()
 
 
 def test_a_window_that_is_evaluated_holds_an_interval():
