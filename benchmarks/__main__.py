@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from benchmarks.parts import RESULTS, Options, Part, shown
+from benchmarks.parts import Options, Part, shown
 from benchmarks.suites import checkpoint, gpu, growth, latency, limit, peers
 from benchmarks.suites import time as times
 from csac.processes import usable_cores
@@ -44,7 +44,7 @@ def measure(part: Part, options: Options, write: bool) -> bool:
     """Measure one part, print its table and, if asked for, write it; return whether anything was measured."""
     began = time.monotonic()
     is_written = write and not (options.quick or options.only)
-    rows = part.run(options, RESULTS / f"{part.name}.unfinished.csv" if is_written else None)
+    rows = part.run(options, part.unfinished() if is_written else None)
     if not rows:
         return False
     notes = part.all_notes(rows, options)

@@ -57,10 +57,7 @@ class Part:
     draw: Callable[[list[Row], Path], None] | None = None
 
     def run(self, options: Options, unfinished: Path | None = None) -> list[Row]:
-        """Measure the cases in turns, A B C A B C, and say what comes out.
-
-        Until all is measured, `unfinished` has the rows so far: an hour's work outlives what cuts it off.
-        """
+        """Measure the cases in turns, A B C A B C, and say what comes out; `unfinished` has the rows so far."""
         chosen = [case for case in self.cases if options.only in getattr(case, "name", case)]
         repetitions = options.repetitions or self.repetitions if self.repetitions > 1 else 1
         if options.quick:
@@ -76,8 +73,6 @@ class Part:
                     rows += [{"repetition": repetition, **row} if self.repetitions > 1 else row for row in measured]
                     if unfinished and rows:
                         write_rows(unfinished, rows)
-        if unfinished:
-            unfinished.unlink(missing_ok=True)
         return rows
 
     def table(self, rows: list[Row]) -> str:
@@ -88,12 +83,17 @@ class Part:
         """Return what the numbers depend on, a line each."""
         return [*machine(0.1 if options.quick else 1.0), *self.notes(rows, options)]
 
+    def unfinished(self, folder: Path = RESULTS) -> Path:
+        """Return where rows lie until all are measured and written: an hour's work outlives what cuts it off."""
+        return folder / f"{self.name}.unfinished.csv"
+
     def write(self, rows: list[Row], notes: Sequence[str], folder: Path = RESULTS) -> None:
         """Write the rows, the notes and, where there is one, the picture."""
         write_rows(folder / f"{self.name}.csv", rows)
         (folder / f"{self.name}.txt").write_text("".join(f"{note}\n" for note in notes))
         if self.draw:
             self.draw(rows, folder / f"{self.name}.png")
+        self.unfinished(folder).unlink(missing_ok=True)
 
     def block(self, folder: Path = RESULTS) -> str:
         """Return what stands in the page: the table of the rows that were written, and below it the notes."""

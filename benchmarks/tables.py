@@ -6,8 +6,11 @@ A row is a dictionary from column to number or text; all rows of a table have th
 from __future__ import annotations
 
 import csv
+import io
 import statistics
 from typing import TYPE_CHECKING, Any, TypeAlias
+
+from csac.record.atomic import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -18,11 +21,12 @@ Row: TypeAlias = dict[str, Any]
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """Write rows in the order in which they were measured, numbers with six digits."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
+    file = io.StringIO(newline="")
+    writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
+    write_atomically(path, file.getvalue().encode())
 
 
 def read_rows(path: Path) -> list[Row]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-from benchmarks.measuring import TASK, run_one, training, worker
+from benchmarks.measuring import run_one, training, worker
 from benchmarks.parts import Options, Part
 from benchmarks.tables import Row, formatted
 from csac.types import InputError
@@ -43,7 +43,15 @@ def measure_speed(case: Seeds, options: Options) -> list[Row]:
     """Train so many seeds for a while."""
     device = "CPU" if options.device == "cpu" else gpu_name()
     window = options.window(5.0)._replace(settled=260)
-    command = training("csac", window, case.seeds, case.interval, options.device, TASK, case.preset, case.groups)
+    command = training(
+        "csac",
+        window,
+        seeds=case.seeds,
+        interval=case.interval,
+        device=options.device,
+        preset=case.preset,
+        groups=case.groups,
+    )
     found = run_one(command, device=options.device)
     row = {
         "device": device,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from typing import Any, NamedTuple
 
@@ -59,12 +60,22 @@ def test_what_is_measured_outlives_what_cuts_it_off(tmp_path):
             raise RuntimeError("the machine is gone")
         return [{"case": case, "speed": 2.5}]
 
-    unfinished = tmp_path / "rows.csv"
+    unfinished = part().unfinished(tmp_path)
     with pytest.raises(RuntimeError, match="the machine is gone"):
         part(measure=measure).run(Options(), unfinished)
     assert read_rows(unfinished) == [{"case": "a", "speed": 2.5}]
-    part().run(Options(), unfinished)
-    assert not unfinished.exists()
+    rows = part().run(Options(), unfinished)
+    assert read_rows(unfinished) == rows  # until they lie where they belong
+    part().write(rows, [], tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["it.csv", "it.txt"]
+
+
+def test_what_pages_measure_alone_is_there():
+    cases = [getattr(case, "name", case) for part in PARTS for case in part.cases]
+    pages = (*ROOT.glob("docs/**/*.md"), ROOT / "benchmarks" / "README.md")
+    wanted = [text for page in pages for text in re.findall(r"""ARGS='.*--only "(.+?)\"""", page.read_text())]
+    assert wanted
+    assert [text for text in wanted if not any(text in case for case in cases)] == []
 
 
 def test_a_window_that_is_evaluated_holds_an_interval():
