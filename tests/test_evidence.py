@@ -131,6 +131,10 @@ def test_the_tables_say_which_seeds_are_missing_and_left_out():
     assert alone.startswith("## S: seeds 1 alone\n\n- not run: SAC, 0.2 on Ant-v4: seed 1\n")
     assert "left out of what is over all tasks: Hopper-v4, seed 1" in alone
     assert "comparisons" not in alone
+    one_task = study.narrowed(["Ant-v4"])
+    assert EVIDENCE.told(one_task, source, has_more_tasks=True).startswith("## S: on Ant-v4 alone\n\n- not run")
+    both = EVIDENCE.told(one_task, source, only=[0], has_more_tasks=True)
+    assert both.startswith("## S: seeds 0, on Ant-v4 alone\n\n**Ant-v4**")
     with pytest.raises(InputError, match="s has the seeds 0 to 1"):
         EVIDENCE.told(study, source, only=[7])
 

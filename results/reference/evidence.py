@@ -3,6 +3,7 @@
     python results/reference/evidence.py tables results/reference/screen.toml results/reference/confirm.toml
     python results/reference/evidence.py tables results/reference/tenth.toml --seeds 3 4 --into PAGE.md#NAME
     python results/reference/evidence.py tables results/strong/confirm.toml --methods "SAC, automatic" "CSAC, candidate"
+    python results/reference/evidence.py tables results/strong/longer.toml --tasks Walker2d-v4
     python results/reference/evidence.py write chosen       (or options)
     python results/reference/evidence.py null --tasks 3
 
@@ -35,6 +36,7 @@ from csac.record.statistics import (
 )
 from csac.studies.arms import Arm, gather
 from csac.studies.cells import complete
+from csac.studies.options import narrowed
 from csac.studies.results import Results, Source
 from csac.studies.run_report import write_between
 from csac.studies.study import Method, Study, read_study
@@ -273,10 +275,11 @@ def _with_interval(value: float, interval: tuple[float, float] | None) -> Cell:
     return numeric(value, f"{value:.3f}" + (f" ({interval[0]:.3f} to {interval[1]:.3f})" if interval else ""))
 
 
-def told(study: Study, source: Source, only: Sequence[int] = ()) -> str:
+def told(study: Study, source: Source, only: Sequence[int] = (), has_more_tasks: bool = False) -> str:
     """Return what is known of a study: what did not run, what failed, which seeds are left out, and the tables.
 
-    With `only` these seeds count, and all that has a scale is scaled by theirs. Raises InputError for none of its own.
+    With `only` these seeds count, and all that has a scale is scaled by theirs. Where the study `has_more_tasks`, the
+    heading says on which it is told. Raises InputError for no seed of its own.
     """
     of_study = range(study.first_seed, study.first_seed + study.seeds)
     kept = set(only or of_study) & set(of_study)
@@ -298,7 +301,9 @@ def told(study: Study, source: Source, only: Sequence[int] = ()) -> str:
     tables = [task_table(task, methods) for task, methods in found.items()]
     if seeds:
         tables += [overall_table(study, found), comparison_table(study, found)]
-    title = f"## {study.title}" + (f": seeds {', '.join(map(str, sorted(kept)))} alone" if only else "")
+    some = [f"seeds {', '.join(map(str, sorted(kept)))}"] if only else []
+    some += [f"on {', '.join(study.tasks)}"] if has_more_tasks else []
+    title = f"## {study.title}" + (f": {', '.join(some)} alone" if some else "")
     parts = [title, "\n".join(f"- {note}" for note in notes), *map(markdown, tables)]
     return "\n\n".join(part for part in parts if part)
 
@@ -435,8 +440,11 @@ def main() -> None:
     try:
         if arguments.command == "tables":
             source = Results(arguments.results)
-            studies = [read_study(path).narrowed(arguments.tasks, arguments.methods) for path in arguments.studies]
-            text = "\n\n".join(told(study, source, arguments.seeds) for study in studies) + "\n"
+            studies = [read_study(path) for path in arguments.studies]
+            text = "".join(
+                told(study, source, arguments.seeds, has_more_tasks=bool(arguments.tasks)) + "\n\n"
+                for study in narrowed(studies, arguments.tasks, arguments.methods, None)
+            )[:-1]
             if arguments.into:
                 page, _, name = arguments.into.partition("#")
                 write_between(Path(page), name, text)
