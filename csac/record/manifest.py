@@ -56,10 +56,10 @@ class Machine:
     host: str = ""
     gpu: str = ""
     """Its model, where the run computes on one."""
-    xla_flags: str = ""
-    """What XLA is told beside its defaults: by the user's XLA_FLAGS, and on a GPU by csac."""
-    matmul_precision: str = ""
-    """Of products, where it is not JAX's default."""
+    xla_flags: str | None = None
+    """What XLA is told beside its defaults: by the user's XLA_FLAGS, and on a GPU by csac. None: not recorded."""
+    matmul_precision: str | None = None
+    """Of products, where it is not JAX's default. None: not recorded."""
 
 
 OTHER_TASK = "task is "  # how a change of the task begins

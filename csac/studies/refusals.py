@@ -84,7 +84,7 @@ def _try(cells: list[Cell]) -> None:
 def refuse_device(device: str, beside: bool) -> None:
     """Raise InputError where there is no such device for cells that are trained here or, one each, `beside`.
 
-    The GPU is looked for where cells are trained: a process that has looked keeps most of its memory.
+    The GPU is looked for where cells are trained: a process that has looked keeps some of its memory.
     """
     if not beside:
         _choose(device)

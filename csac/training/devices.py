@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import jax
+from jax._src import xla_bridge
 
 from csac.types import InputError
 
@@ -28,7 +30,8 @@ def choose_device(device: str) -> None:
 
     A GPU computes as a CPU does, in float32 and the same in every run, unless the user's own XLA_FLAGS or
     JAX_DEFAULT_MATMUL_PRECISION say otherwise. A process takes the GPU's memory as it needs it, so that several share
-    one, unless XLA_PYTHON_CLIENT_PREALLOCATE says otherwise.
+    one, unless XLA_PYTHON_CLIENT_PREALLOCATE says otherwise. Where this process has looked for devices already it is
+    too late for that and for XLA's flags: a warning says so.
 
     Raises:
         InputError: there is no such device, this process has computed on another one, or JAX is set to numbers or keys
@@ -43,9 +46,10 @@ def choose_device(device: str) -> None:
         raise InputError(f"csac's keys are of JAX's {PRNG}: unset JAX_DEFAULT_PRNG_IMPL (jax_default_prng_impl)")
     before = config.jax_platforms, {name: os.environ.get(name) for name in (FLAGS, PREALLOCATE)}
     jax.config.update("jax_platforms", PLATFORMS[device])
-    if device == "gpu":
+    is_late = _has_looked_for_devices()
+    if device == "gpu" and not is_late:
         os.environ[FLAGS] = with_exact_kernels(os.environ.get(FLAGS, ""))
-        os.environ.setdefault(PREALLOCATE, "false")
+        os.environ[PREALLOCATE] = os.environ.get(PREALLOCATE) or "false"
     try:
         chosen = jax.default_backend()
     except Exception as error:  # which one depends on what is missing, and on JAX's version
@@ -58,10 +62,18 @@ def choose_device(device: str) -> None:
     os.environ["JAX_PLATFORMS"] = PLATFORMS[device]  # for the workers
     if device == "gpu":
         multiply_in_float32()
+        if is_late and EXACT_GPU not in os.environ.get(FLAGS, ""):
+            warnings.warn(
+                "JAX was in use before csac, so runs on this GPU may differ in their last bits: "
+                f"train first, or set XLA_FLAGS={EXACT_GPU}=true before",
+                stacklevel=2,
+            )
+    if config.jax_default_matmul_precision:
+        os.environ["JAX_DEFAULT_MATMUL_PRECISION"] = config.jax_default_matmul_precision  # for the workers
 
 
 def in_use() -> dict[str, str]:
-    """Return what decides the last bits of what this process computes, by the names that `Machine` has for it."""
+    """Return what decides the last bits of what this process and its workers compute, as `Machine` has it."""
     config: Any = jax.config
     return {
         "gpu": jax.devices()[0].device_kind if jax.default_backend() == "gpu" else "",
@@ -76,11 +88,20 @@ def with_exact_kernels(flags: str) -> str:
 
 
 def multiply_in_float32() -> None:
-    """Let products be of float32 in this process and in those that it starts, unless the user has set another one."""
+    """Let products be of float32 in this process, unless the user has set another precision."""
     config: Any = jax.config
     if config.jax_default_matmul_precision is None:
         config.update("jax_default_matmul_precision", PRECISION)
-        os.environ["JAX_DEFAULT_MATMUL_PRECISION"] = PRECISION
+
+
+def preallocates() -> bool:
+    """Whether the user has each process take most of a GPU's memory as it begins, as JAX reads the variable."""
+    return os.environ.get(PREALLOCATE, "") not in ("", "0", "false", "False")
+
+
+def _has_looked_for_devices() -> bool:
+    """Whether JAX has, after which it reads no variable of the GPU. It has no public function that tells."""
+    return xla_bridge.backends_are_initialized()
 
 
 def _forget(platforms: str | None, variables: Mapping[str, str | None]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -97,7 +98,12 @@ class Learner:
 
     def _of_parcel(self, program: Callable) -> Callable:
         """Return the program of a carry, packed transitions, observations and a step as one of a carry and a parcel."""
-        return lambda carry, row: program(carry, *self._parcel.unpack(row))
+
+        @functools.wraps(program)
+        def of_parcel(carry: Carry, row: jax.Array) -> Any:
+            return program(carry, *self._parcel.unpack(row))
+
+        return of_parcel
 
     def networks(self) -> list[PolicyNetwork]:
         """Return each seed's policy as NumPy layers."""

@@ -51,7 +51,7 @@ class Packing:
 class Parcel:
     """Float32 arrays and a whole number as one row on their way from the host to a program, and what they are there.
 
-    A GPU is sent each array for itself, which takes a tenth of the time of a step. The row is of integers: they reach
+    A GPU is sent each array for itself, and each takes time however small it is. The row is of integers: they reach
     the program as they are, where a float that is the image of a small integer might be taken for zero.
 
     Args:

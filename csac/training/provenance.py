@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distributions, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,16 +21,18 @@ if TYPE_CHECKING:
 
 def provenance(task: Task, command: str | None) -> dict[str, Any]:
     """Return these fields of a manifest, of a process whose device has been chosen."""
+    machine = Machine(_processor(), len(usable_cores()), platform.node(), **in_use())
     return {
-        "machine": Machine(_processor(), len(usable_cores()), platform.node(), **in_use()),
-        "versions": _versions(task),
+        "machine": machine,
+        "versions": _versions(task, on_gpu=bool(machine.gpu)),
         "commit": _commit(),
         "command": command,
         "process": os.getpid(),
     }
 
 
-def _versions(task: Task) -> dict[str, str]:
+def _versions(task: Task, on_gpu: bool) -> dict[str, str]:
+    """Return the versions of what decides the numbers; on a GPU also those of its libraries, whatever they are."""
     robots = ("pybullet", "PyFlyt", "panda-gym") if adapter_of(task) else ()
     versions = {"csac": __version__, "python": platform.python_version()}
     for package in ("jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco", *robots):
@@ -38,6 +40,9 @@ def _versions(task: Task) -> dict[str, str]:
             versions[package] = version(package)
         except PackageNotFoundError:
             continue
+    if on_gpu:
+        names = (distribution.name for distribution in distributions())
+        versions |= {name: version(name) for name in sorted(names) if name.startswith(("jax-cuda", "nvidia-"))}
     return versions
 
 

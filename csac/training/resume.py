@@ -318,14 +318,17 @@ def _machine_changes(before: Manifest, wanted: Manifest) -> list[str]:
         "number of usable cores": (before.machine.cores, wanted.machine.cores),
         "grouping of the seeds": ([list(group) for group in before.groups], [list(group) for group in wanted.groups]),
         "device": (before.machine.gpu or before.device, wanted.machine.gpu or wanted.device),
-        "XLA_FLAGS": (_or_none(before.machine.xla_flags), _or_none(wanted.machine.xla_flags)),
-        "precision of products": (_or_none(before.machine.matmul_precision), _or_none(wanted.machine.matmul_precision)),
     }
+    settings = {
+        "XLA_FLAGS": (before.machine.xla_flags, wanted.machine.xla_flags),
+        "precision of products": (before.machine.matmul_precision, wanted.machine.matmul_precision),
+    }
+    pairs |= {name: tuple(map(_or_none, pair)) for name, pair in settings.items() if None not in pair}
     for package in sorted(before.versions.keys() | wanted.versions.keys()):
         pairs[f"version of {package}"] = (before.versions.get(package), wanted.versions.get(package))
     pairs["commit of csac"] = (before.commit, wanted.commit)
     return [f"the {name} was {old} and is {new}" for name, (old, new) in pairs.items() if old != new]
 
 
-def _or_none(setting: str) -> str:
+def _or_none(setting: str | None) -> str:
     return setting or "not set"

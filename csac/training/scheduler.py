@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from csac.evaluation.evaluator import EPISODES_AT_ONCE
 from csac.processes import Child, core_quota, die_with_parent, move_to, usable_cores
 from csac.training.checkpoint import remove_unfinished
+from csac.training.devices import preallocates
 from csac.training.group import Group
 from csac.training.messages import (
     TURN_STEPS,
@@ -37,8 +38,12 @@ if TYPE_CHECKING:
 
 # More processes than this for each core only cost memory: the seeds of a larger run share processes.
 GROUPS_PER_CORE = 4
-# Of a GPU, so many share it, if each has so many seeds and processors.
-GROUPS_PER_GPU, SEEDS_PER_GPU_GROUP, CORES_PER_GPU_GROUP = 4, 5, 2
+# So many processes share a GPU at most: eight were in each other's way.
+GROUPS_PER_GPU = 4
+# With fewer seeds than this, one more process gains little.
+SEEDS_PER_GPU_GROUP = 5
+# One that steps its environments, and one for what JAX does beside; chosen, not measured.
+CORES_PER_GPU_GROUP = 2
 
 # Steps that one group may be ahead of another when its turn begins: all can be saved at one step without a long wait.
 LONGEST_LEAD = 1_000
@@ -61,10 +66,12 @@ def choose_groups(seeds: int, device: str) -> int:
 
     Two learners on a core each do about a fifth more than one learner of two seeds on both. A GPU computes for many
     seeds at once, but their environments wait for each other in one process: four with a few seeds each do nearly twice
-    as much as one, and eight are in each other's way (docs/gpu.md).
+    as much as one (docs/gpu.md). A process that takes most of the GPU's memory as it begins stays alone.
     """
     cores = len(usable_cores()[: core_quota()])
     if device == "gpu":
+        if preallocates():
+            return 1
         return max(1, min(seeds // SEEDS_PER_GPU_GROUP, cores // CORES_PER_GPU_GROUP, GROUPS_PER_GPU))
     return min(seeds, GROUPS_PER_CORE * cores)
 

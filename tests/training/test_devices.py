@@ -5,13 +5,17 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import warnings
+from types import SimpleNamespace
 from typing import Any
 
 import jax
 import pytest
 
 from csac.algorithms import SAC
-from csac.training.devices import choose_device
+from csac.training import devices
+from csac.training import provenance as provenance_module
+from csac.training.devices import choose_device, in_use, preallocates
 from csac.training.train import train
 from csac.types import InputError
 
@@ -52,6 +56,7 @@ def a_gpu(monkeypatch):
     monkeypatch.delenv(MEMORY)
     jax.config.update("jax_default_matmul_precision", None)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(devices, "_has_looked_for_devices", lambda: False)
     yield config
     jax.config.update("jax_default_matmul_precision", before)
 
@@ -63,12 +68,44 @@ def test_a_gpu_computes_in_float32_and_the_same_in_every_run(a_gpu):
     assert config.jax_default_matmul_precision == "highest"
 
 
-@pytest.mark.parametrize(("own", "then"), [(None, "false"), ("true", "true")])
+@pytest.mark.parametrize(("own", "then"), [(None, "false"), ("", "false"), ("true", "true")])
 def test_processes_share_a_gpu_s_memory_unless_the_user_will_not(a_gpu, monkeypatch, own, then):
-    if own:
+    if own is not None:
         monkeypatch.setenv(MEMORY, own)
     choose_device("gpu")
     assert os.environ[MEMORY] == then
+    assert preallocates() == (then == "true")
+
+
+def test_what_comes_too_late_for_a_gpu_is_not_said_to_hold(a_gpu, monkeypatch):
+    monkeypatch.setattr(devices, "_has_looked_for_devices", lambda: True)
+    with pytest.warns(UserWarning, match="JAX was in use before csac, so runs on this GPU may differ"):
+        choose_device("gpu")
+    assert os.environ["XLA_FLAGS"] == ""
+    assert MEMORY not in os.environ
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_deterministic_ops=true")  # as the first of two runs has left it
+    with warnings.catch_warnings(action="error"):
+        choose_device("gpu")
+
+
+def test_it_is_seen_whether_jax_has_looked_for_devices():
+    program = """
+import jax
+from csac.training.devices import _has_looked_for_devices
+before = _has_looked_for_devices()
+jax.devices()
+print(before, _has_looked_for_devices())
+"""
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert said == "False True\n"
+
+
+@pytest.mark.parametrize("device", ["cpu", "gpu"])
+def test_a_precision_that_a_program_sets_reaches_its_workers(a_gpu, monkeypatch, device):
+    jax.config.update("jax_default_matmul_precision", "tensorfloat32")
+    monkeypatch.setattr(jax, "default_backend", lambda: device)
+    choose_device(device)
+    assert os.environ["JAX_DEFAULT_MATMUL_PRECISION"] == in_use()["matmul_precision"] == "tensorfloat32"
 
 
 def test_what_the_user_has_set_of_a_gpu_s_numbers_stays(a_gpu, monkeypatch):
@@ -88,6 +125,17 @@ def test_a_gpu_that_is_not_to_be_had_leaves_no_setting_behind(a_gpu, monkeypatch
         choose_device("gpu")
     assert os.environ.get("XLA_FLAGS", "") == flags
     assert a_gpu.jax_default_matmul_precision is None
+
+
+def test_a_gpu_s_libraries_are_recorded(monkeypatch):
+    installed = {"nvidia-cublas": "13.1", "jax-cuda13-plugin": "0.11", "nvidia": "1", "rich": "14"}
+    monkeypatch.setattr(provenance_module, "distributions", lambda: [SimpleNamespace(name=name) for name in installed])
+    monkeypatch.setattr(provenance_module, "version", lambda name: installed.get(name, "2"))
+    monkeypatch.setattr(provenance_module, "in_use", lambda: {"gpu": "GPU A"})
+    on_gpu = provenance_module.provenance("Pendulum-v1", None)["versions"]
+    monkeypatch.setattr(provenance_module, "in_use", lambda: {"gpu": ""})
+    on_cpu = provenance_module.provenance("Pendulum-v1", None)["versions"]
+    assert on_gpu == {**on_cpu, "jax-cuda13-plugin": "0.11", "nvidia-cublas": "13.1"}
 
 
 def test_another_device_is_refused():

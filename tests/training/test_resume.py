@@ -712,17 +712,32 @@ def test_a_continuation_is_exact_only_if_every_episode_goes_on():
         ({"versions": {"csac": "1", "python": "3.12.0"}}, "the version of python was 3.11.7 and is 3.12.0"),
         ({"versions": {"csac": "1", "python": "3.11.7", "pybullet": "3"}}, "the version of pybullet was None and is 3"),
         ({"device": "gpu", "machine": Machine(gpu="GPU B")}, "the device was cpu and is GPU B"),
-        ({"machine": Machine(xla_flags="--xla_a=1")}, "the XLA_FLAGS was not set and is --xla_a=1"),
-        ({"machine": Machine(matmul_precision="high")}, "the precision of products was not set and is high"),
+        (
+            {"machine": Machine(xla_flags="--xla_a=1", matmul_precision="")},
+            "the XLA_FLAGS was not set and is --xla_a=1",
+        ),
+        (
+            {"machine": Machine(xla_flags="", matmul_precision="high")},
+            "the precision of products was not set and is high",
+        ),
     ],
 )
 def test_whatever_else_computes_is_noticed(change, said):
     versions = {"csac": "1", "python": "3.11.7"}
-    before = Manifest(task="Hopper-v4", algorithm="sac", seeds=(0,), steps=400, versions=versions, commit="a")
+    machine = Machine(xla_flags="", matmul_precision="")
+    before = Manifest(
+        task="Hopper-v4", algorithm="sac", seeds=(0,), steps=400, machine=machine, versions=versions, commit="a"
+    )
     now, restart = replace(before, **change), Restart(100, {}, [], [])
     entry = restart.continuation(before, now)
     assert (entry.exact, entry.previous["commit"]) == (False, "a")
     assert any(said in note for note in restart.notes(before, now))
+
+
+def test_what_an_older_manifest_does_not_have_is_no_change():
+    old = Manifest(task="Hopper-v4", algorithm="sac", seeds=(0,), steps=400)
+    now = replace(old, machine=Machine(xla_flags="--xla_a=1", matmul_precision="high"))
+    assert Restart(100, {}, [], []).continuation(old, now).exact
 
 
 def test_another_model_of_gpu_is_another_device():

@@ -54,6 +54,8 @@ def test_a_few_groups_of_several_seeds_share_a_gpu(monkeypatch, cores, seeds, gr
     monkeypatch.setattr(scheduler_module, "usable_cores", lambda: list(range(cores)))
     monkeypatch.setattr(scheduler_module, "core_quota", lambda: None)
     assert scheduler_module.choose_groups(seeds, "gpu") == groups
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "true")  # the first process takes what others would need
+    assert scheduler_module.choose_groups(seeds, "gpu") == 1
 
 
 @pytest.mark.parametrize("interval", [100, 130])
