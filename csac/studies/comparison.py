@@ -22,7 +22,7 @@ from csac.record.run import RunDirectory, find_runs, is_run
 from csac.record.summaries import case_names, last_rows
 from csac.studies.arms import Arm, Time
 from csac.studies.collected import ROLLOUTS, find_collected, read_collected, rollouts_of
-from csac.studies.configurations import differing, filled_in, labels, merged, settings_of
+from csac.studies.configurations import differing, filled_in, labels, merged, name_of, settings_of
 from csac.studies.sections import plain
 from csac.tasks.perturbations import perturbations_of
 from csac.types import InputError
@@ -235,10 +235,7 @@ def _named(arms: list[Arm], firsts: Sequence[Given]) -> list[Arm]:
 
 
 def _name(run: Given) -> str:
-    one = run.manifest
-    if not one:
-        return run.path.stem
-    return one.algorithm.upper() + (f" ({one.preset})" if one.preset else "")
+    return name_of(run.manifest) if run.manifest else run.path.stem
 
 
 def seeds_of(runs: Sequence[Given]) -> set[int]:

@@ -6,6 +6,7 @@ import dataclasses
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from csac.presets import PRESETS, hyperparameters
 from csac.studies.sections import plain
 from csac.types import InputError
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from csac.studies.arms import Arm
 
 LENGTH = "steps"
+FITTED = ("warmup_steps", "replay_size")  # to the length of a run, whatever preset it follows
 
 
 def filled_in(manifests: Sequence[Manifest | None]) -> list[Manifest | None]:
@@ -36,6 +38,31 @@ def _complete(manifest: Manifest) -> Manifest:
         known = complete(manifest.algorithm, manifest.hyperparameters)
         return dataclasses.replace(manifest, hyperparameters=known)
     return manifest
+
+
+def name_of(manifest: Manifest) -> str:
+    """Return the algorithm, the preset that a run follows, if any, and what was fitted to its length beside that."""
+    name, own = manifest.algorithm.upper(), manifest.hyperparameters
+    if manifest.preset:
+        return f"{name} ({manifest.preset})"
+    for preset in PRESETS:
+        with suppress(InputError):  # of a preset that says nothing of the algorithm
+            given = hyperparameters(preset, manifest.algorithm, manifest.task)
+            fitted = {item: own[item] for item in FITTED if item in own and plain(own[item]) != plain(given.get(item))}
+            if fitted and _follows(manifest, {**given, **fitted}):
+                return ", ".join([f"{name} ({preset})", *(f"{item} {plain(value)}" for item, value in fitted.items())])
+    return name
+
+
+def _follows(manifest: Manifest, given: Mapping[str, Any]) -> bool:
+    """Whether a run has these hyperparameters, and the default of each other one."""
+    own = manifest.hyperparameters
+    if any(plain(own.get(name)) != plain(value) for name, value in given.items()):
+        return False
+    from csac.studies.cells import complete  # which imports JAX
+
+    whole = complete(manifest.algorithm, given)
+    return all(plain(whole.get(name)) == plain(value) for name, value in own.items())
 
 
 def settings_of(manifest: Manifest) -> dict[str, Any]:

@@ -10,10 +10,13 @@ import pytest
 from made import make_run_of
 
 from csac.cli import main
+from csac.presets import hyperparameters
 from csac.record import manifest as manifests
 from csac.record.manifest import EvaluationPlan
+from csac.studies.cells import complete
 from csac.studies.collected import read_collected
 from csac.studies.comparison import _given_cell, _times
+from csac.studies.configurations import name_of
 
 ROWS = "seed,step,episode,return,length,success"
 
@@ -240,6 +243,28 @@ def test_a_run_from_before_a_hyperparameter_is_one_arm_with_what_has_its_default
     make_run_of("runs/old", [[10.0]], seeds=(0,))
     make_run_of("runs/new", [[30.0]], seeds=(1,), hyperparameters={"policy_delay": 1, "adam_momentum": 0.9})
     assert "| SAC | 20 ± 14 | 10 | 2 |" in report("runs")
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "preset", "changed", "name"),
+    [
+        ("sac", "strong", {}, "SAC (strong)"),
+        ("sac", "strong", {"warmup_steps": 100}, "SAC (strong), warmup_steps 100"),
+        ("csac", "paper", {"warmup_steps": 1_000, "replay_size": 5_000},
+         "CSAC (paper), warmup_steps 1,000, replay_size 5,000"),
+        ("sac", "strong", {"warmup_steps": 100, "policy_delay": 1}, "SAC"),
+        ("csac", "paper", {"warmup_steps": 100, "adam_momentum": 0.5}, "CSAC"),  # of which the preset says nothing
+        ("ppo", "paper", {"minibatches": 4}, "PPO"),
+        ("mine", None, {"warmup_steps": 100}, "MINE"),
+    ],
+)  # fmt: skip
+def test_what_is_fitted_to_a_run_s_length_hides_no_preset(algorithm, preset, changed, name):
+    own = {**(complete(algorithm, hyperparameters(preset, algorithm, "Ant-v4")) if preset else {}), **changed}
+    follows = preset if not changed else None
+    run = manifests.Manifest(
+        task="Ant-v4", algorithm=algorithm, seeds=(0,), steps=9, hyperparameters=own, preset=follows
+    )
+    assert name_of(run) == name
 
 
 def test_a_method_has_one_label_on_all_tasks():
