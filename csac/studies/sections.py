@@ -187,8 +187,11 @@ def robustness(arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
             if len(some) > 1:
                 panels = [panel._replace(title=", ".join(text for _, text in panel.marks)) for panel in panels]
             yield scope.figure(kind, f"{task}{number_of_it}", Curves(tuple(panels)), title)
+        titles = [title for (_, condition), _ in conditions for title in titles_of_changes(task, condition)]
         for (_, condition), each in conditions:
             for index, title in enumerate(titles_of_changes(task, condition)):
+                if titles.count(title) > 1 and len(marks_of(condition)) > 1:  # another condition has the same change
+                    title = f"{title} (in {_changes(condition)})"
                 yield recoveries_table(each, marks_of(condition), index)._replace(title=scope.titled(title))
 
 

@@ -11,7 +11,7 @@ from csac.studies.arms import Arm, gather
 from csac.studies.figures import Bars, Curves, Trend
 from csac.studies.named import NAMED
 from csac.studies.parts import Figure, Paragraph
-from csac.studies.sections import Scope, cases, curves, efficiency, report_looks, returns, success
+from csac.studies.sections import Scope, cases, curves, efficiency, report_looks, returns, robustness, success
 from csac.studies.study import Method
 
 
@@ -171,6 +171,20 @@ def test_a_sweep_is_of_methods_that_differ_in_that_number_alone(others):
     study = replace(study.narrowed(seeds=1), methods=(first, replace(second, **others)))
     arms = gather(study, MadeRecords(lambda *_: 1.0))
     assert len(drawn(returns(arms, Scope("it")), Trend)) == (not others)
+
+
+def test_two_conditions_that_begin_alike_have_a_title_each():
+    conditions = ("friction=2@200000",), ("friction=2@200000", "friction=3@400000")
+    (study,) = NAMED["efficiency"]
+    study = replace(study.narrowed(tasks=["Hopper-v4"], algorithms=["sac"], seeds=1), conditions=conditions)
+    some = gather(study, MadeRecords(lambda *_: 1.0))
+    titles = [part.title for part in robustness(some, Scope("it")) if isinstance(part, Table)]
+    both = "friction x 2 after step 200,000, friction x 3 after step 400,000"
+    assert titles == [
+        "Hopper-v4, friction x 2 after step 200,000",
+        f"Hopper-v4, friction x 2 after step 200,000 (in {both})",
+        "Hopper-v4, friction x 3 after step 400,000",
+    ]
 
 
 def test_the_name_of_a_picture_fits_into_a_folder_however_many_changes_it_is_of():
