@@ -7,6 +7,7 @@ import pytest
 from policies import contract, random_policy
 
 import csac
+from csac.algorithms import ALGORITHMS
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 
@@ -122,6 +123,20 @@ def test_what_only_the_end_of_a_run_needs_is_not_imported_at_its_start():
 def test_public_names_resolve(name):
     assert getattr(csac, name) is not None
     assert name in dir(csac)
+
+
+def test_an_algorithm_is_wherever_its_page_says():
+    """What docs/adding-an-algorithm.md lists beside presets and the search space, which have tests of their own."""
+    root = Path(__file__).parents[1]
+    (kept_apart,) = [
+        contract["modules"]
+        for contract in tomllib.loads(root.joinpath("pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+        if contract["type"] == "independence"
+    ]
+    for name, algorithm in ALGORITHMS.items():
+        assert algorithm.__name__ in csac.__all__
+        assert algorithm.__module__ in kept_apart
+        assert root.joinpath("docs", "algorithms", f"{name}.md").is_file()
 
 
 def test_an_unknown_name_is_an_attribute_error():
