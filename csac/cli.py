@@ -245,6 +245,9 @@ def _evaluate(arguments: list[str]) -> int:
         console.print(cases)
     for name in silent_events(results):
         _say(f"note: no episode's last info holds a number called {name!r}")
+    if options.seed is None and (others := [one for one in run.seeds_with_policies() if one not in results]):
+        names = ", ".join(map(str, others))
+        _say(f"note: not tested, never evaluated in training and so without a best policy: seed {names}")
     for seed in sorted(results.keys() & manifest.failures.keys()):
         _say(f"note: seed {seed} failed at {manifest.failures[seed]}; it is in no mean, and in no file of rows")
     _tell_of_warmup(manifest)

@@ -46,7 +46,10 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
     if not is_run(folder) and os.path.isdir(folder):
         _refuse_artefacts(folder)
     run = RunDirectory.open(directory)
-    return Policy.load(run.policy(choose_seed(run, seed), which), Contract.load(run.contract))
+    label = choose_seed(run, seed)
+    if not has_policy(run, label, which):
+        raise InputError(f"{run.path} has no best policy of seed {label}, which was never evaluated: load its last")
+    return Policy.load(run.policy(label, which), Contract.load(run.contract))
 
 
 def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
@@ -79,6 +82,11 @@ def no_policies(run: RunDirectory) -> InputError:
     """Return what to raise for a run without policies."""
     when = "any more" if len(run.evaluations) else "yet: its first evaluation writes them"
     return InputError(f"{run.path} holds no policies {when}")
+
+
+def has_policy(run: RunDirectory, seed: int, which: Which) -> bool:
+    """Whether a seed that has left a policy has this one: a best one comes with its first evaluation."""
+    return which == "last" or run.policy(seed, which).exists() or bool((run.evaluations["seed"] == seed).any())
 
 
 def choose_seed(run: RunDirectory, seed: int | None = None) -> int:

@@ -152,7 +152,11 @@ class Evaluator:
             self.close()
         self._make_environments()
         check_contract(policy, self._environments[0])
-        return self._run_batch(policy, range(first, min(first + EPISODES_AT_ONCE, self.episodes)), deterministic)
+        try:
+            return self._run_batch(policy, range(first, min(first + EPISODES_AT_ONCE, self.episodes)), deterministic)
+        except EvaluationFailure:
+            self.close()  # what has raised may be broken for good, and the next policy is to fail by itself alone
+            raise
 
     def close(self) -> None:
         """Close the environments; another `run` makes new ones."""

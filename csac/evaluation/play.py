@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.checks import check_flag
-from csac.deploy.choosing import load, no_policies
+from csac.deploy.choosing import has_policy, load, no_policies
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.atomic import check_name
@@ -68,7 +68,7 @@ def evaluate_run(
         run.manifest.events,
     )
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
-    labels = _seeds_with_policies(run) if seed is None else [seed]
+    labels = _seeds_with_policies(run, which) if seed is None else [seed]
     policies = [load(directory, label, which) for label in labels]
     processes = choose_processes(evaluator, len(policies)) if processes is None else processes
     if processes == 1:
@@ -183,11 +183,13 @@ def _follow(environment: Environment) -> None:
         renderer.camera_id = renderer.model.camera("track").id
 
 
-def _seeds_with_policies(run: RunDirectory) -> list[int]:
+def _seeds_with_policies(run: RunDirectory, which: Which) -> list[int]:
     seeds = run.seeds_with_policies()
     if not seeds:
         raise no_policies(run)
-    return seeds
+    if not (those := [seed for seed in seeds if has_policy(run, seed, which)]):
+        raise InputError(f"{run.path} has no best policies, since no seed of it was evaluated: take the last ones")
+    return those
 
 
 def _require_display() -> None:

@@ -40,6 +40,8 @@ class Recording(NamedTuple):
 
     observations: np.ndarray
     returns: np.ndarray
+    starts_alike: bool = False
+    """Whether every episode began in one state: without noise they are one episode, played again and again."""
 
 
 class Compared(NamedTuple):
@@ -64,10 +66,11 @@ class Returns:
 
     policy: np.ndarray
     artefact: np.ndarray
+    starts_alike: bool = False
 
     @property
     def chance(self) -> float:
-        """The probability that equal policies have means so far apart (Welch's t-test); 1 below two episodes."""
+        """The chance that equal policies have means so far apart (Welch's t-test); 1 below two episodes that differ."""
         from scipy import special  # slow to import
 
         if len(self.policy) < 2:
@@ -77,7 +80,7 @@ class Returns:
         difference = max(0.0, difference - 1e-4 * np.abs(self.policy).max())
         variances = np.array([values.var(ddof=1) / len(values) for values in (self.policy, self.artefact)])
         if variances.sum() == 0.0:
-            return 1.0 if difference == 0.0 else 0.0
+            return 1.0 if difference == 0.0 or self.starts_alike else 0.0
         freedom = variances.sum() ** 2 / (variances**2 / (len(self.policy) - 1)).sum()
         return float(2.0 * special.stdtr(freedom, -difference / np.sqrt(variances.sum())))
 
@@ -100,7 +103,8 @@ def record(
         played = evaluator.run(policy, deterministic)
     finally:
         evaluator.close()
-    return Recording(np.concatenate(seen), np.array([episode.episode_return for episode in played]))
+    starts_alike = bool((seen[0] == seen[0][0]).all())
+    return Recording(np.concatenate(seen), np.array([episode.episode_return for episode in played]), starts_alike)
 
 
 def compare_actions(artefact: Artefact, policy: Policy, recorded: np.ndarray | None = None) -> list[Compared]:
@@ -147,7 +151,9 @@ def compare_returns(
         EvaluationFailure: as `evaluate_episodes`.
     """
     played = evaluate_episodes(artefact, task, len(reference.returns), environment_arguments=environment_arguments)
-    returns = Returns(reference.returns, np.array([episode.episode_return for episode in played]))
+    returns = Returns(
+        reference.returns, np.array([episode.episode_return for episode in played]), reference.starts_alike
+    )
     is_same = artefact.contract.weights == "float32" and not artefact.contract.guards.is_any
     if is_same and returns.chance < IMPLAUSIBLE:
         raise InputError(

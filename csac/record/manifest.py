@@ -78,6 +78,11 @@ class Origin:
         """Whether the checkpoint is of another task."""
         return any(text.startswith(OTHER_TASK) for text in self.changes)
 
+    @property
+    def has_other_returns(self) -> bool:
+        """Whether returns before it are of another task, or of this one made with other arguments."""
+        return any(text.startswith((OTHER_TASK, "environment_arguments")) for text in self.changes)
+
 
 @dataclass(frozen=True)
 class Continuation:

@@ -146,10 +146,15 @@ def scalar(reward: Any) -> float:
 
 
 def message(error: BaseException) -> str:
-    """Return what an error says, in one line."""
-    return " ".join(str(error).split())
+    """Return what an error says, in one line that every file and terminal takes."""
+    try:
+        text = str(error)
+    except Exception as unsaid:
+        text = f"(saying what it is raised {type(unsaid).__name__})"
+    return " ".join(text.encode("utf-8", "backslashreplace").decode().split())
 
 
 def one_line(error: BaseException) -> str:
     """Return an error's type and what it says, in one line."""
-    return f"{type(error).__name__}: {message(error)}" if str(error) else type(error).__name__
+    told = message(error)
+    return f"{type(error).__name__}: {told}" if told else type(error).__name__

@@ -82,7 +82,7 @@ class Recorder:
         self._saved: dict[int, dict[int, Files]] = defaultdict(dict)  # step -> group -> its files
         # One that was lost is followed by the best of later evaluations, and that of another task by the first of this.
         origin, known = run.manifest.forked_from, run.evaluations
-        if origin and origin.has_other_task:
+        if origin and origin.has_other_returns:
             known = known[known["step"] > origin.step]
         self._best = {k: v for k, v in best_returns(known).items() if self.run.policy(k, "best").exists()}
         self._has_contract = False  # of this task: a fork begins with its source's

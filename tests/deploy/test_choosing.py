@@ -46,6 +46,16 @@ def test_a_seed_is_loaded_by_its_label(tmp_path):
     assert same(load(tmp_path / "run", seed=2, which="best"), random_policy(contract(), 102))
 
 
+def test_a_seed_that_was_never_evaluated_has_no_best_policy(tmp_path):
+    save_run(tmp_path / "run", "0,1,0,5.0,10,\n", failures={1: "step 1: it broke"})
+    for seed in (0, 1):
+        RunDirectory.open(tmp_path / "run").policy(seed, "best").unlink()
+    with pytest.raises(InputError, match="run has no best policy of seed 1, which was never evaluated: load its last"):
+        load(tmp_path / "run", seed=1, which="best")
+    with pytest.raises(InputError, match="restore it"):  # this one had its best
+        load(tmp_path / "run", seed=0, which="best")
+
+
 def test_the_best_seed_is_best_over_its_last_three_evaluation_points(tmp_path):
     # Means of the last three points: seed 0: (1 + 1 + 30) / 3; seed 1: (12 + 12 + 12) / 3, its 99 being older;
     # seed 2: (90, its own mean of 60 and 120, then 3 and 0) / 3 = 31.

@@ -299,6 +299,26 @@ def test_an_environment_that_fails_is_named(task, arguments, message):
         evaluator.run(policy_for(probes.Endless))
 
 
+class Fragile(probes.Endless):
+    """Breaks for good at an action below zero."""
+
+    is_broken = False
+
+    def step(self, action):
+        self.is_broken |= bool(action < 0.0)
+        if self.is_broken:
+            raise RuntimeError("it is broken")
+        return super().step(action)
+
+
+def test_what_a_policy_has_broken_is_not_the_next_policy_s():
+    evaluator, good = Evaluator(Fragile, {"length": 3}, episodes=2), policy_for(probes.Endless, bias=1.0)
+    alone = evaluator.run(good)
+    with pytest.raises(EvaluationFailure, match="it is broken"):
+        evaluator.run(policy_for(probes.Endless, bias=-1.0))
+    assert evaluator.run(good) == alone
+
+
 def test_a_policy_that_is_not_a_number_fails():
     with pytest.raises(EvaluationFailure, match=r"action\[0\] is nan"):
         evaluate(policy_for(probes.Endless, bias=float("nan")), probes.Endless, episodes=1)

@@ -196,3 +196,18 @@ def test_evaluating_a_run_tells_how_far_it_is(run_of):
     results = dict(evaluate_run(run_of(3).path, episodes=12, processes=1, on_progress=lambda *done: told.append(done)))
     assert [episode.length for episode in results[0]] == [3] * 12
     assert told == [(10, 12), (12, 12)]
+
+
+def test_the_best_policies_of_a_run_are_those_of_the_seeds_that_were_evaluated(run_of, capsys):
+    run = run_of(3)
+    with pytest.raises(InputError, match="has no best policies, since no seed of it was evaluated"):
+        list(evaluate_run(run.path, episodes=1, processes=1, which="best"))
+    run.update_manifest(seeds=(0, 1), failures={1: "step 5: it broke"})
+    for which in ("last", "best"):
+        random_policy(contract()).save_layers(run.policy(0, which))
+    random_policy(contract()).save_layers(run.policy(1))
+    run.append("evaluations", [{"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 3}])
+    assert [seed for seed, _ in evaluate_run(run.path, episodes=1, processes=1, which="best")] == [0]
+    assert main(["evaluate", str(run.path), "--checkpoint", "best", "--episodes", "1", "--processes", "1"]) == 0
+    said = "note: not tested, never evaluated in training and so without a best policy: seed 1\n"
+    assert said in capsys.readouterr().out

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import probes
 import pytest
 from gymnasium.spaces import Box
 from policies import ALGORITHMS, algorithm_policy
@@ -22,6 +23,7 @@ from csac.deploy import writing
 from csac.deploy.artefact import open_artefact
 from csac.deploy.artefact_contract import ArtefactContract
 from csac.deploy.choosing import load, step_of_policy
+from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.deploy.writing import write_artefact
 from csac.evaluation import verify
@@ -29,6 +31,7 @@ from csac.evaluation.evaluator import evaluate
 from csac.evaluation.export import ExportOptions, control_rate, export_run, provenance
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
+from csac.tasks.environment import Environment
 from csac.tasks.seeds import FRESH_EVALUATION_SEED
 from csac.training.train import train
 from csac.types import InputError, Layer, PolicyNetwork
@@ -258,6 +261,21 @@ def test_chance_is_welchs():
     assert verify.Returns(np.full(3, 100.0), np.full(3, 100.001)).chance == 1.0
     assert verify.Returns(np.full(3, 100.0), np.full(3, 101.0)).chance == 0.0
     assert verify.Returns(np.array([1.0]), np.array([9.0])).chance == 1.0
+
+
+def test_one_episode_that_is_played_again_and_again_proves_nothing():
+    """A chaotic task whose episodes all begin in one state goes another way from the last bit on, in all of them."""
+    assert verify.Returns(np.full(3, 100.0), np.full(3, 10.0), starts_alike=True).chance == 1.0
+    differing = np.array([100.0, 101.0, 99.0]), np.array([10.0, 11.0, 9.0])  # by noise: these are three
+    assert verify.Returns(*differing, starts_alike=True).chance == verify.Returns(*differing).chance < 1e-3
+    policy = algorithm_policy("csac")
+    assert not verify.record(policy, "Follow-v0", episodes=3).starts_alike
+
+
+def test_whether_episodes_begin_alike_is_recorded():
+    network = algorithm_policy("csac", ((None, (1,)),), (1,)).network
+    contract = Contract("Probe-v0", "csac", "relu", "tanh_gaussian", *Environment(probes.ConstantReward).contract_parts)
+    assert verify.record(Policy(network, contract), probes.ConstantReward, episodes=3).starts_alike
 
 
 def export(*arguments, **options):

@@ -18,7 +18,7 @@ from gymnasium import spaces
 
 from csac.tasks.environment import Environment
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED, SeedEnvironments, training_seed
-from csac.tasks.spaces import EnvironmentFailure
+from csac.tasks.spaces import EnvironmentFailure, one_line
 from csac.types import InputError, Spec
 
 UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -745,3 +745,21 @@ def test_an_episode_that_cannot_be_saved_says_why_and_begins_anew(gives, problem
     assert saved.values["problem"].startswith(problem)
     assert second.take_back(0, saved) is False
     np.testing.assert_array_equal(second.observations, SeedEnvironments(probes.Unsavable, {}, [3]).reset())
+
+
+class Unsaid(Exception):
+    def __str__(self) -> str:
+        raise ValueError("nothing")
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (RuntimeError("no file \udcff here"), "RuntimeError: no file \\udcff here"),
+        (Unsaid(), "Unsaid: (saying what it is raised ValueError)"),
+        (RuntimeError(), "RuntimeError"),
+    ],
+)
+def test_whatever_an_error_says_can_be_written_down(error, said):
+    assert one_line(error) == said
+    assert one_line(error).encode()

@@ -159,10 +159,18 @@ def test_a_task_that_cannot_be_made_again_for_an_evaluation_costs_no_run(tmp_pat
     assert (step_of_policy(run, 0, "last"), len(run.rows("episodes"))) == (50, 5)
 
 
-@pytest.mark.parametrize("is_other", [False, True])
-def test_the_best_policy_of_another_task_gives_way_to_the_first_of_this(tmp_path, is_other):
+@pytest.mark.parametrize(
+    ("changes", "is_other"),
+    [
+        ((), False),
+        (("discount is 0.9, not 0.99",), False),
+        (("task is 'A-v4', not 'B-v4'",), True),
+        (("environment_arguments.g is 20.0, not 0.5",), True),  # returns that are none of this one's
+    ],
+)
+def test_the_best_policy_of_another_task_gives_way_to_the_first_of_this(tmp_path, changes, is_other):
     evaluations = [{"seed": 0, "step": step, "episode": 0, "return": 900.0, "length": 9} for step in (50, 100)]
-    origin = Origin("runs/one", 100, ("task is 'A-v4', not 'B-v4'",) * is_other)
+    origin = Origin("runs/one", 100, changes)
     manifest = Manifest(task="B-v4", algorithm="sac", seeds=(0,), steps=300, forked_from=origin)
     forked = RunDirectory.create(tmp_path / "run", manifest)
     forked.append("evaluations", evaluations)
