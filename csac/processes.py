@@ -8,8 +8,11 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
+import time
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +20,12 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
+    from multiprocessing.context import SpawnProcess
 
 # A process whose pipe is closed is about to end: its exit code says why.
 SECONDS_TO_END = 10.0
+# What an environment has to close itself, and with it the simulator that it started.
+SECONDS_TO_CLOSE = 2.0
 
 # How a process ends that was to train, and whose import of the user's script trains already.
 UNGUARDED = 97
@@ -90,6 +96,46 @@ def die_with_parent() -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
+def outlive_termination() -> None:
+    """Have this worker go on after a SIGTERM, as its parent decides when it ends, but not what its task starts.
+
+    It is blocked until then (`worker_surroundings`). A mask survives an exec and a handler does not: with the mask,
+    a task would end its simulator by a `terminate` that does nothing, and wait for it for ever. What a terminal sends
+    to all that it has started, a Ctrl-C or a hang-up, stays blocked: simulators live until their seeds are saved.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows: nothing was blocked
+        return
+    before = signal.signal(signal.SIGTERM, _pass_over)
+    signal.siginterrupt(signal.SIGTERM, False)  # native code need not expect that its system calls are broken off
+    os.register_at_fork(  # where no exec follows
+        before=_hold_back, after_in_parent=_let_through, after_in_child=lambda: _take_back(before)
+    )
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+
+
+def _pass_over(*_: Any) -> None:
+    """Handle a signal by doing nothing."""
+
+
+def _take_back(handler: Any) -> None:
+    """Handle a SIGTERM as before `outlive_termination`, unless the task handles it by now."""
+    if signal.getsignal(signal.SIGTERM) is _pass_over:
+        signal.signal(signal.SIGTERM, handler)
+    _let_through()
+
+
+_forking = threading.local()
+
+
+def _hold_back() -> None:
+    """Have a signal wait that a child is sent at once, while its handler is still its parent's."""
+    _forking.mask = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
+
+
+def _let_through() -> None:
+    signal.pthread_sigmask(signal.SIG_SETMASK, _forking.mask)
+
+
 def end_if_unguarded() -> None:
     """End this process at once, and silently, if it is importing the script of its parent: that one says why."""
     if getattr(multiprocessing.current_process(), "_inheriting", False):
@@ -97,7 +143,12 @@ def end_if_unguarded() -> None:
 
 
 class Child:
-    """A process that runs `work(connection, *arguments)`, and this end of the pipe to it."""
+    """A process that runs `work(connection, *arguments)`, and this end of the pipe to it.
+
+    A daemon may not start processes of its own, and so no task that does: it is for work without one.
+    """
+
+    _at_exit: Finalize | None = None
 
     def __init__(self, work: Callable[..., None], *arguments: Any, daemon: bool) -> None:
         context = multiprocessing.get_context("spawn")
@@ -111,6 +162,8 @@ class Child:
                 self.kill()
             raise
         theirs.close()
+        # An interpreter that ends waits for its processes, and those wait for it where somebody forgot to close them.
+        self._at_exit = Finalize(None, _kill, (self.process,), exitpriority=0)
 
     def tell(self, message: Any) -> None:
         """Send a message; that the process is dead is seen when one is received."""
@@ -135,10 +188,32 @@ class Child:
 
     def kill(self) -> None:
         """End the process at once, and wait until it is gone."""
-        if self.process.is_alive():
-            self.process.kill()
-        self.process.join()
+        _kill(self.process)
         self.connection.close()
+        if self._at_exit:
+            self._at_exit.cancel()
+
+
+def _kill(process: SpawnProcess) -> None:
+    if process.is_alive():
+        process.kill()
+    process.join()
+
+
+def end(children: Sequence[Child], seconds: float = SECONDS_TO_CLOSE) -> None:
+    """End processes that have nothing more to say; those that have not ended in so many seconds are killed.
+
+    A simulator outlives the process that started it: it is the environments' to end, which takes them a moment.
+    """
+    deadline = time.monotonic() + seconds
+    try:
+        for child in children:
+            child.connection.close()
+        for child in children:
+            child.process.join(max(0.0, deadline - time.monotonic()))
+    finally:
+        for child in children:
+            child.kill()
 
 
 @contextmanager

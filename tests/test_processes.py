@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import re
 import signal
@@ -12,10 +13,19 @@ from pathlib import Path
 
 import pytest
 
-from csac.processes import Child, cause_of_death, control_groups, core_quota, memory_left, move_to
+from csac.processes import (
+    Child,
+    cause_of_death,
+    control_groups,
+    core_quota,
+    end,
+    memory_left,
+    move_to,
+    outlive_termination,
+)
 
 
-def end(_: Connection, how: str) -> None:
+def end_as_told(_: Connection, how: str) -> None:
     """What a task may do to the process that it is in."""
     if how == "sys.exit":
         sys.exit(7)
@@ -25,7 +35,7 @@ def end(_: Connection, how: str) -> None:
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_a_process_that_ended_is_not_said_to_have_been_killed():
     """Its pipe closes before it is gone: who ends it then would find the cause in himself."""
-    exits, faults = (Child(end, how, daemon=True) for how in ("sys.exit", "fault"))
+    exits, faults = (Child(end_as_told, how, daemon=True) for how in ("sys.exit", "fault"))
     for child, cause in (
         (exits, "ended by itself with exit code 7"),
         (faults, r"killed by SIGSEGV \(a fault in native"),
@@ -61,6 +71,86 @@ def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
     assert "InputError: this script starts processes that import it" in lines[-1]
     assert sum(line.startswith("Traceback") for line in lines) == 1
     assert not (tmp_path / "run").exists()  # once mended, the script begins there
+
+
+def end_what_a_task_starts(connection: Connection) -> None:
+    """Be told to end, in vain; then tell a program and a forked process to, and send how they did."""
+    outlive_termination()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.raise_signal(number)
+    forked = multiprocessing.get_context("fork").Process(target=signal.pause, daemon=True)
+    forked.start()
+    forked.terminate()
+    forked.join(30)
+    ends: list[int | None] = [forked.exitcode]
+    with subprocess.Popen(["sleep", "300"]) as program:
+        program.send_signal(signal.SIGINT)  # a Ctrl-C ends nothing before its seed is saved
+        program.send_signal(signal.SIGHUP)
+        program.terminate()
+        try:
+            ends.append(program.wait(30))
+        except subprocess.TimeoutExpired:
+            ends.append(None)
+            program.kill()
+    forked.kill()
+    connection.send(ends)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+def test_a_worker_outlives_what_ends_what_its_task_starts(monkeypatch):
+    """They were blocked, and so in the task's simulator too: to end it was to wait for it for ever."""
+    worker = Child(end_what_a_task_starts, daemon=False)
+    assert worker.connection.recv() == [-signal.SIGTERM, -signal.SIGTERM]
+    end([worker], 30)
+    assert worker.process.exitcode == 0
+
+
+def say_when_it_is_over(connection: Connection, path: Path) -> None:
+    connection.send("there")
+    try:
+        connection.recv()
+    except EOFError:
+        path.write_text("closed")
+
+
+def stay(connection: Connection) -> None:
+    connection.send("there")
+    while True:
+        signal.pause()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+def test_who_is_to_end_has_a_moment_and_no_more(tmp_path):
+    closing, staying = Child(say_when_it_is_over, tmp_path / "said", daemon=False), Child(stay, daemon=False)
+    assert [child.connection.recv() for child in (closing, staying)] == ["there", "there"]
+    end([closing], 30)
+    end([staying], 0)
+    assert [child.process.exitcode for child in (closing, staying)] == [0, -signal.SIGKILL]
+    assert (tmp_path / "said").read_text() == "closed"
+
+
+FORGETFUL = """
+import signal
+from csac.processes import Child, outlive_termination
+
+def work(connection):
+    outlive_termination()
+    connection.send("there")
+    while True:
+        signal.pause()
+
+if __name__ == "__main__":
+    children = [Child(work, daemon=False), Child(work, daemon=True)]
+    print([child.connection.recv() for child in children])
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+def test_an_interpreter_that_ends_waits_for_no_process_that_was_forgotten(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(FORGETFUL)
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "['there', 'there']\n", "")
 
 
 WITH_A_CHILD = """

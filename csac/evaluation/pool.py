@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from csac.evaluation.evaluator import EvaluationEpisode, EvaluationFailure, Evaluator
-from csac.processes import Child, core_quota, die_with_parent, move_to, usable_cores
+from csac.processes import Child, core_quota, die_with_parent, end, move_to, outlive_termination, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -108,10 +108,15 @@ class EvaluationPool:
         return PendingEvaluation(list(self._workers), tasks, len(policies) * self._evaluator.episodes, stop_at_failure)
 
     def close(self) -> None:
-        """End the processes; another run starts new ones."""
-        for worker in self._workers:
-            worker.kill()
-        self._workers = []
+        """End the processes, which close their environments; another run starts new ones.
+
+        One that is in the middle of a long batch is killed: nobody waits for its episodes.
+        """
+        workers, self._workers = self._workers, []
+        for worker in workers:
+            if worker.process.is_alive():
+                worker.tell(None)  # where a task has forked, its child holds this end of the pipe open
+        end(workers)
 
     def _start(self, processes: int) -> None:
         for worker in [worker for worker in self._workers if not worker.process.is_alive()]:
@@ -201,10 +206,10 @@ class PendingEvaluation:
 
 
 class _Worker(Child):
-    """The parent's end of one process, which is told the `Work` to do."""
+    """The parent's end of one process, which is told the `Work` to do, or None to end."""
 
     def __init__(self, evaluator: Evaluator, cores: Sequence[int] | None) -> None:
-        super().__init__(_work, evaluator, cores, daemon=True)
+        super().__init__(_work, evaluator, cores, daemon=False)
 
     def answer(self) -> Answer:
         with suppress(EOFError, OSError):
@@ -213,15 +218,18 @@ class _Worker(Child):
 
 
 def _work(connection: Connection, evaluator: Evaluator, cores: Sequence[int] | None) -> None:
-    """Run the batches that are asked for, until the parent is gone."""
+    """Run the batches that are asked for, until there are no more or the parent is gone."""
     die_with_parent()
+    outlive_termination()
     if cores:
         move_to(cores)
     try:
-        while True:
-            connection.send(_answer(evaluator, *connection.recv()))
+        while work := connection.recv():
+            connection.send(_answer(evaluator, *work))
     except (EOFError, OSError):
         return
+    finally:
+        evaluator.close()
 
 
 def _answer(

@@ -10,7 +10,8 @@ import time
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TextIO
+from typing import IO, TYPE_CHECKING, Any, Literal, TextIO, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 Table = Literal["episodes", "metrics", "evaluations"]
 Which = Literal["last", "best"]
+
+_File = TypeVar("_File", bound=IO[str])
 
 LOCK = ".lock"
 MANIFEST = "manifest.json"
@@ -184,7 +187,8 @@ class RunDirectory:
     def log(self, line: str) -> None:
         """Add a line to log.txt, after the time of now."""
         moment = datetime.now().astimezone().isoformat(timespec="seconds")
-        with open(self.path / "log.txt", "a", encoding="utf-8") as file:
+        # A traceback has lines of the task's own, which may be no UTF-8.
+        with open(self.path / "log.txt", "a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{moment} {line.rstrip()}\n")
 
     @contextmanager
@@ -212,12 +216,35 @@ class RunDirectory:
 
     def _open_lock(self) -> TextIO:
         try:
-            return open(self.path / LOCK, "a+")
+            return kept_from_children(open(self.path / LOCK, "a+"))
         except OSError as error:
             raise InputError(f"cannot write to {self.path}: {error.strerror}; check its permissions") from None
 
     def _table(self, name: Table) -> Path:
         return self.path / f"{name}.csv"
+
+
+# Files whose locks are this process's own; one that was closed may stay, since nothing happens to it.
+_own: WeakSet[IO[str]] = WeakSet()
+
+
+def kept_from_children(file: _File) -> _File:
+    """Return a file that is closed in every process forked from this one.
+
+    A lock belongs to the open file, which such a child shares: a task's helper that outlives this process would keep
+    its lock for as long as it lives.
+    """
+    _own.add(file)
+    return file
+
+
+def _close_own() -> None:
+    for file in list(_own):
+        file.close()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_close_own)
 
 
 def _take(file: TextIO) -> None:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING, Any, Protocol
 
-from csac.processes import Child, usable_cores
+from csac.processes import Child, end, usable_cores
 from csac.studies.cells import read_history, write_history
 from csac.studies.job import Ended, Job, Message, Started, Stopped, execute
 from csac.studies.worker import work
@@ -71,7 +71,7 @@ def run_in_processes(jobs: Sequence[Job], tell: Tell, workers: int | None = None
                     worker = running[connection]
                     message = worker.receive()
                     if isinstance(message, Ended):
-                        worker.child.kill()
+                        end([worker.child])
                         del running[connection]
                         free.append(worker.cores)
                     tell(message)
@@ -96,7 +96,7 @@ class _Worker:
 
     def __init__(self, job: Job, cores: list[int]) -> None:
         self.job, self.cores, self._is_stopping = job, cores, False
-        self.child = Child(work, cores, pickle.dumps(job), daemon=True)
+        self.child = Child(work, cores, pickle.dumps(job), daemon=False)
 
     def stop(self) -> None:
         """Ask it to save and end; once."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from csac.record.csv_tables import drop_torn_line
 from csac.record.manifest import differences
-from csac.record.run import is_locked, is_run
+from csac.record.run import is_locked, is_run, kept_from_children
 from csac.tasks.seeds import TUNING_EVALUATION_SEED
 from csac.training.options import Options
 from csac.types import InputError
@@ -161,7 +161,8 @@ class SharedStudy:
             trial = self.study.ask()
             label = trial.user_attrs.get("trial", label)
             trial.set_user_attr("trial", label)
-            lock = open(self._lock(label), "a")  # noqa: SIM115  held for as long as the trial runs
+            # Held for as long as the trial runs, by this process alone.
+            lock = kept_from_children(open(self._lock(label), "a"))  # noqa: SIM115
             _lock(lock)
             values = {name: dimension.draw(trial, name) for name, dimension in self.question.space.items()}
             trial.set_user_attr("values", values)
@@ -183,14 +184,16 @@ class SharedStudy:
     def give_back(self, attempt: Attempt) -> None:
         """Put a trial that was stopped back into the queue."""
         with self._ending(attempt):
-            self._requeue(attempt.trial.number, attempt.trial.params, attempt.trial.user_attrs)
+            self._requeue(self._all()[attempt.trial.number])
 
     def drop(self, attempt: Attempt) -> None:
         """Leave a trial out that could not begin; one whose configuration came from the queue goes back there."""
         with self._ending(attempt):
             trial = self._all()[attempt.trial.number]
-            was_queued = "fixed_params" in trial.system_attrs
-            self._requeue(trial.number, *((trial.params, trial.user_attrs) if was_queued else ({}, {})))
+            if "fixed_params" in trial.system_attrs:
+                self._requeue(trial)
+            else:
+                self._fail(trial)
 
     def results(self) -> list[Result]:
         """Return every trial, in order; one that was taken up again stands there once."""
@@ -229,14 +232,10 @@ class SharedStudy:
         optuna, path = self._optuna, self.directory / JOURNAL
         try:
             # Its other lock, a symbolic link, would be waited for for ever where a process died that held it.
-            lock = optuna.storages.journal.JournalFileOpenLock(str(path))
+            lock = _JournalLock(path, optuna.storages.journal.JournalFileOpenLock(str(path)))
             backend = optuna.storages.journal.JournalFileBackend(str(path), lock)
-            lock.acquire()
-            try:
-                with open(path, "ab+") as file:
-                    drop_torn_line(file)  # which the next one would otherwise be glued to
-            finally:
-                lock.release()
+            lock.acquire()  # so that what is read has no half line
+            lock.release()
             options = {
                 "storage": optuna.storages.JournalStorage(backend),
                 "study_name": NAME,
@@ -287,13 +286,25 @@ class SharedStudy:
         """Put trials that say that they are being run, and are not, back into the queue."""
         for trial in self._all():
             if trial.state.name == "RUNNING" and not self._is_run(trial):
-                self._requeue(trial.number, trial.params, trial.user_attrs)
+                self._requeue(trial)
 
-    def _requeue(self, number: int, params: dict[str, Any], facts: Mapping[str, Any]) -> None:
-        """Tell a trial as failed, since Optuna knows no other way to end one, and queue its configuration again."""
-        self.study.tell(number, state=self._optuna.trial.TrialState.FAIL)
-        if "values" in facts:
-            self.study.enqueue_trial(params, user_attrs={"trial": facts["trial"], "values": facts["values"]})
+    def _requeue(self, trial: optuna.trial.FrozenTrial) -> None:
+        """Queue a trial's configuration again, if it has one by now, and end the trial.
+
+        In this order nothing is lost where the process dies between the two: whoever takes the trial back then sees
+        that another stands for it already.
+        """
+        facts = {name: trial.user_attrs[name] for name in ("trial", "values") if name in trial.user_attrs}
+        is_queued = any(other.user_attrs.get("instead_of") == trial.number for other in self._all())
+        if ("values" in facts or "fixed_params" in trial.system_attrs) and not is_queued:
+            # A process that died at once had drawn nothing, or not all, of what the queue had given it.
+            params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
+            self.study.enqueue_trial(params, user_attrs={**facts, "instead_of": trial.number})
+        self._fail(trial)
+
+    def _fail(self, trial: optuna.trial.FrozenTrial) -> None:
+        """Tell a trial as failed, since Optuna knows no other way to end one."""
+        self.study.tell(trial.number, state=self._optuna.trial.TrialState.FAIL)
 
     def _is_run(self, trial: optuna.trial.FrozenTrial) -> bool:
         return "trial" in trial.user_attrs and is_locked(self._lock(trial.user_attrs["trial"]))
@@ -317,6 +328,30 @@ class SharedStudy:
         with open(self.directory / ".lock", "a") as file:
             _lock(file)
             yield
+
+
+class _JournalLock:
+    """Optuna's lock of the journal, with which it appends. Whoever gets it cuts off a half-written line first.
+
+    A process leaves one that dies or whose disk is full, and the next line would be glued to it, whoever writes that:
+    from then on nobody could read the journal. Optuna takes every object with these two methods for a lock.
+    """
+
+    def __init__(self, journal: Path, lock: Any) -> None:
+        self._journal, self._lock = journal, lock
+
+    def acquire(self) -> bool:
+        self._lock.acquire()
+        try:
+            with open(self._journal, "ab+") as file:
+                drop_torn_line(file)
+        except BaseException:
+            self._lock.release()
+            raise
+        return True
+
+    def release(self) -> None:
+        self._lock.release()
 
 
 def import_optuna() -> Any:

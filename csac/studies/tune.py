@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.checks import check_whole
-from csac.record.run import RunDirectory, is_run
+from csac.record import manifest as manifests
+from csac.record.run import MANIFEST, RunDirectory, is_run
 from csac.record.statistics import evaluation_matrix, last_evaluations
 from csac.studies.cells import restarting_seeds
 from csac.studies.job import Stopped
 from csac.studies.shared_study import POINTS
 from csac.tasks.seeds import TUNING_EVALUATION_SEED
+from csac.training.checkpoint import FOLDER, steps_in
 from csac.training.interruptions import signals_noted
 from csac.types import InputError
 
@@ -134,21 +136,37 @@ def _run(study: SharedStudy, attempt: Attempt, watcher: Watcher, options: dict[s
 def _points_before(path: Path) -> dict[int, dict[int, float]]:
     """Return each seed's return at each evaluation up to the checkpoint that a trial goes on from.
 
-    A trial that has no checkpoint yet begins anew.
+    A trial that has no checkpoint yet begins anew. One that has is left as it is: `train` restores a damaged table, of
+    which nothing is known until then, and refuses a manifest that it cannot use.
     """
     if not is_run(path):
         return {}
+    if _begins_anew(path):
+        shutil.rmtree(path)
+        return {}
     with suppress(InputError):
         run = RunDirectory.open(path)
-        if run.manifest.last_checkpoint:
-            steps, seeds, returns = evaluation_matrix(run.evaluations)
-            return {
-                step: dict(zip(seeds.tolist(), column.tolist(), strict=True))
-                for step, column in zip(steps.tolist(), returns.T, strict=True)
-                if step <= run.manifest.last_checkpoint
-            }
-    shutil.rmtree(path)
+        # A process that dies after a checkpoint may not have told the manifest of it.
+        newest = max(steps_in(run.checkpoints), default=run.manifest.last_checkpoint)
+        steps, seeds, returns = evaluation_matrix(run.evaluations)
+        return {
+            step: dict(zip(seeds.tolist(), column.tolist(), strict=True))
+            for step, column in zip(steps.tolist(), returns.T, strict=True)
+            if step <= newest
+        }
     return {}
+
+
+def _begins_anew(path: Path) -> bool:
+    """Whether a run surely has no checkpoint: a manifest may be unreadable for a moment only, or of a newer csac."""
+    if steps_in(path / FOLDER):
+        return False
+    try:
+        return not manifests.read((path / MANIFEST).read_bytes()).last_checkpoint
+    except (OSError, manifests.NewerError):
+        return False
+    except InputError:  # half-written, since the machine lost power
+        return True
 
 
 def _objective(points: Mapping[int, Mapping[int, float]], step: int) -> float:

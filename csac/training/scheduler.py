@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from csac.evaluation.evaluator import EPISODES_AT_ONCE
-from csac.processes import Child, core_quota, die_with_parent, move_to, usable_cores
+from csac.processes import Child, core_quota, die_with_parent, end, move_to, outlive_termination, usable_cores
 from csac.training.checkpoint import remove_unfinished
 from csac.training.devices import preallocates
 from csac.training.group import Group
@@ -50,6 +50,9 @@ LONGEST_LEAD = 1_000
 
 # A checkpoint is made at least this often, whatever the interval in steps.
 SECONDS_BETWEEN_CHECKPOINTS = 600.0
+
+# What a group has to close its environments, after the processes that evaluate for it have had their own moment.
+SECONDS_TO_CLOSE = 5.0
 
 
 def split_seeds(seeds: Sequence[int], groups: int) -> list[list[int]]:
@@ -214,9 +217,11 @@ class _Scheduler:
             self._hand_out()
 
     def kill(self) -> None:
-        """End every process."""
+        """End every process: at once what still trains, and what is over once its environments are closed."""
         for worker in self.workers:
-            worker.kill()
+            if not worker.over:
+                worker.kill()
+        end([worker for worker in self.workers if worker.over], SECONDS_TO_CLOSE)
 
     def _receive(self, index: int, worker: _Worker) -> Message:
         message: Message | None = None
@@ -343,6 +348,7 @@ def _not_waited_for(late: Sequence[_Worker], furthest: int, newest: int | None) 
 def _work(connection: Connection, settings: Settings, seeds: list[int]) -> None:
     """Train one group in a process of its own, one turn at a time."""
     die_with_parent()
+    outlive_termination()
     cores, turns = usable_cores(), _Turns(connection)
     try:
         turns.take(None)

@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+import socket
 import tempfile
 from dataclasses import replace
 from datetime import datetime
@@ -269,6 +270,29 @@ def test_a_look_whether_a_run_is_locked_keeps_nobody_from_locking_it(run, monkey
         monkeypatch.setattr(record.time, "sleep", lambda _: look.close())
         with run.locked():
             assert record.is_locked(run.path / record.LOCK)
+
+
+@pytest.mark.skipif(record.fcntl is None, reason="a system with locks")
+@pytest.mark.filterwarnings("ignore:os.fork")  # JAX has threads
+def test_a_child_that_was_forked_keeps_no_lock(run):
+    """A task's helper outlives a run that is killed, and nobody could take that run up."""
+    ours, theirs = socket.socketpair()
+    with run.locked():
+        child = os.fork()
+        if not child:
+            ours.close()
+            theirs.send(b"there")
+            theirs.recv(1)  # until the test is over
+            os._exit(0)
+        theirs.close()
+        assert ours.recv(5) == b"there"
+        assert record.is_locked(run.path / record.LOCK), "it is still this process's"
+    try:
+        with run.locked():
+            assert os.waitpid(child, os.WNOHANG) == (0, 0)
+    finally:
+        ours.close()
+        os.waitpid(child, 0)
 
 
 @pytest.fixture

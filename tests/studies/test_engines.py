@@ -3,6 +3,7 @@ import signal
 from contextlib import nullcontext
 
 import pytest
+from helped import ends_of
 from resuming import Crash, contents
 from studying import cell, jobs
 
@@ -165,6 +166,17 @@ def test_processes_run_cells_side_by_side_and_outlive_one_that_dies(tmp_path):
     }
     assert "killed by SIGKILL" in Store(tmp_path).status(deadly).reason
     assert {type(message) for message in messages[:2]} == {Started}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+def test_a_task_may_have_processes_in_a_process_that_runs_a_cell(tmp_path):
+    """It could where cells are run one after another; a daemon may start none."""
+    (tmp_path / "ends").mkdir()
+    arguments = {"folder": str(tmp_path / "ends"), "forks": False}
+    (job,), messages = jobs(tmp_path / "study", cell(0, "helped:Helped-v0", environment_arguments=arguments)), []
+    run_in_processes([job], messages.append, workers=1)
+    assert outcomes(messages) == {job.cell.key: "complete"}
+    assert ends_of(tmp_path / "ends") == (1, {"-15 -15"})
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import numpy as np
 import plans
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
+from helped import Helped, ends_of
 from resuming import SMALL, run
 
 from csac.algorithms import CSAC, SAC
@@ -137,6 +138,7 @@ class SlowWorkers:
 
         monkeypatch.setattr(scheduler_module, "time", clock)
         monkeypatch.setattr(scheduler_module, "_Worker", Worker)
+        monkeypatch.setattr(scheduler_module, "end", lambda workers, _: None)
         monkeypatch.setattr(scheduler_module, "usable_cores", lambda: [0, 1])
         monkeypatch.setattr(
             scheduler_module, "wait", lambda all_of_them, timeout: [w for w in all_of_them if w.answers]
@@ -235,13 +237,32 @@ def test_a_run_in_one_process_is_saved_every_ten_minutes_and_at_its_end(tmp_path
     assert [message.step for message in told if isinstance(message, Saved)] == [500, 1_000, 1_100]
 
 
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+@pytest.mark.filterwarnings("ignore:os.fork")  # JAX has threads
+def test_the_environments_of_every_process_are_closed(tmp_path):
+    """Their simulators, which take a signal to end, went on for ever; or training did, where it waited for them."""
+    (tmp_path / "ends").mkdir()
+    settings: dict[str, Any] = {
+        "seeds": 2,
+        "groups": 2,
+        "evaluation_processes": 1,
+        "evaluation_interval": 100,
+        "environment_arguments": {"folder": str(tmp_path / "ends")},
+    }
+    finished = run(tmp_path / "run", SAC(**SMALL), 100, Helped, **settings)
+    assert (finished.manifest.state, finished.manifest.failures) == ("finished", {})
+    processes, ends = ends_of(tmp_path / "ends")
+    assert processes >= 4  # and this one may have looked at the task
+    assert ends == {"-15 -15"}
+
+
 # Workers that cannot go on.
 
 
 def worked(monkeypatch: pytest.MonkeyPatch, folder: Path, group: Any, *orders: Any) -> list[Any]:
     """Return what a worker with this group says to its first turn and these orders."""
     monkeypatch.setattr(scheduler_module, "Group", group)
-    for of_a_process_of_its_own in ("die_with_parent", "move_to"):
+    for of_a_process_of_its_own in ("die_with_parent", "outlive_termination", "move_to"):
         monkeypatch.setattr(scheduler_module, of_a_process_of_its_own, lambda *_: None)
     settings = plans.settings(CSAC(), "Hopper-v4", 900, folder, checkpoint_interval=100)
     ours, theirs = multiprocessing.Pipe()
