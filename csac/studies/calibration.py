@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from csac.processes import Child, die_with_parent, move_to, usable_cores
+from csac.processes import Child, die_with_parent, end, move_to, outlive_termination, usable_cores
 from csac.record.atomic import write_atomically
 
 if TYPE_CHECKING:
@@ -88,13 +88,13 @@ class Calibration:
     def measure(self, cell: Cell) -> Cost:
         """Measure a cell in a process on one core, and remember it for its kind. Raises RuntimeError where it fails."""
         busy = os.getloadavg()[0] >= len(usable_cores())
-        child = Child(_work, usable_cores()[:1], pickle.dumps(cell), daemon=True)
+        child = Child(_work, usable_cores()[:1], pickle.dumps(cell), daemon=False)
         try:
             outcome = child.connection.recv()
         except EOFError:
             outcome = child.cause_of_death()
         finally:
-            child.kill()
+            end([child])
         if isinstance(outcome, str):
             raise RuntimeError(outcome)
         self._known[_kind(cell)] = list(outcome)
@@ -109,6 +109,7 @@ class Calibration:
 
 def _work(connection: Connection, cores: Sequence[int], packed: bytes) -> None:
     die_with_parent()
+    outlive_termination()
     move_to(cores)
     try:
         connection.send(_measure(pickle.loads(packed)))

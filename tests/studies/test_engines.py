@@ -8,7 +8,7 @@ from resuming import Crash, contents
 from studying import cell, jobs
 
 from csac.record.run import RunDirectory
-from csac.studies import engines
+from csac.studies import calibration, engines
 from csac.studies.cells import Cell, Store, is_final
 from csac.studies.engines import run_here, run_in_processes, split_cores
 from csac.studies.job import Advanced, Ended, Noted, Started, Stopped
@@ -176,6 +176,15 @@ def test_a_task_may_have_processes_in_a_process_that_runs_a_cell(tmp_path):
     (job,), messages = jobs(tmp_path / "study", cell(0, "helped:Helped-v0", environment_arguments=arguments)), []
     run_in_processes([job], messages.append, workers=1)
     assert outcomes(messages) == {job.cell.key: "complete"}
+    assert ends_of(tmp_path / "ends") == (1, {"-15 -15"})
+
+
+def test_what_a_cell_costs_is_measured_with_the_processes_of_its_task(tmp_path, monkeypatch):
+    monkeypatch.setattr(calibration, "_home", lambda: tmp_path / "home")
+    (tmp_path / "ends").mkdir()
+    arguments = {"folder": str(tmp_path / "ends"), "forks": False}
+    cost = calibration.Calibration().measure(cell(0, "helped:Helped-v0", environment_arguments=arguments))
+    assert cost.longest_episode == 1
     assert ends_of(tmp_path / "ends") == (1, {"-15 -15"})
 
 
