@@ -128,8 +128,8 @@ _forking = threading.local()
 
 
 def _hold_back() -> None:
-    """Have a signal wait that a child is sent at once, while its handler is still its parent's."""
-    _forking.mask = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
+    """Have a SIGTERM wait that a child is sent at once, while its handler is still its parent's."""
+    _forking.mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 
 
 def _let_through() -> None:

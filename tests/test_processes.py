@@ -97,7 +97,7 @@ def end_what_a_task_starts(connection: Connection) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
-def test_a_worker_outlives_what_ends_what_its_task_starts(monkeypatch):
+def test_a_worker_outlives_what_ends_what_its_task_starts():
     """They were blocked, and so in the task's simulator too: to end it was to wait for it for ever."""
     worker = Child(end_what_a_task_starts, daemon=False)
     assert worker.connection.recv() == [-signal.SIGTERM, -signal.SIGTERM]

@@ -7,7 +7,6 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import jax
-from jax._src import xla_bridge
 
 from csac.types import InputError
 
@@ -46,7 +45,7 @@ def choose_device(device: str) -> None:
         raise InputError(f"csac's keys are of JAX's {PRNG}: unset JAX_DEFAULT_PRNG_IMPL (jax_default_prng_impl)")
     before = config.jax_platforms, {name: os.environ.get(name) for name in (FLAGS, PREALLOCATE)}
     jax.config.update("jax_platforms", PLATFORMS[device])
-    is_late = _has_looked_for_devices()
+    is_late = device == "gpu" and _has_looked_for_devices()
     if device == "gpu" and not is_late:
         os.environ[FLAGS] = with_exact_kernels(os.environ.get(FLAGS, ""))
         os.environ[PREALLOCATE] = os.environ.get(PREALLOCATE) or "false"
@@ -101,6 +100,8 @@ def preallocates() -> bool:
 
 def _has_looked_for_devices() -> bool:
     """Whether JAX has, after which it reads no variable of the GPU. It has no public function that tells."""
+    from jax._src import xla_bridge  # here, so that nothing on a CPU depends on what is not public
+
     return xla_bridge.backends_are_initialized()
 
 

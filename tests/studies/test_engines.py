@@ -179,6 +179,7 @@ def test_a_task_may_have_processes_in_a_process_that_runs_a_cell(tmp_path):
     assert ends_of(tmp_path / "ends") == (1, {"-15 -15"})
 
 
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_what_a_cell_costs_is_measured_with_the_processes_of_its_task(tmp_path, monkeypatch):
     monkeypatch.setattr(calibration, "_home", lambda: tmp_path / "home")
     (tmp_path / "ends").mkdir()
