@@ -1,88 +1,66 @@
-"""TensorBoard files of a run: one sub-directory per seed, with the tags of `scalars`."""
+"""TensorBoard files of a run, from rows of its tables, with Stable-Baselines3's tags."""
 
 from __future__ import annotations
 
 import time
+from collections import defaultdict, deque
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import Event as TensorBoardEvent  # pyright: ignore[reportAttributeAccessIssue]
-from tensorboardX.proto.event_pb2 import SessionLog  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
-from csac.record.scalars import Scalars
+from csac.record.statistics import is_case, mean_over_episodes
+from csac.record.tables import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from csac.record.scalars import Tables
+    from csac.record.run import Table
 
+    Row = Mapping[str, Any]
+
+EPISODES_AVERAGED = 100  # as Stable-Baselines3's rollout/ep_rew_mean
 FLUSH_SECONDS = 30
 
 
 class TensorBoardLog:
-    """Writes the curves of a run that goes on from step `begin`, after the rows `before`, to `path/seed_<k>`.
+    """Writes the curves of a run that goes on from step `begin`, after the training episodes `before`.
 
-    Whatever writes raises OSError where the disk is full.
+    `rollout/*` are means over the last 100 training episodes, `eval/*` over the episodes of one evaluation, `train/*`
+    the metrics, `time/fps` environment steps per second since the log was opened. Not tensorboardX's own writer: its
+    thread dies of a full disk, and whoever adds to its queue then waits for ever.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        seeds: Sequence[int],
-        begin: int = 0,
-        before: Tables | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._files = {seed: _SeedFile(path / f"seed_{seed}", begin) for seed in seeds}
-        self._scalars = Scalars(seeds, begin, before, clock)
-
-    def write(self, tables: Tables) -> Sequence[str]:
-        """Write the points of these rows, by table."""
-        for seed, step, values in self._scalars.points(tables):
-            for tag, value in values.items():
-                record = TensorBoardEvent(step=step, summary=Summary(value=[_value(tag, value)]))
-                self._files[seed].add(record)
-        return ()
-
-    def flush(self) -> None:
-        """Have everything in the files: what comes before a checkpoint is not made again after a crash."""
-        for file in self._files.values():
-            file.flush()
-
-    def close(self) -> Sequence[str]:
-        """Write what still waits and close the files. May be called again."""
-        for file in self._files.values():
-            file.close()
-        return ()
-
-
-class _SeedFile:
-    """One seed's file.
-
-    Not tensorboardX's own writer: its thread dies of a full disk, and whoever adds to its queue then waits for ever.
-    """
-
-    def __init__(self, folder: Path, begin: int) -> None:
+    def __init__(self, folder: Path, begin: int = 0, before: Sequence[Row] = ()) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         has_earlier = any(folder.glob("events.*"))
         self._writer: EventsWriter | None = EventsWriter(str(folder / "events"))
-        self._flushed = time.monotonic()
+        self._begin, self._began = begin, time.monotonic()
+        self._flushed = self._began
+        recent = [(row["return"], row["length"]) for row in before]
+        self._recent: deque[tuple[float, int]] = deque(recent, maxlen=EPISODES_AVERAGED)
+        self._cases: set[str] = set()  # events that happen or do not: where nobody speaks of one, it did not
         if begin or has_earlier:  # TensorBoard drops what was written after the step that the run goes on from
-            self.add(TensorBoardEvent(step=begin + 1, session_log=SessionLog(status=SessionLog.START)))
+            self._add(Event(step=begin + 1, session_log=SessionLog(status=SessionLog.START)))
 
-    def add(self, record: TensorBoardEvent) -> None:
-        assert self._writer
-        record.wall_time = time.time()
-        self._writer.write_event(record)
-        if time.monotonic() - self._flushed >= FLUSH_SECONDS:
-            self.flush()
+    def write(self, table: Table, rows: Sequence[Row]) -> None:
+        """Write the points of these rows. Raises OSError."""
+        steps: dict[int, list[Row]] = defaultdict(list)
+        for row in rows:
+            steps[row["step"]].append(row)
+        scalars = {"episodes": self._episodes, "metrics": self._metrics, "evaluations": self._evaluations}[table]
+        for step, rows_of_step in steps.items():
+            values = [Summary.Value(tag=tag, simple_value=value) for tag, value in scalars(rows_of_step).items()]
+            self._add(Event(step=step, summary=Summary(value=values)))
 
     def flush(self) -> None:
-        assert self._writer
-        self._writer.flush()
+        """Have everything in the file. Raises OSError."""
+        if self._writer:
+            self._writer.flush()
         self._flushed = time.monotonic()
 
     def close(self) -> None:
@@ -92,6 +70,35 @@ class _SeedFile:
             with suppress(OSError):
                 writer.close()
 
+    def _add(self, event: Event) -> None:
+        assert self._writer
+        event.wall_time = time.time()
+        self._writer.write_event(event)
+        if time.monotonic() - self._flushed >= FLUSH_SECONDS:
+            self.flush()
 
-def _value(tag: str, value: float) -> Summary.Value:
-    return Summary.Value(tag=tag, simple_value=value)
+    def _episodes(self, rows: Sequence[Row]) -> dict[str, float]:
+        self._recent.extend((row["return"], row["length"]) for row in rows)
+        returns, lengths = np.array(self._recent).T
+        return {"rollout/ep_rew_mean": float(returns.mean()), "rollout/ep_len_mean": float(lengths.mean())}
+
+    def _metrics(self, rows: Sequence[Row]) -> dict[str, float]:
+        row, elapsed = rows[-1], time.monotonic() - self._began
+        values = {f"train/{name}": float(value) for name, value in row.items() if name not in COLUMNS["metrics"]}
+        return {**values, "time/fps": (row["step"] - self._begin) / max(elapsed, 1e-9)}
+
+    def _evaluations(self, rows: Sequence[Row]) -> dict[str, float]:
+        values = {
+            "eval/mean_reward": float(np.mean([row["return"] for row in rows])),
+            "eval/mean_ep_length": float(np.mean([row["length"] for row in rows])),
+        }
+        for name in ("success", *(name for name in rows[0] if name not in COLUMNS["evaluations"])):
+            told = np.array([row.get(name) for row in rows], float)
+            if is_case(told):
+                self._cases.add(name)
+            elif not np.isnan(told).all():
+                self._cases.discard(name)
+            mean = mean_over_episodes(told, name in self._cases)
+            if not np.isnan(mean):
+                values["eval/success_rate" if name == "success" else f"eval/{name}"] = mean
+        return values

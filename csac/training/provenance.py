@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from csac import __version__
-from csac.processes import usable_cores
 from csac.record.manifest import Machine
 from csac.tasks.known import adapter_of
 from csac.training.devices import in_use
@@ -19,9 +18,9 @@ if TYPE_CHECKING:
     from csac.tasks.making import Task
 
 
-def provenance(task: Task, command: str | None) -> dict[str, Any]:
+def provenance(task: Task, command: str | None, threads: int) -> dict[str, Any]:
     """Return these fields of a manifest, of a process whose device has been chosen."""
-    machine = Machine(_processor(), len(usable_cores()), platform.node(), **in_use())
+    machine = Machine(_processor(), threads, platform.node(), **in_use())
     return {
         "machine": machine,
         "versions": _versions(task, on_gpu=bool(machine.gpu)),

@@ -1,334 +1,257 @@
-"""Resuming a run or forking another from its checkpoint: what is refused, what may change, what is rolled back."""
+"""Resuming a run or starting one from another's checkpoint: what is refused, what may change, what is rolled back."""
 
 from __future__ import annotations
 
 import os
 import re
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from csac.record.manifest import OTHER_TASK, Continuation, Origin, differences
-from csac.record.run import RunDirectory, Table, now
+from csac.record.config import differences
+from csac.record.files import write_atomically
+from csac.record.manifest import Continuation, Manifest, Origin
+from csac.record.run import TABLES, RunDirectory, now
+from csac.record.sets import RunSet
 from csac.tasks.perturbations import continued, perturbations_of
-from csac.training.checkpoint import Checkpoint, Checkpoints, newest_sound, sound_at, steps_in, taken_back
-from csac.training.restore import copy, restore
-from csac.types import InputError, Snapshot
+from csac.training.checkpoint import REPLAY, Checkpoint, Damaged, newest_sound, prune, steps_in, write_folder
+from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Sequence
 
-    from csac.record.manifest import Manifest
-    from csac.tasks.perturbations import Perturbation
+    from csac.record.config import RunConfig
 
-# What a run cannot change: with any other value it would be another run.
-_FIXED = (
-    "task",
-    "environment_arguments",
-    "perturbations",
-    "algorithm",
-    "hyperparameters",
-    "seeds",
-    "evaluation",
-    "events",
-)
+# What may differ when a run goes on; with any other value it would be another run.
+_MAY_DIFFER = ("steps", "device", "checkpoint_interval", "keep_checkpoints")
 
 
-class Restart(NamedTuple):
-    """Where a run goes on: the step of its checkpoint (0 is its beginning), and who had failed by then."""
+class ResumePoint(NamedTuple):
+    """Where a run goes on: its checkpoint, None for its beginning, and what the user should know of it."""
 
-    step: int
-    failures: dict[int, str]
-    complaints: list[str]  # what was wrong with newer checkpoints, and what was mended
-    pinned: list[int]  # steps of checkpoints to keep for good
-    groups: Sequence[Sequence[int]] = ()  # the seeds that each process had trained together by then
+    checkpoint: Checkpoint | None
+    notes: list[str]
 
-    def parts(self, groups: Sequence[Sequence[int]]) -> list[list[int]]:
-        """Return what is left of these groups to be trained, without the seeds that had failed.
-
-        A group that is as it was keeps them: they are at rest in its files, and the numbers of the others depend on
-        them at rounding level.
-        """
-        parts = []
-        for group in map(list, groups):
-            living = [seed for seed in group if seed not in self.failures]
-            if living:
-                parts.append(group if group in self.groups else living)
-        return parts
-
-    def notes(self, before: Manifest, now: Manifest) -> list[str]:
-        """Return what the user should know of this continuation, a line each."""
-        lines = [f"warning: {complaint}" for complaint in self.complaints]
-        lines.append(f"going on from step {self.step:,}" if self.step else "no checkpoint yet: it begins anew")
-        if changes := _machine_changes(before, now):
-            lines.append(f"note: not the same to the last bit from here on, because {' and '.join(changes)}")
-        if before.inexact_seeds:
-            several = "s" * (len(before.inexact_seeds) > 1)
-            seeds = f"seed{several} {', '.join(map(str, before.inexact_seeds))} restart{'' if several else 's'}"
-            lines.append(f"note: {seeds} the episode in progress, which the checkpoint could not hold")
-        return lines
-
-    def continuation(self, before: Manifest, wanted: Manifest) -> Continuation:
-        """Return what the manifest remembers of this."""
-        exact = not (_machine_changes(before, wanted) or before.inexact_seeds)
-        previous = {
-            "steps": before.steps,
-            "machine": vars(before.machine),
-            "versions": before.versions,
-            "commit": before.commit,
-            "groups": before.groups,
-        }
-        return Continuation(now(), self.step, exact, tuple(self.complaints), wanted.command, previous)
+    @property
+    def step(self) -> int:
+        """The step of the checkpoint; 0 is the beginning."""
+        return self.checkpoint.step if self.checkpoint else 0
 
 
-BEGINNING = Restart(0, {}, [], [])
-
-
-def refuse_differences(run: RunDirectory, wanted: Manifest, has_schedule: bool, defaults: Mapping[str, Any]) -> None:
-    """Raise InputError, with what differs, where `wanted` is not a continuation of `run`.
-
-    `defaults` are those of the hyperparameters: what a run did that was made before there was one of them.
-    """
-    made, asked = _fixed(run.manifest, defaults), _fixed(wanted, defaults)
-    if made["algorithm"] != asked["algorithm"]:  # whose hyperparameters are others
-        made, asked = ({"algorithm": each["algorithm"]} for each in (made, asked))
+def refuse_differences(run: RunDirectory, wanted: RunConfig, has_schedule: bool) -> None:
+    """Raise InputError, with what differs, where `wanted` is not a continuation of `run`."""
+    before = run.config
+    made, asked = _fixed(before), _fixed(wanted)
+    if before.algorithm != wanted.algorithm:  # whose hyperparameters are others
+        made, asked = {"algorithm": before.algorithm}, {"algorithm": wanted.algorithm}
     if found := differences(made, asked):
-        advice = f"Choose another directory; 'csac resume {run.path}' goes on as it was"
-        raise InputError(f"{run.path} was trained otherwise: {'; '.join(found)}. {advice}")
-    before = run.manifest.steps
-    if wanted.steps < before:
-        raise InputError(
-            f"{run.path} is a run of {before:,} steps, which {wanted.steps:,} would shorten: give at least as many"
-        )
-    if wanted.steps > before and has_schedule:
-        raise InputError(
-            f"{run.path} cannot go on beyond its {before:,} steps: its learning rate was planned for them (a schedule)"
-        )
+        advice = f"choose another directory, or resume it as it was: csac resume {run.path}"
+        raise InputError(f"config differs from the saved run {run.path}: {'; '.join(found)}; {advice}")
+    if wanted.steps < before.steps:
+        raise InputError(f"{run.path} is a run of {before.steps:,} steps: steps={wanted.steps:,} would shorten it")
+    if wanted.steps > before.steps and has_schedule:
+        raise InputError(f"{run.path} cannot be extended beyond {before.steps:,} steps: its learning rate has a schedule")
 
 
-def planned_perturbations(
-    given: str | Perturbation | Iterable[str | Perturbation] | None,
-    existing: RunDirectory | None,
-    source: Source | None,
-) -> tuple[Perturbation, ...]:
-    """Return the perturbations of a run together with those that it was forked after.
-
-    Args:
-        given: those asked for now; None for those that were planned where it goes on or begins.
-        existing: the run that goes on, if there is one.
-        source: where a new run begins, if not anew.
+def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
+    """Bring runs that share a program back to their newest common sound checkpoint, or to their beginning.
 
     Raises:
-        InputError: one of those asked for cannot be, or lies before the step where the run was or is forked.
+        InputError: no checkpoint is sound, or there are results and no checkpoint to go on from.
     """
-    asked = perturbations_of(() if given is None else given)
-    if existing:
-        origin = existing.manifest.forked_from
-        before, begin = existing.manifest, origin.step if origin else 0
-    elif source:
-        before, begin = source.run.manifest, source.checkpoint.step
-    else:
-        return asked
-    planned = perturbations_of(before.perturbations)
-    return planned if given is None else continued(planned, asked, begin)
+    for run in runs:
+        _remove_unfinished(run)
+    points = [_find(run, None) for run in runs]
+    while len({point.step for point in points}) > 1:
+        until = min(point.step for point in points)
+        points = [_find(run, until) if point.step > until else point for run, point in zip(runs, points, strict=True)]
+    return [ResumePoint(point.checkpoint, point.notes + _restore(run, point)) for run, point in zip(runs, points, strict=True)]
 
 
-def roll_back(run: RunDirectory) -> Restart:
-    """Bring a run's files back to its newest sound checkpoint, or to its beginning, and say where that is.
-
-    Raises:
-        InputError: rows are missing that the checkpoint counts on, all its checkpoints are damaged, or it has rows
-            and no checkpoint, so that going on would be to begin anew.
-    """
-    checkpoint, complaints = newest_sound(run.checkpoints)
+def _find(run: RunDirectory, until: int | None) -> ResumePoint:
+    checkpoint, complaints = newest_sound(run.checkpoints, until)
     if checkpoint is None and complaints:
-        advice = "restore one from a copy, or train in another directory"
-        raise InputError(f"no checkpoint of {run.path} is sound ({'; '.join(complaints)}): {advice}")
+        raise InputError(f"no checkpoint of {run.path} is sound ({'; '.join(complaints)}): restore one, or train anew")
     if checkpoint is None and run.manifest.forked_from:
-        raise InputError(
-            f"{run.path} was stopped before its first checkpoint: repeat its command, --from included, with --resume"
-        )
-    if checkpoint is None and _would_lose_results(run):
-        raise InputError(
-            f"{run.path} has results and no checkpoint to go on from, and would begin anew: train in another directory"
-        )
-    complaints = [f"{complaint}; an earlier checkpoint is used" for complaint in complaints]
-    complaints += restore(run.path, checkpoint)
-    for unfinished in [*run.path.glob(".*.*"), *run.path.glob("policy/.*.*")]:
-        if not unfinished.is_dir():
-            unfinished.unlink()
-    if checkpoint is None:
-        Checkpoints(run.checkpoints, run.manifest.checkpoints.keep).discard_after(0)  # what a first one left unfinished
-        return BEGINNING
-    step, pinned = checkpoint.step, checkpoint.values["pinned"]
-    Checkpoints(run.checkpoints, run.manifest.checkpoints.keep, pinned).discard_after(step)
-    failures = {int(seed): reason for seed, reason in checkpoint.values["failures"].items()}
-    return Restart(step, failures, complaints, pinned, checkpoint.values["groups"])
+        raise InputError(f"{run.path} was stopped before its first checkpoint: repeat its command in a new directory")
+    if checkpoint is None and not run.config.checkpoint_interval and any(len(run.rows(table)) for table in TABLES):
+        raise InputError(f"{run.path} has results and no checkpoint to go on from: train in another directory")
+    return ResumePoint(checkpoint, [f"warning: {text}; an earlier checkpoint is used" for text in complaints])
 
 
-class Source(NamedTuple):
-    """A checkpoint of a run that another run begins with."""
-
-    run: RunDirectory
-    checkpoint: Checkpoint
-
-    @classmethod
-    def find(cls, where: str | Path) -> Source:
-        """Return the checkpoint at `DIRECTORY` (its newest sound one) or `DIRECTORY@STEP`.
-
-        Raises:
-            InputError: no such run or checkpoint, or a damaged one.
-        """
-        name, at, step = str(where).rpartition("@")
-        if at and not os.path.exists(where):
-            run = RunDirectory.open(name)
-            if not _is_step(step):
-                raise InputError(f"{where}: {step!r} is not a step; write DIRECTORY@STEP")
-            return cls(run, sound_at(run.checkpoints, int(step)))
-        run = RunDirectory.open(where)
-        checkpoint, complaints = newest_sound(run.checkpoints)
-        if checkpoint is None:
-            raise InputError("; ".join(complaints) or f"{run.path} has no checkpoint yet")
-        return cls(run, checkpoint)
-
-    def refuse_misfit(
-        self,
-        wanted: Manifest,
-        has_schedule: bool,
-        defaults: Mapping[str, Any],
-        misfit: Callable[[Snapshot], str | None],
-    ) -> None:
-        """Raise InputError where the new run cannot begin with this checkpoint; `misfit` says why its arrays do not.
-
-        `defaults` are as in `refuse_differences`.
-        """
-        before = self.run.manifest
-        names = ("algorithm", "events")  # of whose tables the new run's are a continuation
-        found = differences({name: getattr(before, name) for name in names}, {n: getattr(wanted, n) for n in names})
-        missing = sorted(set(wanted.seeds) - set(before.seeds))
-        living = self._living(wanted)
-        if missing:
-            found.append(f"it has no seeds {', '.join(map(str, missing))}")
-        elif not living:
-            found.append(f"every seed asked for had failed by step {self.checkpoint.step}; begin with an earlier step")
-        if not found and _normalises(before, defaults) != _normalises(wanted, defaults):
-            found.append("its networks have learnt what they see with the other choice of normalise_observations")
-        if not found and has_schedule and wanted.steps != before.steps:
-            found.append(
-                f"it was planned for {before.steps:,} steps, and its learning rate with it (a schedule): give as many"
-            )
-        if not found:
-            with taken_back(self.checkpoint):
-                problem = misfit(self.checkpoint.seed(living[0]).part("learner"))
-                tasks = f" ({before.task}, and {wanted.task} now)" if before.task != wanted.task else ""
-                found += [problem + tasks] if problem else []
-        kept, size = (m.hyperparameters.get("replay_size", 0) for m in (before, wanted))
-        if kept < self.checkpoint.step and kept < size:
-            found.append(f"its replay kept {kept:,} transitions and no others, so replay_size cannot be {size:,}")
-        if found:
-            raise InputError(f"{self.run.path} does not fit: {'; '.join(found)}")
-        if wanted.steps <= self.checkpoint.step:
-            raise InputError(
-                f"steps counts from the beginning: give more than the {self.checkpoint.step:,} made already"
-            )
-
-    def described(self, wanted: Manifest, defaults: Mapping[str, Any]) -> Origin:
-        """Return what the manifest says of where the new run began, and of what is different in it."""
-        changes = differences(_fixed(self.run.manifest, defaults), _fixed(wanted, defaults))
-        origin, before = Origin(os.path.abspath(self.run.path), self.checkpoint.step, tuple(changes)), self.run.manifest
-        if before.forked_from and before.forked_from.step == origin.step and not origin.has_other_task:
-            # The checkpoint with which that run began: its episodes are those of the task before.
-            of_task = [text for text in before.forked_from.changes if text.startswith(OTHER_TASK)]
-            return replace(origin, changes=(*of_task, *changes))
-        return origin
-
-    def begun(self, wanted: Manifest, defaults: Mapping[str, Any]) -> Manifest:
-        """Return the manifest with which the new run is made: which seeds begin their episode anew is known by now."""
-        origin = self.described(wanted, defaults)
-        anew = self._living(wanted) if origin.has_other_task else self.run.manifest.inexact_seeds
-        inexact = tuple(seed for seed in wanted.seeds if seed in anew)
-        return replace(wanted, forked_from=origin, inexact_seeds=inexact)
-
-    def _living(self, wanted: Manifest) -> list[int]:
-        return [seed for seed in wanted.seeds if str(seed) not in self.checkpoint.values["failures"]]
-
-    def copy_to(self, run: RunDirectory, keep: int) -> None:
-        """Give a new run the tables up to the checkpoint, and the checkpoint."""
-        files = copy(self.checkpoint, run.path, run.manifest.seeds)
-        failures = self.checkpoint.values["failures"].items()
-        values = {**self.checkpoint.values, "failures": {k: v for k, v in failures if int(k) in run.manifest.seeds}}
-        if self.run.contract.exists():
-            run.contract.parent.mkdir(exist_ok=True)
-            shutil.copyfile(self.run.contract, run.contract)
-        Checkpoints(run.checkpoints, keep).commit(self.checkpoint.step, files, values)
+def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
+    """Bring tables and the best policy back to a checkpoint; return a line for each that was damaged."""
+    checkpoint, notes = point.checkpoint, []
+    if checkpoint:
+        prune(run.checkpoints, 0, newest=checkpoint.step)
+    for table in TABLES:
+        path = run.table(table)
+        if not checkpoint or path.name not in checkpoint.files:
+            path.unlink(missing_ok=True)
+        elif not _cut_back(path, content := checkpoint.read(path.name)):
+            write_atomically(path, content)
+            notes.append(f"warning: {path} had changed since the checkpoint; it is restored")
+    best = run.policy_file("best")
+    try:
+        if checkpoint and best.name in checkpoint.files:
+            run.policies.mkdir(exist_ok=True)
+            write_atomically(best, checkpoint.read(best.name))
+        else:
+            best.unlink(missing_ok=True)
+    except Damaged as error:
+        notes.append(f"warning: {error}; the best policy is one of later evaluations")
+        best.unlink(missing_ok=True)
+    return notes
 
 
-def refuse_other_source(run: RunDirectory, where: str | Path) -> None:
-    """Raise InputError where a run that goes on did not begin with `where`, which may have trained on or be gone."""
-    origin = run.manifest.forked_from
-    if origin is None:
-        raise InputError(f"{run.path} goes on and began with no other run: leave {where} out, or train elsewhere")
-    name, _, step = str(where).rpartition("@")
-    places = [where, *([name] if name and _is_step(step) and int(step) == origin.step else [])]
-    if Path(origin.directory).resolve() not in [Path(place).resolve() for place in places]:
-        began = f"{origin.directory}@{origin.step}"
-        raise InputError(f"{run.path} goes on and began with {began}: leave {where} out, or train elsewhere")
-
-
-def can_go_on(run: RunDirectory) -> bool:
-    """Whether there is a checkpoint to go on from, or nothing to lose where the run begins anew."""
-    return bool(steps_in(run.checkpoints)) or not (run.manifest.forked_from or _would_lose_results(run))
-
-
-def _would_lose_results(run: RunDirectory) -> bool:
-    """Whether a run without a checkpoint has rows that it would not make again by itself.
-
-    One that was killed before its first checkpoint was due makes the very same rows again, as a cluster's scheduler
-    expects that repeats its command.
-    """
-    manifest = run.manifest
-    was_killed_early = manifest.checkpoints.interval and not manifest.last_checkpoint
-    if was_killed_early and manifest.state not in ("finished", "failed"):
+def _cut_back(path: Path, content: bytes) -> bool:
+    """Cut off what a file has beyond `content`; return false where it does not begin so."""
+    try:
+        with open(path, "rb") as file:
+            is_sound = file.read(len(content)) == content
+    except OSError:
         return False
-    return any(len(run.rows(table)) for table in get_args(Table))
+    if is_sound:
+        os.truncate(path, len(content))
+    return is_sound
 
 
-def _fixed(manifest: Manifest, defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a run cannot change, by name; seeds and the like as lists, so that they compare with JSON's."""
-    fixed = {name: getattr(manifest, name) for name in _FIXED}
-    fixed["evaluation"] = vars(manifest.evaluation)
-    fixed["hyperparameters"] = {**defaults, **manifest.hyperparameters}
-    return fixed
+def _remove_unfinished(run: RunDirectory) -> None:
+    """Remove what a process was writing when it was killed."""
+    for path in [*run.path.glob(".*.*"), *run.policies.glob(".*"), *run.checkpoints.glob(".*"), *run.checkpoints.glob("replay/.*")]:
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
-def _is_step(text: str) -> bool:
-    return bool(text.isascii() and re.fullmatch(r"\d+(_\d+)*", text) and len(text) <= 20)
-
-
-def _normalises(manifest: Manifest, defaults: Mapping[str, Any]) -> bool:
-    """Whether the networks of a run see observations on a common scale. PPO has the statistics in any case."""
-    return bool({**defaults, **manifest.hyperparameters}.get("normalise_observations"))
-
-
-def _machine_changes(before: Manifest, wanted: Manifest) -> list[str]:
-    """Return what decides the last bits and is not what it was."""
-    pairs = {
-        "processor": (before.machine.processor, wanted.machine.processor),
-        "number of usable cores": (before.machine.cores, wanted.machine.cores),
-        "grouping of the seeds": ([list(group) for group in before.groups], [list(group) for group in wanted.groups]),
-        "device": (before.machine.gpu or before.device, wanted.machine.gpu or wanted.device),
+def continuation(manifest: Manifest, now_: Manifest, point: ResumePoint) -> tuple[Continuation, list[str]]:
+    """Return what the manifest remembers of a resume, and the lines for the user."""
+    changes = machine_changes(manifest, now_)
+    lines = [*point.notes, f"resuming at step {point.step:,}" if point.step else "no checkpoint yet: starting anew"]
+    if changes:
+        lines.append(f"note: not bit for bit the same from here on: {' and '.join(changes)}")
+    restarts = bool(point.step and manifest.restarts_episode)
+    if restarts:
+        lines.append("note: the episode in progress restarts: its environment cannot be saved")
+    exact = not (changes or restarts or any("transitions are lost" in note for note in point.notes))
+    previous = {
+        "steps": manifest.config.steps,
+        "machine": vars(manifest.machine),
+        "versions": manifest.versions,
+        "commit": manifest.commit,
     }
-    settings = {
-        "XLA_FLAGS": (before.machine.xla_flags, wanted.machine.xla_flags),
-        "precision of products": (before.machine.matmul_precision, wanted.machine.matmul_precision),
+    return Continuation(now(), point.step, exact, tuple(point.notes), now_.command, previous), lines
+
+
+def machine_changes(before: Manifest, current: Manifest) -> list[str]:
+    """Return what decides the last bits of a run and is not what it was."""
+    pairs: dict[str, tuple[Any, Any]] = {
+        "processor": (before.machine.processor, current.machine.processor),
+        "number of cores": (before.machine.cores, current.machine.cores),
+        "GPU": (before.machine.gpu, current.machine.gpu),
+        "XLA_FLAGS": (before.machine.xla_flags, current.machine.xla_flags),
+        "precision of products": (before.machine.matmul_precision, current.machine.matmul_precision),
+        "number of seeds in the program": (len(before.program), len(current.program)),
+        "commit of csac": (before.commit, current.commit),
     }
-    pairs |= {name: tuple(map(_or_none, pair)) for name, pair in settings.items() if None not in pair}
-    for package in sorted(before.versions.keys() | wanted.versions.keys()):
-        pairs[f"version of {package}"] = (before.versions.get(package), wanted.versions.get(package))
-    pairs["commit of csac"] = (before.commit, wanted.commit)
+    for package in sorted(before.versions.keys() | current.versions.keys()):
+        pairs[f"version of {package}"] = (before.versions.get(package), current.versions.get(package))
     return [f"the {name} was {old} and is {new}" for name, (old, new) in pairs.items() if old != new]
 
 
-def _or_none(setting: str | None) -> str:
-    return setting or "not set"
+class Source(NamedTuple):
+    """Checkpoints, all of one step, that new runs begin with: one for each seed."""
+
+    path: Path
+    runs: dict[int, RunDirectory]
+    checkpoints: dict[int, Checkpoint]
+
+    @classmethod
+    def find(cls, where: str | Path, seeds: Sequence[int]) -> Source:
+        """Return the checkpoints at `DIRECTORY` (the newest) or `DIRECTORY@STEP`, of a set or of one run.
+
+        Raises:
+            InputError: no such run, seed or checkpoint, or a damaged one.
+        """
+        name, at, text = str(where).rpartition("@")
+        has_step = bool(at) and not os.path.exists(where)
+        if has_step and not re.fullmatch(r"[0-9][0-9_]*", text):
+            raise InputError(f"{where}: {text!r} is not a step; write DIRECTORY@STEP")
+        found = RunSet.open(name if has_step else where)
+        runs = {seed: found.run(seed) for seed in seeds}
+        step = int(text) if has_step else min(max(steps_in(run.checkpoints), default=0) for run in runs.values())
+        checkpoints = {}
+        for seed, run in runs.items():
+            checkpoint, complaints = newest_sound(run.checkpoints, step)
+            if checkpoint is None or checkpoint.step != step:
+                known = ", ".join(map(str, steps_in(run.checkpoints))) or "none"
+                raise InputError("; ".join(complaints) or f"{run.path} has no checkpoint of step {step}; it has {known}")
+            checkpoints[seed] = checkpoint
+        return cls(found.path, runs, checkpoints)
+
+    @property
+    def step(self) -> int:
+        """The step of the checkpoints."""
+        return next(iter(self.checkpoints.values())).step
+
+    def perturbations(self, seed: int, given: Any) -> tuple[str, ...]:
+        """Return those of the run before the checkpoint and those `given`; with None those that it had planned."""
+        planned = perturbations_of(self.runs[seed].config.perturbations)
+        return tuple(map(str, planned if given is None else continued(planned, perturbations_of(given), self.step)))
+
+    def refuse_misfit(self, wanted: RunConfig, has_schedule: bool) -> None:
+        """Raise InputError where a new run of this configuration cannot begin with its checkpoint."""
+        before = self.runs[wanted.seed].config
+        if before.algorithm != wanted.algorithm:
+            raise InputError(f"{self.path} does not fit: its algorithm is {before.algorithm}, not {wanted.algorithm}")
+        found = [] if before.events == wanted.events else [f"its events are {list(before.events)}"]
+        old, new = before.hyperparameters, wanted.hyperparameters
+        if old.get("normalise_observations") != new.get("normalise_observations"):
+            found.append("its networks have learnt with the other choice of normalise_observations")
+        if has_schedule and wanted.steps != before.steps:
+            found.append(f"its learning rate has a schedule over {before.steps:,} steps: give as many")
+        kept, size = old.get("replay_size", 0), new.get("replay_size", 0)
+        if kept < self.step and kept < size:
+            found.append(f"its replay kept {kept:,} transitions: replay_size cannot be {size:,}")
+        if found:
+            raise InputError(f"{self.path} does not fit: {'; '.join(found)}")
+        if wanted.steps <= self.step:
+            raise InputError(f"steps counts from the beginning: give more than the {self.step:,} made already")
+
+    def begun(self, manifest: Manifest) -> Manifest:
+        """Return the manifest with which a new run begins."""
+        before = self.runs[manifest.config.seed]
+        changes = tuple(differences(_fixed(before.config), _fixed(manifest.config)))
+        origin = Origin(str(before.path), self.step, changes)
+        restarts = before.manifest.restarts_episode or origin.changed("task ")
+        return replace(manifest, forked_from=origin, restarts_episode=restarts)
+
+    def copy_to(self, run: RunDirectory) -> None:
+        """Give a new run the tables and the checkpoint; transitions get a second name where the disk can."""
+        checkpoint = self.checkpoints[run.seed]
+        (run.checkpoints / REPLAY).mkdir(parents=True, exist_ok=True)
+        own: dict[str, bytes] = {}
+        for name in checkpoint.files:
+            if name.startswith(f"{REPLAY}/"):
+                if not _link(checkpoint.folder / name, run.checkpoints / name):
+                    write_atomically(run.checkpoints / name, checkpoint.read(name))
+                continue
+            own[name] = checkpoint.read(name)
+            if name.endswith(".csv"):
+                write_atomically(run.path / name, own[name])
+        folder = checkpoint.folder / f"step_{checkpoint.step}"
+        own["checkpoint.json"] = (folder / "checkpoint.json").read_bytes()
+        write_folder(run.checkpoints / folder.name, own)
+
+
+def _fixed(config: RunConfig) -> dict[str, Any]:
+    return {name: value for name, value in asdict(config).items() if name not in _MAY_DIFFER}
+
+
+def _link(source: Path, target: Path) -> bool:
+    """Give a file that is only ever replaced whole a second name; false where the file system has no links."""
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        return False
+    return True

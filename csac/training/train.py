@@ -1,427 +1,417 @@
-"""`train`: one call from a task to a run directory. The command line calls nothing else."""
+"""`train`: one call from a task to a set of runs. The command line calls nothing else."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
+import os
+import pickle
+import sys
 import warnings
-from contextlib import closing, nullcontext, suppress
+from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
-from csac.checks import check_callable, check_flag, check_path
-from csac.processes import end_if_unguarded
-from csac.record.manifest import as_kept
-from csac.record.run import RunDirectory
-from csac.record.statistics import mean_returns
-from csac.record.wandb import WandbLog, import_wandb, logs_to_wandb
+from csac.checks import check_callable, check_flag, check_path, check_whole
+from csac.processes import core_quota, end_if_unguarded, usable_cores
+from csac.record.run import RunDirectory, is_run
+from csac.record.sets import RunSet, new_set_directory
+from csac.record.statistics import last_evaluations
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.tasks.trust import refuse_untrusted
-from csac.training.checkpoint import Checkpoints, steps_in
 from csac.training.compilation import tidy_programs
+from csac.training.config import algorithm_of, check_algorithm, labels, make_configs, make_manifest
+from csac.training.devices import choose_device, preallocates
 from csac.training.footprint import memory_needed
-from csac.training.interruptions import (
-    Interrupted,
-    StoppedAtOnce,
-    callers_own,
-    caught_signals,
-    storage_failures_told,
-)
-from csac.training.learner import misfit
-from csac.training.messages import Settings
-from csac.training.plan import Before, Plan, algorithm_of, check_algorithm, make_plan, options_of
+from csac.training.loop import Loop, Program
 from csac.training.provenance import provenance
-from csac.training.recorder import Recorder
-from csac.training.resume import BEGINNING, Restart, can_go_on, refuse_differences, roll_back
-from csac.training.scheduler import run_groups
+from csac.training.resume import Source, continuation, refuse_differences, roll_back
+from csac.training.signals import Interrupted, stop_requested, storage_failures
+from csac.training.supervisor import begin_with, supervise
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    import threading
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
 
     from typing_extensions import Unpack
 
     from csac.console.progress import Reporter
-    from csac.record.manifest import Manifest, State
-    from csac.record.scalars import Log
+    from csac.record.config import RunConfig
     from csac.tasks.making import Task
-    from csac.training.options import PlanOptions
+    from csac.training.config import Options
+    from csac.training.loop import Watcher
+    from csac.training.resume import ResumePoint
     from csac.types import Algorithm
 
     OnEvaluation = Callable[[int, dict[int, float]], Any]
     StopWhen = Callable[[int, dict[int, float]], bool]
 
-_STOPPING = "stopping at the next step where all can be saved; once more to leave at once"
+PROCESSES_PER_CORE = 4  # more only cost memory: further seeds wait for their turn
+PROCESSES_PER_GPU = 4  # eight were in each other's way
+SEEDS_PER_GPU_PROCESS = 5  # with fewer, one more process gains little
 
 
 def train(
     algorithm: Algorithm,
     task: Task,
     *,
+    seeds: int = 1,
+    first_seed: int = 0,
     directory: str | Path | None = None,
     resume: bool = False,
     start_from: str | Path | None = None,
+    seeds_per_process: int | None = None,
+    evaluation_processes: int | None = None,
     tensorboard: bool = True,
     wandb: bool | str = False,
+    progress: bool = False,
     reporter: Reporter | None = None,
     command: str | None = None,
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
-    **options: Unpack[PlanOptions],
-) -> RunDirectory:
-    """Train independent seeds of an algorithm on a task and return the finished run.
+    **options: Unpack[Options],
+) -> RunSet:
+    """Train independent seeds of an algorithm on a task and return their runs.
+
+    Several seeds train in processes of their own, so a script needs the usual `if __name__ == "__main__":` guard.
 
     Args:
         algorithm: a hyperparameter dataclass such as `CSAC()`.
         task: a Gymnasium id, `module:Id`, or a callable that makes an environment.
-        directory: the run directory; by default `runs/<task>/<algorithm>/<date-time>`.
-        resume: go on with the run in `directory`, where there is one, from its newest checkpoint.
-        start_from: `DIRECTORY` or `DIRECTORY@STEP` of a run: begin with a copy of its checkpoint of that step.
+        seeds: number of independent seeds.
+        first_seed: the first of them; the others are numbered from it.
+        directory: the folder of the runs, `seed-<k>` each; by default `runs/<task>/<algorithm>/<date-time>`.
+        resume: resume the runs in `directory` that are there; start the others.
+        start_from: `DIRECTORY` or `DIRECTORY@STEP` of a set or a run: begin with copies of the seeds' checkpoints.
+        seeds_per_process: seeds that share one program; by default 1 on a CPU, and a few on a GPU. With all of them
+            training stays in this process.
+        evaluation_processes: processes in which a program evaluates while it trains on; 0 evaluates in between, None
+            chooses by the cores. The numbers are the same.
         tensorboard: whether to write TensorBoard files.
-        wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to: a W&B run for each
-            seed, those of a run directory in one group. Training never waits for W&B, nor fails with it.
-        reporter: where progress is shown; None is silent, but for a warning about each seed that fails.
+        wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to.
+        progress: whether to show progress on the terminal.
+        reporter: what shows it, instead of the terminal's own.
         command: the command line, for the manifest.
-        on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation.
-        stop_when: called in the same way; training ends early, and counts as finished, once it returns True. With
-            `resume` it is asked once more of the last evaluation of a run that had ended early, which ends there again
-            unless it has become more demanding.
-        **options: `steps`, `seeds`, `first_seed`, `device`, `evaluation_interval`, `evaluation_episodes`,
-            `checkpoint_interval` and `keep_checkpoints`, as `csac.training.options.Options` explains them, and
-
-            - `environment_arguments`: keyword arguments for the environment;
-            - `perturbations`: changes of the task, in training and evaluations, such as `("friction=1.5@300000",)`: see
-              `Perturbation`. What a run begins with (`start_from`) keeps what had happened to it; with None also what
-              was still to happen;
-            - `evaluation_seed`: what the first evaluation episode is reset with, the next ones with the numbers after
-              it: 1,000,000 by default, 2,000,000 are those of `evaluate`, 3,000,000 those of `csac tune`;
-            - `events`: names in the `info` of an evaluation episode's last step (booleans or numbers): each becomes a
-              column of evaluations.csv, beside those that the task has by itself. None keeps those of the run that
-              this one goes on from or begins with;
-            - `groups`: processes to split the seeds over: 1, the default, trains in this process, None chooses by the
-              cores. With more than one, a script needs the usual `if __name__ == "__main__":` guard;
-            - `evaluation_processes`: processes in which each group evaluates while it trains on; 0, the default,
-              evaluates in line, None chooses by the cores. The run is the same to the last bit; `on_evaluation` is
-              called later. A script needs the guard here too. With `stop_when`, which would come too late, evaluation
-              is in line.
+        on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation of a program's seeds.
+        stop_when: called in the same way; those seeds end early, as finished, once it returns True.
+        **options: what a run computes, as `csac.record.config.RunConfig` explains it: `steps`, `device`,
+            `evaluation_interval`, `evaluation_episodes`, `evaluation_seed`, `checkpoint_interval`, `keep_checkpoints`,
+            `environment_arguments`, `perturbations`, `events`.
 
     Raises:
         InputError: a mistake in the arguments; nothing has been written then.
-        Interrupted: on SIGINT or SIGTERM, after everything was saved, if it saves checkpoints and no process that
-            trains was still starting or far behind the others; the message says from where the run can go on.
-        StoppedAtOnce: on a second signal; what came after the last checkpoint is lost.
-        StorageFailure: the run directory can no longer be written; it is as sound as if the run had been killed.
+        Interrupted: on SIGINT or SIGTERM, after everything was saved.
+        StorageFailure: a run directory can no longer be written; it is as sound as if the run had been killed.
     """
     end_if_unguarded()
     check_algorithm(algorithm)
     check_flag("resume", resume)
-    check_flag("tensorboard", tensorboard)
-    if not isinstance(wandb, str) or wandb.lower() in ("", "yes", "no", "true", "false"):
-        check_flag("wandb", wandb)
-    check_callable("on_evaluation", on_evaluation)
-    check_callable("stop_when", stop_when)
-    if directory is not None:
-        check_path("directory", directory)
-    elif resume:
-        raise InputError(
-            "resume goes on with the run in `directory`: give one (csac.resume(directory) does without task)"
-        )
-    if reporter is not None and (isinstance(reporter, type) or not callable(getattr(reporter, "note", None))):
-        raise InputError(f"reporter is an object such as csac.console.progress.Reporter(), not {reporter!r:.40}")
-    if wandb:
-        import_wandb()
-    watchers = Watchers(reporter, tensorboard, wandb, on_evaluation, stop_when, [])
-    before = Before.find(directory, resume, start_from)
-    plan, spec = make_plan(algorithm, task, options, before, may_evaluate_beside=stop_when is None)
-    notes = [memory_needed(plan, spec, goes_on=before.run is not None), *_warmup_note(plan)]
-    manifest = wanted = as_kept(plan.manifest(**provenance(task, command)))
-    has_schedule, defaults = algorithm.cadence.has_schedule, _defaults(algorithm)
-    if before.existing:
-        run = before.existing
-        refuse_differences(run, wanted, has_schedule, defaults)
-    elif before.source:
-        fits = functools.partial(misfit, algorithm, spec, plan.steps)
-        before.source.refuse_misfit(wanted, has_schedule, defaults, fits)
-        manifest = before.source.begun(wanted, defaults)
-        run = before.create(plan, manifest)
-    else:
-        run = before.create(plan, wanted)
-    with storage_failures_told(run, watchers.failures), run.locked():
-        if before.existing:
-            run.read_again()  # another process may have gone on with it, and ended, before we had the lock
-            refuse_differences(run, wanted, has_schedule, defaults)
-        if before.source:
-            before.copy_source(run, manifest)
-            made = before.source.run.manifest
-            made = dataclasses.replace(made, inexact_seeds=run.manifest.inexact_seeds)
-            return _go_on(run, plan, made, wanted, notes, watchers)
-        if before.existing:
-            return _go_on(run, plan, run.manifest, wanted, notes, watchers)
-        try:
-            return _run(run, plan, notes, watchers, BEGINNING)
-        except InputError:  # such as a script without a guard: once mended, it begins in the same directory
-            if not (run.manifest.steps_done or len(run.evaluations) or steps_in(run.checkpoints)):
-                run.discard()
-            raise
+    check_path("directory", directory) if directory is not None else None
+    if resume and directory is None:
+        raise InputError("resume needs the `directory` of the runs (csac.resume(directory) does without a task)")
+    watch = _Watch.make(reporter, progress, on_evaluation, stop_when)
+    choose_device(options.get("device", "cpu"))
+    wanted = labels(seeds, first_seed)
+    source = Source.find(start_from, wanted) if start_from is not None else None
+    configs, spec = make_configs(algorithm, task, wanted, options, source)
+    place = Path(os.path.abspath(directory)) if directory else new_set_directory(configs[0].task, algorithm.name)
+    existing = _existing(place, configs, resume, algorithm.cadence.has_schedule)
+    groups = _groups(wanted, existing, seeds_per_process, configs[0].device, task)
+    how = _How(algorithm, task, evaluation_processes, tensorboard, wandb, command, stop_when is not None)
+    programs = how.programs([[place / f"seed-{seed}" for seed in group] for group in groups], existing, configs[0])
+    notes = [memory_needed(programs, configs[0], spec, _workers()), *_warmup_note(algorithm, configs[0])]
+    for config in configs:
+        group = next(group for group in groups if config.seed in group)
+        _create_or_extend(place, config, group, existing.get(config.seed), source)
+    return _run(RunSet.open(place), programs, watch, notes)
 
 
 def resume(
     directory: str | Path,
     *,
     steps: int | None = None,
-    evaluation_processes: int | None = 0,
+    evaluation_processes: int | None = None,
     trust_task: bool = False,
+    progress: bool = False,
     reporter: Reporter | None = None,
     command: str | None = None,
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
-) -> RunDirectory:
-    """Go on with a run from its newest checkpoint; everything but a larger number of `steps` comes from its manifest.
+) -> RunSet:
+    """Resume a run, or every run of a set, from its newest checkpoint; everything but `steps` comes from its manifest.
 
-    `trust_task` lets the task import its module though nobody has named it here (`csac.tasks.trust`);
-    `evaluation_processes`, `reporter` and what follows it are as in `train`.
+    `trust_task` lets the task import its module though nobody has named it here (`csac.tasks.trust`); the other
+    arguments are those of `train`.
 
     Raises:
         InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
             call `train` with it and `resume=True` then.
-        Interrupted: as `train`.
+        Interrupted, StorageFailure: as `train`.
+    """
+    runs = RunSet.open(directory)
+    config = runs.config
+    if config.task_is_callable:
+        raise InputError(f"the task of {runs.path} is a Python function: call csac.train with it and resume=True")
+    refuse_untrusted(config.task, runs.path, trust_task)
+    watch = _Watch.make(reporter, progress, on_evaluation, stop_when)
+    choose_device(config.device)
+    algorithm = algorithm_of(config)
+    for run in runs.runs:
+        if steps is not None:
+            wanted = dataclasses.replace(run.config, steps=steps)
+            refuse_differences(run, wanted, algorithm.cadence.has_schedule)
+            with run.locked():
+                run.update_manifest(config=wanted)
+    existing = {run.seed: run for run in runs.runs}
+    groups = _groups(runs.seeds, existing, None, config.device, config.task)
+    has_wandb = any((run.path / "wandb").exists() for run in runs.runs)
+    has_tensorboard = any(run.tensorboard.exists() for run in runs.runs)
+    how = _How(algorithm, config.task, evaluation_processes, has_tensorboard, has_wandb, command, stop_when is not None)
+    programs = how.programs([[existing[seed].path for seed in group] for group in groups], existing, config)
+    return _run(runs, programs, watch, [])
+
+
+def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], bool]) -> None:
+    """Train the runs of a program in this process, from their newest checkpoint or their beginning.
+
+    Raises:
+        InputError: a run is in use, or cannot go on.
         StorageFailure: as `train`.
     """
-    run = RunDirectory.open(directory)
-    task, options = options_of(run)
-    refuse_untrusted(task, run.path, trust_task)
-    options["evaluation_processes"], options["groups"] = evaluation_processes, None
-    if steps is not None:
-        options["steps"] = steps
-    return train(
-        algorithm_of(run.manifest),
-        task,
-        directory=directory,
-        resume=True,
-        tensorboard=run.tensorboard.exists(),
-        wandb=logs_to_wandb(run) and _has_wandb(reporter),
-        reporter=reporter,
-        command=command,
-        on_evaluation=on_evaluation,
-        stop_when=stop_when,
-        **options,
-    )
+    runs = [RunDirectory.open(path) for path in program.directories]
+    with ExitStack() as stack, storage_failures(runs[0].path.parent):
+        for run in runs:
+            stack.enter_context(run.locked())
+            run.read_again()  # another process may have gone on with it before we had the lock
+        choose_device(runs[0].config.device)
+        points = roll_back(runs)
+        current = provenance(program.task, program.command, program.threads)
+        for run, point in zip(runs, points, strict=True):
+            _note_begin(run, point, current, watcher)
+        loop = Loop(program, runs, points, watcher)
+        stack.callback(loop.close)
+        try:
+            loop.run(should_stop)
+        finally:
+            stopped = loop.step < loop.steps and (should_stop() or not loop.is_over)
+            for run in runs:
+                if run.manifest.state == "running":
+                    run.update_manifest(state="interrupted" if stopped else "finished")
 
 
-def _has_wandb(reporter: Reporter | None) -> bool:
-    """Whether W&B is still there for a run that was logged to it; it goes on without as well."""
-    try:
-        import_wandb()
-    except InputError as error:
+def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], watcher: Watcher) -> None:
+    """Record in a run's manifest where and how it begins or goes on."""
+    before, history = run.manifest, run.manifest.history
+    after = dataclasses.replace(before, **current)
+    if before.process is not None:
+        entry, lines = continuation(before, after, point)
+        history = (*history, entry)
+        for line in lines:
+            run.log(line)
+            watcher.note(f"seed {run.seed}: {line}")
+    is_resting = before.state == "failed" and point.checkpoint and not point.checkpoint.values["environment"]["alive"]
+    state = {} if is_resting else {"state": "running", "failure": ""}
+    run.update_manifest(**current, **state, history=history, steps_done=point.step)
+
+
+def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_schedule: bool) -> dict[int, RunDirectory]:
+    """Return the runs that are there and to be resumed. Raises InputError where something is in the way."""
+    existing = {}
+    for config in configs:
+        path = place / f"seed-{config.seed}"
+        if is_run(path):
+            if not resume:
+                raise InputError(f"{path} already holds a run: resume it, or choose another directory")
+            existing[config.seed] = run = RunDirectory.open(path)
+            refuse_differences(run, config, has_schedule)
+    strangers = [p for p in place.iterdir() if not p.name.startswith((".", "seed-", "curve.png"))] if place.is_dir() else []
+    if strangers or (place.exists() and not place.is_dir()):
+        raise InputError(f"{place} is not empty and holds no set of runs: choose a new or an empty directory")
+    return existing
+
+
+def _create_or_extend(
+    place: Path, config: RunConfig, group: Sequence[int], existing: RunDirectory | None, source: Source | None
+) -> None:
+    """Create the run of a configuration, or give the existing one its larger number of steps."""
+    if existing:
+        if config != existing.config:
+            with existing.locked():
+                existing.update_manifest(config=config)
+        return
+    manifest = make_manifest(config, group)
+    run = RunDirectory.create(place / f"seed-{config.seed}", source.begun(manifest) if source else manifest)
+    if source:
+        source.copy_to(run)
+
+
+def _groups(
+    seeds: Sequence[int],
+    existing: Mapping[int, RunDirectory],
+    seeds_per_process: int | None,
+    device: str,
+    task: Task,
+) -> list[list[int]]:
+    """Return the seeds of each program: as they were, as asked for, or as pays here."""
+    known = {existing[seed].manifest.program for seed in seeds if seed in existing}
+    together = [[seed for seed in group if seed in seeds] for group in sorted(known) if len(group) > 1]
+    rest = [seed for seed in seeds if not any(seed in group for group in together)]
+    size = seeds_per_process
+    if size is None:
+        size = len(rest) if not _can_be_sent(task) else 1
+        if device == "gpu":
+            processes = max(1, min(len(rest) // SEEDS_PER_GPU_PROCESS, len(usable_cores()) // 2, PROCESSES_PER_GPU))
+            size = max(1, -(-len(rest) // (1 if preallocates() else processes)))
+    check_whole("seeds_per_process", size, min(len(rest), 1), max(len(seeds), 1))
+    return together + [rest[i : i + size] for i in range(0, len(rest), max(size, 1))]
+
+
+class _How(NamedTuple):
+    """What all programs of a call have in common."""
+
+    algorithm: Algorithm
+    task: Task
+    evaluation_processes: int | None
+    tensorboard: bool
+    wandb: bool | str
+    command: str | None
+    asks: bool
+
+    def programs(
+        self, directories: Sequence[Sequence[Path]], existing: Mapping[int, RunDirectory], config: RunConfig
+    ) -> list[Program]:
+        """Return the programs of these directories. Raises InputError for what cannot be sent to a process."""
+        cores = len(usable_cores()[: core_quota()])
+        threads = max(1, cores // len(directories))
+        recorded = [run.manifest.machine.cores for run in existing.values() if run.manifest.process is not None]
+        threads = recorded[0] if recorded and recorded[0] <= cores else threads
+        spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
+        processes = self.evaluation_processes
+        if processes is None:
+            pays = spare > 0 and not self.asks and 0 < config.evaluation_interval < config.steps
+            processes = min(batches, max(1, spare // len(directories))) if pays and _can_be_sent(self.task) else 0
+        check_whole("evaluation_processes", processes, 0, 1_000)
+        if (processes or len(directories) > 1) and not _can_be_sent(self.task):
+            raise InputError("the task cannot be sent to another process: make it a function of a module that can be imported, or train with seeds_per_process=seeds and evaluation_processes=0")
+        return [
+            Program(
+                tuple(group), self.algorithm, self.task, threads, processes, self.tensorboard, self.wandb, self.asks, self.command
+            )
+            for group in directories
+        ]
+
+
+class _Watch:
+    """Tells the caller what happens: the reporter and the caller's own functions."""
+
+    def __init__(self, reporter: Reporter | None, on_evaluation: OnEvaluation | None, stop_when: StopWhen | None) -> None:
+        self.reporter, self.on_evaluation, self.stop_when = reporter, on_evaluation, stop_when
+
+    @classmethod
+    def make(
+        cls, reporter: Reporter | None, progress: bool, on_evaluation: OnEvaluation | None, stop_when: StopWhen | None
+    ) -> _Watch:
+        """Return it, with a reporter on the terminal where progress is wanted. Raises InputError."""
+        check_flag("progress", progress)
+        check_callable("on_evaluation", on_evaluation)
+        check_callable("stop_when", stop_when)
+        if progress and reporter is None:
+            from csac.console.progress import Reporter
+
+            reporter = Reporter()
+        return cls(reporter, on_evaluation, stop_when)
+
+    def turn(self, step: int) -> None:
+        """Go on: nobody else trains in this process."""
+
+    def progress(self, steps: Mapping[int, int]) -> None:
+        """Show how many steps each seed has made."""
+        if self.reporter:
+            self.reporter.progress(steps)
+
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
+        """Show an evaluation, and ask whether training is to end."""
+        if self.reporter:
+            self.reporter.evaluated(step, returns)
+        if self.on_evaluation:
+            self.on_evaluation(step, dict(returns))
+        return bool(self.stop_when and self.stop_when(step, dict(returns)))
+
+    def failed(self, seed: int, step: int, reason: str) -> None:
+        """Show that a seed failed."""
+        if self.reporter:
+            self.reporter.failed(seed, step, reason)
+        else:
+            warnings.warn(f"seed {seed} failed at step {step}: {reason}", RuntimeWarning, stacklevel=2)
+
+    def note(self, text: str) -> None:
+        """Show a line."""
+        if self.reporter:
+            self.reporter.note(text)
+
+    def is_over(self, run: RunDirectory) -> bool:
+        """Return whether a run needs no more training: all its steps are made, or `stop_when` still says so."""
+        manifest = run.manifest
+        if manifest.state not in ("finished", "failed") or manifest.steps_done < run.config.steps:
+            stopped_early = manifest.state == "finished" and self.stop_when is not None
+            last = last_evaluations(run.evaluations, points=1) if stopped_early else {}
+            return bool(last and self.stop_when and self.stop_when(manifest.steps_done, last))
+        return manifest.state == "finished"
+
+
+def _run(runs: RunSet, programs: list[Program], watch: _Watch, notes: list[str]) -> RunSet:
+    """Train every program that is not over, show it, and draw the curve. Raises as `train`."""
+    done = {run.path for run in runs.runs if watch.is_over(run)}
+    programs = [program for program in programs if not done.issuperset(program.directories)]
+    reporter = watch.reporter
+    notes = [*notes, *filter(None, [tidy_programs()])]
+    if reporter:
+        reporter.start(runs, notes)
+    with closing(reporter) if reporter else nullcontext(), stop_requested(watch.note) as request:
+        if len(programs) == 1:
+            begin_with(programs[0].threads)
+            train_program(programs[0], watch, request.is_set)
+        elif programs:
+            turns = len(usable_cores()) // programs[0].threads if runs.config.device == "cpu" else None
+            supervise(programs, watch, request.is_set, _workers(), turns)
+        runs = RunSet.open(runs.path)
+        draw_curve(runs, watch.note)
         if reporter:
-            reporter.note(f"note: this run was logged to W&B, and is no more: {error}")
+            reporter.finish(runs)
+    if request.is_set() and any(run.manifest.state in ("running", "interrupted") for run in runs.runs):
+        raise Interrupted(runs, request.received[0])
+    return runs
+
+
+def _workers() -> int:
+    return PROCESSES_PER_CORE * len(usable_cores()[: core_quota()])
+
+
+def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:
+    """Draw the evaluations of a set into its `curve.png`; a picture that cannot be drawn is no failure of the runs."""
+    rows = runs.sound_evaluations if len(runs.sound_evaluations) else runs.evaluations
+    if not len(rows):
+        return
+    from csac.record.plots import learning_curve  # matplotlib is slow to import
+
+    changes = by_step(perturbations_of(runs.config.perturbations))
+    marks = [(step, text) for step, text in changes if step <= rows["step"].max()]
+    try:
+        learning_curve([(runs.config.algorithm.upper(), rows)], runs.curve, title=runs.config.task, marks=marks)
+    except Exception as error:
+        note(f"note: the curve could not be drawn ({type(error).__name__}: {' '.join(str(error).split())})")
+
+
+def _can_be_sent(task: Task) -> bool:
+    """Return whether another process can be sent the task; it cannot import what a notebook or a terminal defined."""
+    if getattr(task, "__module__", "") == "__main__" and not hasattr(sys.modules["__main__"], "__file__"):
+        return False
+    try:
+        pickle.dumps(task)
+    except Exception:
         return False
     return True
 
 
-class Watchers(NamedTuple):
-    """Who is told what happens, beside the run directory."""
-
-    reporter: Reporter | None
-    tensorboard: bool
-    wandb: bool | str
-    on_evaluation: OnEvaluation | None
-    stop_when: StopWhen | None
-    failures: list[OSError]
-    """What the caller's functions raised that is no failure of the run directory."""
-
-    def tell(self, evaluated: list[tuple[int, dict[int, float]]]) -> bool:
-        """Call the caller's functions for each new evaluation; return whether the run is to end early."""
-        enough = False
-        while evaluated:
-            step, returns = evaluated.pop(0)
-            with callers_own(self.failures):
-                if self.on_evaluation:
-                    self.on_evaluation(step, returns)
-                enough = bool(self.stop_when and self.stop_when(step, returns)) or enough
-        return enough
-
-    def had_enough(self, run: RunDirectory) -> bool:
-        """Return whether a run that is over had ended early, and `stop_when` still says so of its last evaluation."""
-        if self.stop_when is None or run.manifest.state != "finished":
-            return False
-        try:
-            rows = run.evaluations
-        except InputError:  # damaged: going on restores it
-            return False
-        if not len(rows):
-            return False
-        step = int(rows["step"].max())
-        with callers_own(self.failures):
-            return bool(self.stop_when(step, mean_returns(rows[rows["step"] == step])))
-
-
-def _go_on(
-    run: RunDirectory, plan: Plan, before: Manifest, wanted: Manifest, notes: list[str], watchers: Watchers
-) -> RunDirectory:
-    """Go on with a run from its newest sound checkpoint, which was made as `before` says."""
-    if run.manifest.state in ("finished", "failed") and run.manifest.steps_done >= plan.steps:
-        if watchers.reporter:
-            watchers.reporter.note(f"{run.path} has made its {plan.steps:,} steps already; more: --steps")
-        return run
-    if watchers.had_enough(run):
-        if watchers.reporter:
-            watchers.reporter.note(f"{run.path} had enough after {run.manifest.steps_done:,} steps")
-        return run
-    restart = roll_back(run)
-    current = ("machine", "versions", "commit", "groups", "steps", "process", "device", "checkpoints")
-    run.update_manifest(
-        **{name: getattr(wanted, name) for name in current},
-        state="running",
-        history=(*run.manifest.history, restart.continuation(before, wanted)),
-        failures=restart.failures,
-        steps_done=restart.step,
-    )
-    return _run(run, plan, [*notes, *restart.notes(before, wanted)], watchers, restart)
-
-
-def _run(run: RunDirectory, plan: Plan, notes: list[str], watchers: Watchers, restart: Restart) -> RunDirectory:
-    """Train until the last step or a signal, from the first preparation to the last picture."""
-    reporter = watchers.reporter
-    told = functools.partial(reporter.note, _STOPPING) if reporter else None
-    try:
-        with caught_signals(told) as (stop, received), closing(reporter) if reporter else nullcontext():
-            recorder = _follow(run, plan, notes, watchers, restart, stop, received)
-    except KeyboardInterrupt as second:
-        if run.manifest.state in ("finished", "failed"):  # it had ended, and only its picture is missing
-            return run
-        raise StoppedAtOnce(run, can_go_on(run), *second.args) from second
-    if run.manifest.state == "interrupted":
-        newest = recorder.checkpoints.newest if recorder.checkpoints else None
-        lost = run.manifest.steps_done - (newest or 0)
-        raise Interrupted(run, received[0], newest is not None, lost, begins_anew=newest is None and can_go_on(run))
-    return run
-
-
-def _follow(
-    run: RunDirectory,
-    plan: Plan,
-    notes: list[str],
-    watchers: Watchers,
-    restart: Restart,
-    stop: threading.Event,
-    received: list[int],
-) -> Recorder:
-    """Train until the last step, a request to stop or a failure, and write down what happens."""
-    reporter, begin, failures = watchers.reporter, restart.step, restart.failures
-    groups = restart.parts(plan.groups)
-    notes = [*notes, *filter(None, [tidy_programs()])]
-    if reporter:
-        reporter.start(plan.task_name, plan.algorithm.name, plan.labels, plan.steps, run.path, notes)
-        reporter.go_on(begin, run.evaluations, failures)
-    logs = _logs(run, plan.labels, begin, watchers)
-    folder = run.checkpoints.absolute() if begin or plan.checkpoint_interval else None
-    settings = Settings(plan, folder, begin, _begins_on_another_task(run, begin))
-    checkpoints = Checkpoints(folder, plan.keep_checkpoints, restart.pinned) if folder else None
-    recorder = Recorder(run, groups, reporter, logs, checkpoints, begin, failures, by_step(plan.perturbations))
-    for log in logs:
-        recorder.tell(log.write({}))
-    try:
-        with closing(run_groups(settings, groups, stop.is_set, checkpoints, lambda: bool(received))) as told:
-            for group, message in told:
-                recorder.handle(group, message)
-                if watchers.tell(recorder.evaluated):
-                    stop.set()
-        recorder.close()
-        stopped = bool(received) and not recorder.is_complete(plan.steps)  # a signal may come too late
-        _finish(run, recorder, "interrupted" if stopped else "failed" if recorder.failures else "finished", reporter)
-    except BaseException:
-        _leave(run, recorder)
-        raise
-    finally:
-        for log in logs:
-            lines = log.close()
-            with suppress(OSError):
-                recorder.tell(lines)
-    return recorder
-
-
-def _begins_on_another_task(run: RunDirectory, begin: int) -> bool:
-    """Whether the checkpoint at this step came from a run of another task."""
-    origin = run.manifest.forked_from
-    return origin is not None and origin.step == begin and origin.has_other_task
-
-
-def _logs(run: RunDirectory, labels: list[int], begin: int, watchers: Watchers) -> list[Log]:
-    """Return where the curves go beside the tables. Both are slow to import, and some runs do without."""
-    logs: list[Log] = []
-    before = _before(run, labels) if watchers.tensorboard or watchers.wandb else {}
-    if watchers.tensorboard:
-        from csac.record.tensorboard import TensorBoardLog
-
-        logs.append(TensorBoardLog(run.tensorboard, labels, begin, before))
-    if watchers.wandb:
-        project = watchers.wandb if isinstance(watchers.wandb, str) else None
-        logs.append(WandbLog(run, labels, begin, project, before))
-    return logs
-
-
-def _before(run: RunDirectory, labels: list[int]) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows that a run that goes on has already, of the tables that what comes next is averaged with."""
-    tables = {"episodes": run.rows("episodes"), "evaluations": run.evaluations}
-    return {name: _as_dicts(rows[np.isin(rows["seed"], labels)]) for name, rows in tables.items()}
-
-
-def _as_dicts(rows: np.ndarray) -> list[dict[str, Any]]:
-    return [dict(zip(rows.dtype.names or (), row, strict=True)) for row in rows.tolist()]
-
-
-def _leave(run: RunDirectory, recorder: Recorder) -> None:
-    """Write what can still be written of a run that an error ends; it can go on from its last checkpoint."""
-    if run.manifest.state != "running":
-        return  # it had ended before
-    with suppress(OSError):
-        recorder.close()
-        run.update_manifest(state="interrupted")
-
-
-def _finish(run: RunDirectory, recorder: Recorder, state: State, reporter: Reporter | None) -> None:
-    """Draw the curve and say how the run ended. It has ended so whether or not there is a picture of it."""
-    run.update_manifest(state=state, failures=recorder.failures)
-    try:
-        _draw(run)
-    except Exception as error:
-        text = f"note: the curve could not be drawn ({type(error).__name__}: {' '.join(str(error).split())})"
-        run.log(text)
-        if reporter:
-            reporter.note(text)
-    if reporter:
-        reporter.finish(run)
-        return
-    for seed, reason in run.manifest.failures.items():
-        warnings.warn(f"seed {seed} of {run.path} failed at {reason}", RuntimeWarning, stacklevel=4)
-
-
-def _draw(run: RunDirectory) -> None:
-    rows = run.sound_evaluations
-    if not len(rows):
-        rows = run.evaluations  # of a run of which every seed has failed there is a picture too
-    if len(rows):
-        perturbed = by_step(perturbations_of(run.manifest.perturbations))
-        marks = [(step, text) for step, text in perturbed if step <= rows["step"].max()]
-        from csac.record.plots import learning_curve  # matplotlib is slow to import
-
-        learning_curve([(run.manifest.algorithm.upper(), rows)], run.curve, title=run.manifest.task, marks=marks)
-
-
-def _defaults(algorithm: Algorithm) -> dict[str, Any]:
-    """Return the default of every hyperparameter that has one."""
-    fields = dataclasses.fields(algorithm)  # pyright: ignore[reportArgumentType]
-    return {item.name: item.default for item in fields if item.default is not dataclasses.MISSING}
-
-
-def _warmup_note(plan: Plan) -> list[str]:
-    steps, warmup, first = plan.steps, plan.algorithm.cadence.warmup_steps, plan.algorithm.cadence.first_update
-    if steps >= first:
-        return []
-    is_warmup = f"all {steps:,} steps are warm-up (warmup_steps={warmup:,})"
-    why = is_warmup if steps < warmup else f"the first update comes after step {first:,}"
-    return [f"note: nothing will be learnt, since {why}"]
+def _warmup_note(algorithm: Algorithm, config: RunConfig) -> list[str]:
+    first = algorithm.cadence.first_update
+    return [f"note: no updates: steps ({config.steps:,}) < {first:,}, where the first one comes"] if config.steps < first else []

@@ -1,0 +1,131 @@
+"""What a run is: one settings object that the command line fills, `train` takes, the manifest stores and studies list.
+
+Plain values and no JAX, so that every room can read it.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from csac.checks import check_whole
+from csac.types import InputError
+
+STEPS_LIMIT = 2**31 - 1  # learners count their steps in 32 bits
+SEED_LIMIT = 2**32  # a key is made of a seed's lowest 32 bits
+EVALUATION_SEED = 1_000_000  # resets the first evaluation episode in training
+NEVER = 10**15  # an interval longer than any run
+MOST_EPISODES = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """Everything that decides what one run computes. Steps are environment steps.
+
+    Raises:
+        InputError: a number outside its range, or values that JSON would change.
+    """
+
+    task: str
+    """A Gymnasium id such as HalfCheetah-v4, or module:Id for an environment that a module registers."""
+    algorithm: str = "csac"
+    """The algorithm; its own options are listed below."""
+    hyperparameters: dict[str, Any] = field(default_factory=dict)
+    """Every hyperparameter of the algorithm, so that no later default changes what a run is."""
+    seed: int = 0
+    """Seed of the networks, of exploration, of the replay's draws and of the training episodes."""
+    steps: int = 1_000_000
+    """Environment steps per seed, warm-up included."""
+    device: Literal["cpu", "gpu"] = "cpu"
+    """Device that the networks are trained on."""
+    evaluation_interval: int = 5_000
+    """Environment steps between evaluations; there is always one at the last step."""
+    evaluation_episodes: int = 10
+    """Episodes per evaluation."""
+    evaluation_seed: int = EVALUATION_SEED
+    """Resets the first evaluation episode; the next ones have the numbers after it."""
+    checkpoint_interval: int = 50_000
+    """Environment steps between checkpoints; there is also one every ten minutes and at the end. 0: none at all."""
+    keep_checkpoints: int = 2
+    """Number of newest checkpoints to keep; 0 keeps all."""
+    environment_arguments: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments for the environment."""
+    perturbations: tuple[str, ...] = ()
+    """Changes of the task in mid-training, such as friction=1.5@300000."""
+    events: tuple[str, ...] = ()
+    """Names in the last `info` of an evaluation episode; each is a column of evaluations.csv."""
+    task_is_callable: bool = False
+    """Whether the task is a Python function, which no manifest can name."""
+
+    def __post_init__(self) -> None:
+        if self.device == "cuda":
+            object.__setattr__(self, "device", "gpu")
+        if self.device not in ("cpu", "gpu"):
+            raise InputError(f"device must be cpu or gpu, not {self.device!r}")
+        for name, least, most in _RANGES:
+            check_whole(name, getattr(self, name), least, most)
+        for name in ("hyperparameters", "environment_arguments"):
+            object.__setattr__(self, name, as_json(name, getattr(self, name)))
+        for name in ("perturbations", "events"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+
+
+_RANGES = (
+    ("seed", 0, SEED_LIMIT - 1),
+    ("steps", 1, STEPS_LIMIT),
+    ("evaluation_interval", 1, NEVER),
+    ("evaluation_episodes", 1, MOST_EPISODES),
+    ("evaluation_seed", 0, 2**30 - 1),
+    ("checkpoint_interval", 0, NEVER),
+    ("keep_checkpoints", 0, NEVER),
+)
+
+
+def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Return keyword arguments as JSON gives them back; tuples become lists, NumPy's numbers plain ones.
+
+    Raises:
+        InputError: JSON would change a value, so that a resumed run would be another run.
+    """
+    plain = _plain(values)
+    try:
+        kept = json.loads(json.dumps(plain))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{name} cannot be kept in a manifest: {error}; use numbers, texts, lists and dicts") from None
+    if not isinstance(values, dict) or not same(kept, plain):
+        raise InputError(f"{name} cannot be kept in a manifest: keys must be texts, not {values!r:.60}")
+    return kept
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "tolist") and not getattr(value, "shape", None):  # NumPy's numbers
+        return value.tolist()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def same(old: Any, new: Any) -> bool:
+    """Return whether two values from JSON are equal; a NaN equals itself here."""
+    if isinstance(old, list) and isinstance(new, list):
+        return len(old) == len(new) and all(map(same, old, new))
+    if isinstance(old, dict) and isinstance(new, dict):
+        return old.keys() == new.keys() and all(same(old[key], new[key]) for key in old)
+    return old == new or (old != old and new != new)
+
+
+def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
+    """Return "name is X, not Y" for each value that differs; hyperparameters and arguments one by one."""
+    lines = []
+    for name in sorted(before.keys() | now.keys()):
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            lines += differences(old, new, "environment_arguments." if name == "environment_arguments" else "")
+        elif not same(_listed(old), _listed(new)):
+            lines.append(f"{prefix}{name} is {_listed(old)!r}, not {_listed(new)!r}")
+    return lines
+
+
+def _listed(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value

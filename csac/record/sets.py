@@ -1,0 +1,129 @@
+"""A set of runs, one seed each, in one folder: `seed-<k>` for each, or a run alone."""
+
+from __future__ import annotations
+
+import os
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from csac.checks import check_path
+from csac.record.run import MANIFEST, RunDirectory, is_run
+from csac.record.tables import COLUMNS, structured
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from csac.record.config import RunConfig
+    from csac.record.run import Table
+
+
+class RunSet:
+    """The runs in one folder, `seed-<k>` each, or one run alone."""
+
+    def __init__(self, path: Path, runs: Sequence[RunDirectory]) -> None:
+        self.path, self.runs = path, list(runs)
+
+    def __repr__(self) -> str:
+        return f"RunSet({str(self.path)!r}, seeds {self.seeds})"
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunSet:
+        """Open the runs below a folder, or a run. Raises InputError where there is none, or a manifest is damaged."""
+        check_path("a run directory", path)
+        path = Path(os.path.abspath(path))
+        if is_run(path):
+            return cls(path, [RunDirectory.open(path)])
+        below = [folder for folder in path.glob("seed-*") if is_run(folder)]
+        runs = sorted(map(RunDirectory.open, below), key=lambda run: run.seed)
+        if not runs:
+            if (path / "evaluations.csv").exists() or (path / "policy").exists():
+                raise InputError(f"{path} is a run of an older csac, or its manifest is lost: use the csac that wrote it")
+            RunDirectory.open(path)  # which says what is there instead
+        return cls(path, runs)
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds, in order."""
+        return [run.seed for run in self.runs]
+
+    @property
+    def config(self) -> RunConfig:
+        """What the first run computes; the others differ by their seeds."""
+        return self.runs[0].config
+
+    @property
+    def failures(self) -> dict[int, str]:
+        """How each seed that failed did."""
+        return {run.seed: run.manifest.failure for run in self.runs if run.manifest.state == "failed"}
+
+    @property
+    def curve(self) -> Path:
+        """The picture of the evaluations."""
+        return self.path / "curve.png"
+
+    def run(self, seed: int) -> RunDirectory:
+        """Return the run of one seed. Raises InputError where there is none."""
+        for run in self.runs:
+            if run.seed == seed:
+                return run
+        raise InputError(f"{self.path} has no seed {seed!r:.20}; it has {', '.join(map(str, self.seeds))}")
+
+    def rows(self, name: Table) -> np.ndarray:
+        """Return the rows of a table of all runs, seed by seed, with the columns that all of them have."""
+        tables = [rows for run in self.runs if len(rows := run.rows(name))]
+        if not tables:
+            return structured(COLUMNS[name], [])
+        common = [item for item in tables[0].dtype.names or () if all(item in (t.dtype.names or ()) for t in tables)]
+        return np.concatenate([table[common] for table in tables])
+
+    @property
+    def evaluations(self) -> np.ndarray:
+        """The rows of evaluations.csv of all runs."""
+        return self.rows("evaluations")
+
+    @property
+    def sound_evaluations(self) -> np.ndarray:
+        """The rows of evaluations.csv of the runs that did not fail."""
+        rows = self.evaluations
+        return rows[~np.isin(rows["seed"], list(self.failures))]
+
+
+def new_set_directory(task: str, algorithm: str) -> Path:
+    """Return `runs/<task>/<algorithm>/<date-time>`, with a number behind it where that is taken."""
+    moment = datetime.now().strftime("%Y%m%d-%H%M%S")
+    first = Path("runs", task.replace("/", "-").replace(":", "-"), algorithm, moment).absolute()
+    path, number = first, 1
+    while os.path.lexists(path):
+        number += 1
+        path = first.with_name(f"{moment}-{number}")
+    return path
+
+
+def find_sets(directory: str | Path, on_damaged: Callable[[InputError], None] | None = None) -> list[RunSet]:
+    """Return every set of runs in `directory` and below, sorted by path; `on_damaged` is told why another is not.
+
+    Raises:
+        InputError: there is no such directory.
+    """
+    directory = Path(directory)
+    if not directory.is_dir():
+        raise InputError(f"there is no directory {directory}; give one that holds runs")
+    found: dict[Path, list[RunDirectory]] = {}
+    for folder, below, files in os.walk(directory):
+        if MANIFEST in files:
+            below.clear()
+            try:
+                run = RunDirectory.open(folder)
+                in_set = run.path.name == f"seed-{run.seed}" and Path(folder) != directory
+                found.setdefault(run.path.parent if in_set else run.path, []).append(run)
+            except InputError as error:
+                if on_damaged and "evaluations.csv" in files:  # else it is the manifest of something else
+                    on_damaged(error)
+    return [RunSet(path, sorted(runs, key=lambda run: run.seed)) for path, runs in sorted(found.items())]

@@ -1,0 +1,132 @@
+"""From what a user gives to the configurations of runs: names resolved, values checked, the task tried once."""
+
+from __future__ import annotations
+
+import dataclasses
+from contextlib import closing
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
+
+from csac.algorithms import ALGORITHMS
+from csac.checks import check_arguments, check_whole, did_you_mean
+from csac.presets import matching_preset
+from csac.record.config import SEED_LIMIT, RunConfig, as_json
+from csac.record.manifest import Manifest
+from csac.synonyms import called_in_python
+from csac.tasks.environment import Environment, try_arguments
+from csac.tasks.known import check_events, events_of
+from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
+from csac.tasks.trust import remember
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from csac.tasks.making import Task
+    from csac.training.resume import Source
+    from csac.types import Algorithm, Spec
+
+MOST_SEEDS = 10_000
+
+
+class Options(TypedDict, total=False):
+    """The keyword arguments of `train` that say what a run computes, as `RunConfig` explains them."""
+
+    steps: int
+    device: Literal["cpu", "gpu", "cuda"]
+    evaluation_interval: int
+    evaluation_episodes: int
+    evaluation_seed: int
+    checkpoint_interval: int
+    keep_checkpoints: int
+    environment_arguments: dict[str, Any] | None
+    perturbations: str | Perturbation | Iterable[str | Perturbation] | None
+    events: Sequence[str] | None
+
+
+def make_configs(
+    algorithm: Algorithm, task: Task, seeds: Sequence[int], given: Options, source: Source | None
+) -> tuple[list[RunConfig], Spec]:
+    """Return the configuration of each seed's run, and the sizes of the task, which is made and perturbed once.
+
+    Raises:
+        InputError: a mistake in the options, or a task that csac cannot learn.
+    """
+    _refuse_unknown(given, algorithm)
+    options: Any = dict(given)
+    check_arguments("environment_arguments", options.get("environment_arguments"))
+    arguments = as_json("environment_arguments", dict(options.pop("environment_arguments", None) or {}))
+    asked, events = options.pop("perturbations", None), options.pop("events", None)
+    if events is not None:
+        check_events(events)
+    if source and events is None:
+        events = next(iter(source.runs.values())).config.events
+    else:
+        events = events_of(task, events or ())
+    hyperparameters = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
+    with closing(Environment(task, arguments)) as environment:
+        spec, name = environment.spec, environment.task_name
+        if arguments:
+            try_arguments(environment, arguments)
+        remember(task)
+        configs = [
+            RunConfig(
+                task=name,
+                algorithm=algorithm.name,
+                hyperparameters=hyperparameters,
+                seed=seed,
+                environment_arguments=arguments,
+                perturbations=source.perturbations(seed, asked) if source else tuple(map(str, perturbations_of(asked or ()))),
+                events=tuple(events),
+                task_is_callable=not isinstance(task, str),
+                **options,
+            )
+            for seed in seeds
+        ]
+        changes = perturbations_of(configs[0].perturbations)
+        refuse_late(changes, configs[0].steps, planned=source is not None and asked is None)
+        for item in changes:
+            environment.perturb({item.kind: item.value})
+    return configs, spec
+
+
+def labels(seeds: int, first_seed: int) -> list[int]:
+    """Return the seeds from `first_seed` on. Raises InputError where there are none or too many."""
+    check_whole("seeds", seeds, 1, MOST_SEEDS)
+    check_whole("first_seed", first_seed, 0, SEED_LIMIT - seeds)
+    return list(range(first_seed, first_seed + seeds))
+
+
+def make_manifest(config: RunConfig, program: Sequence[int]) -> Manifest:
+    """Return the manifest of a new run that shares its program with these seeds."""
+    preset = matching_preset(ALGORITHMS[config.algorithm], config.task, config.hyperparameters)
+    return Manifest(config=config, preset=preset, program=tuple(program))
+
+
+def algorithm_of(config: RunConfig) -> Algorithm:
+    """Return the algorithm of a run with its hyperparameters. Raises InputError where this csac does not know them."""
+    if config.algorithm not in ALGORITHMS:
+        raise InputError(f"the run's algorithm {config.algorithm!r} is unknown: {' or '.join(ALGORITHMS)} are known")
+    make: Any = ALGORITHMS[config.algorithm]
+    unknown = config.hyperparameters.keys() - {item.name for item in dataclasses.fields(make)}
+    if unknown:
+        raise InputError(f"the run has unknown hyperparameters: {', '.join(sorted(unknown))}")
+    return make(**{name: tuple(v) if isinstance(v, list) else v for name, v in config.hyperparameters.items()})
+
+
+def check_algorithm(algorithm: object) -> None:
+    """Raise InputError for what is no algorithm with its hyperparameters: a name, a class, something else."""
+    if isinstance(algorithm, type) or not (dataclasses.is_dataclass(algorithm) and hasattr(algorithm, "update")):
+        given = algorithm.__name__ if isinstance(algorithm, type) else str(algorithm)
+        names = {name: kind.__name__ for name, kind in ALGORITHMS.items()}
+        raise InputError(f"{given:.60} is no algorithm with hyperparameters: give {names.get(given.lower(), 'CSAC')}()")
+
+
+def _refuse_unknown(given: Options, algorithm: Algorithm) -> None:
+    known = Options.__annotations__
+    for name in given:
+        if name in known:
+            continue
+        if name in (item.name for item in dataclasses.fields(algorithm)):  # pyright: ignore[reportArgumentType]
+            raise InputError(f"train takes no {name}: it is a hyperparameter, as in {type(algorithm).__name__}({name}=...)")
+        hint = called_in_python(name, known) or did_you_mean(name, known)
+        raise InputError(f"train takes no {name}" + (f": {hint}" if hint else ""))

@@ -1,0 +1,385 @@
+"""One loop for every algorithm: step the environments, remember, learn, act; now and then evaluate, write and save."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
+from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
+from csac.evaluation.pool import EvaluationPool
+from csac.record.manifest import written
+from csac.record.recorder import Recorder
+from csac.record.run import MANIFEST, TABLES
+from csac.tasks.perturbations import by_step, perturbations_of, values_at
+from csac.tasks.seeds import SeedEnvironments
+from csac.training.checkpoint import Writer
+from csac.training.learner import Learner
+from csac.training.resume import ResumePoint
+from csac.types import Snapshot
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from csac.evaluation.evaluator import EvaluationEpisode
+    from csac.record.run import RunDirectory
+    from csac.tasks.making import Task
+    from csac.types import Algorithm, PolicyNetwork
+
+METRICS_INTERVAL = 1_000
+LOOK_INTERVAL = 500  # steps between two looks at what is due: rows to write, a signal, a diverged seed
+SECONDS_BETWEEN_CHECKPOINTS = 600.0
+
+
+class Program(NamedTuple):
+    """The runs that one process trains together, and how. Nothing here changes what they compute but `threads`."""
+
+    directories: tuple[Path, ...]
+    algorithm: Algorithm
+    task: Task
+    threads: int
+    """Cores that XLA divides its work for."""
+    evaluation_processes: int = 0
+    tensorboard: bool = True
+    wandb: bool | str = False
+    asks: bool = False
+    """Whether an evaluation waits to hear if training goes on (`stop_when`)."""
+    command: str | None = None
+
+
+class Watcher(Protocol):
+    """Who is told what happens, beside the run directories."""
+
+    def turn(self, step: int) -> None:
+        """Wait until it is this program's turn to train on, after so many steps."""
+        ...
+
+    def progress(self, steps: Mapping[int, int]) -> None:
+        """Take how many steps each seed has made."""
+        ...
+
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
+        """Take the mean return of each seed's evaluation; return whether training is to end."""
+        ...
+
+    def failed(self, seed: int, step: int, reason: str) -> None:
+        """Take that a seed is trained no more."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Take a line for the user."""
+        ...
+
+
+class Loop:
+    """Trains runs side by side that differ by their seeds alone.
+
+    Strict order: whatever updates the step before an action has brought are made before it. Evaluations may run in
+    processes beside this one while training goes on; their numbers are the same.
+
+    Args:
+        program: what is trained and how.
+        runs: the run directories, locked by this process.
+        points: where each run goes on, all at one step.
+        watcher: who is told.
+
+    Raises:
+        InputError: a checkpoint does not fit, or the task cannot be made.
+    """
+
+    def __init__(
+        self, program: Program, runs: Sequence[RunDirectory], points: Sequence[ResumePoint], watcher: Watcher
+    ) -> None:
+        self.runs, self.watcher, self.config = list(runs), watcher, runs[0].config
+        self.step, self.steps = points[0].step, self.config.steps
+        seeds = [run.seed for run in runs]
+        arguments = self.config.environment_arguments
+        with ExitStack() as stack:
+            self.environments = SeedEnvironments(program.task, arguments, seeds)
+            stack.callback(self.environments.close)
+            self.evaluator = _evaluator(program, self.config)
+            stack.callback(self.evaluator.close)
+            self.learner = Learner(program.algorithm, self.environments.spec, seeds, self.steps)
+            self._contract = Contract(
+                self.environments.task_name,
+                program.algorithm.name,
+                self.learner.network.activation,
+                self.learner.network.head,
+                *self.environments.contract_parts,
+            )
+            self._perturbations = perturbations_of(self.config.perturbations)
+            self._changes = dict(by_step(self._perturbations))
+            self._pending: tuple[int, list[int], list[Policy], Any] | None = None
+            self._unheard = set(self.config.events) if not len(runs[0].evaluations) else set()
+            self._begin(points)
+            self.recorders = [Recorder(run, self.step, program.tensorboard) for run in runs]
+            self._saved_at, self._saved_time = self.step, time.monotonic()
+            self.is_over = False
+            self._opened = stack.pop_all()
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Train to the last step, until no seed is left, or until a stop is asked for.
+
+        Raises:
+            OSError: a run directory can no longer be written.
+        """
+        is_asked = False
+        self.watcher.turn(self.step)
+        while self.step < self.steps and self.environments.is_any_alive and not is_asked:
+            self._advance()
+            last = self.step == self.steps
+            if self.step % METRICS_INTERVAL == 0 or last:
+                self._record_metrics()
+            looks = self.step % LOOK_INTERVAL == 0 or last
+            if looks:
+                self._stop_diverged()
+            if self._is_due(self.config.evaluation_interval) or (last and self.config.evaluation_interval):
+                is_asked = self._evaluate() or is_asked
+            if looks:
+                is_asked = self._look() or is_asked or should_stop()
+            if self._is_due(self.config.checkpoint_interval):
+                self.save()
+        self._finish()
+        self.is_over = True
+
+    def save(self) -> None:
+        """Write a checkpoint of every run, seeds that have failed included. Raises OSError."""
+        self._settle()
+        self._stop_diverged()
+        if self.step == self._saved_at or not self.environments.alive.any():
+            return
+        for index, run in enumerate(self.runs):
+            self.recorders[index].sync()
+            saved = self._snapshot(index)
+            restarts = bool(saved.values["environment"]["alive"]) and not saved.values["environment"]["exact"]
+            if restarts and not run.manifest.restarts_episode:
+                problem = saved.values["environment"]["problem"] or "its environment cannot be saved"
+                self._note(run, f"seed {run.seed}: {problem}: a resume restarts the episode in progress")
+            run.update_manifest(steps_done=self.step, restarts_episode=restarts, last_checkpoint=self.step)
+            self._writers[index].write(self.step, saved, self.learner.memory(index, self.step), _others(run))
+        self._saved_at, self._saved_time = self.step, time.monotonic()
+
+    def close(self) -> None:
+        """Close every environment, and end the processes that evaluate."""
+        for recorder in self.recorders:
+            recorder.close()
+        self._opened.close()
+
+    def _begin(self, points: Sequence[ResumePoint]) -> None:
+        """Reset the environments, or restore what `save` wrote."""
+        keep = self.config.keep_checkpoints
+        self._writers = [Writer(run.checkpoints, keep) for run in self.runs]
+        self._perturb(max(self.step - 1, 0))  # as in the step that the checkpoint came after
+        if not self.step:
+            self._observations = self.environments.reset()
+            self._actions = self.learner.next_actions(self._observations, 0)
+            return
+        self._actions = np.zeros((len(self.runs), self.environments.spec.action_size), np.float32)
+        learnt, restarted, fills = [], [], []
+        for index, (run, point) in enumerate(zip(self.runs, points, strict=True)):
+            assert point.checkpoint
+            saved, origin = point.checkpoint.state(), run.manifest.forked_from
+            learnt.append(saved.part("learner"))
+            self._actions[index] = saved.arrays["actions"]
+            environment = saved.part("environment")
+            if origin and origin.step == self.step and origin.changed("task "):
+                environment.values["exact"] = False
+            if not self.environments.take_back(index, environment):
+                restarted.append(index)
+            fills.append(self._filler(index, point))
+        self.learner.take_back(learnt, fills)
+        self._observations = self.environments.observations
+        for index, reason in self.environments.refused.items():
+            self._note(self.runs[index], f"seed {self.runs[index].seed}: {reason}: its episode restarts")
+        if restarted:
+            self.learner.break_off(restarted, self.step)
+            self._actions[restarted] = self.learner.next_actions(self._observations, self.step)[restarted]
+
+    def _filler(self, index: int, point: ResumePoint) -> Callable[[np.ndarray], None]:
+        """Return what puts a run's transitions into its rows [capacity, width]."""
+        checkpoint, run = point.checkpoint, self.runs[index]
+        assert checkpoint
+
+        def fill(rows: np.ndarray) -> None:
+            lost = checkpoint.fill(rows)
+            for text in lost:
+                self._note(run, f"warning: {text}")
+            self._writers[index] = Writer(run.checkpoints, self.config.keep_checkpoints, {} if lost else checkpoint.files)
+
+        return fill
+
+    def _advance(self) -> None:
+        """Make one environment step, and learn from it."""
+        if self.step in self._changes:
+            self._perturb(self.step)
+            for run in self.runs:
+                run.log(f"perturbed from step {self.step + 1:,} on: {self._changes[self.step]}")
+            self.watcher.note(f"perturbed from step {self.step + 1:,} on: {self._changes[self.step]}")
+        outcome = self.environments.step(self._actions)
+        self.step += 1
+        for failure in outcome.failures:
+            self._save_policy(failure.place)
+            self._fail(failure.place, failure.reason, failure.details)
+        for episode in outcome.episodes:
+            row = {"seed": self.runs[episode.place].seed, "step": self.step}
+            row |= {"return": episode.episode_return, "length": episode.length}
+            self.recorders[episode.place].add("episodes", [row])
+        self._actions = self.learner.step(self._observations, self._actions, outcome, self.step)
+        self._observations = outcome.observation
+        flat = self._actions.ravel()
+        # One product finds a nan or an inf in a third of the time of np.isfinite().all().
+        if not flat.dot(flat) < np.inf and not np.isfinite(self._actions[self.environments.alive]).all():
+            self._stop_diverged()
+
+    def _evaluate(self) -> bool:
+        """Begin to evaluate the policies of now, on the task as it was in the last step; return whether to stop."""
+        is_asked = self._settle()
+        networks = self.learner.networks()
+        places = [i for i in np.flatnonzero(self.environments.alive).tolist() if _is_finite(networks[i])]
+        policies = [Policy(networks[i], self._contract, step=self.step) for i in places]
+        self.evaluator.perturb(values_at(self._perturbations, self.step - 1))
+        self._pending = (self.step, places, policies, self.evaluator.begin(policies))
+        return is_asked or (self._pending[3].is_over and self._settle())
+
+    def _settle(self) -> bool:
+        """Wait for the evaluation in progress, if there is one, and record it; return whether to stop."""
+        if not self._pending:
+            return False
+        (step, places, policies, pending), self._pending = self._pending, None
+        returns = {}
+        for place, policy, result in zip(places, policies, pending.results(), strict=True):
+            run = self.runs[place]
+            if isinstance(result, EvaluationFailure):
+                self._note(run, f"warning: seed {run.seed}: the evaluation at step {step:,} failed: {result}")
+                continue
+            returns[run.seed] = self._record_evaluation(place, step, policy, result)
+        for text in pending.notes:
+            self._note(self.runs[0], text)
+        self._tell_unheard()
+        return self.watcher.evaluated(step, returns) if returns else False
+
+    def _record_evaluation(self, place: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> float:
+        """Record a run's evaluation, and its policy where it is the best so far; return the mean return."""
+        run, recorder = self.runs[place], self.recorders[place]
+        recorder.add("evaluations", [episode.row(run.seed, step) for episode in episodes])
+        recorder.flush()
+        mean = float(np.mean([episode.episode_return for episode in episodes]))
+        is_best = mean > recorder.best
+        recorder.best = max(mean, recorder.best)
+        policy.save_in(run.policies, ("last", "best") if is_best else ("last",))
+        run.log(f"step {step}: mean return {mean:.1f}")
+        run.update_manifest(steps_done=max(step, run.manifest.steps_done))
+        if any(episode.length >= LONGEST_EPISODE for episode in episodes):
+            self._note(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
+        return mean
+
+    def _look(self) -> bool:
+        """Write what waits, tell how far the seeds are, save by the clock; return whether to stop."""
+        is_asked = bool(self._pending and self._pending[3].is_over and self._settle())
+        for recorder in self.recorders:
+            recorder.flush()
+        alive = zip(self.runs, self.environments.alive.tolist(), strict=True)
+        self.watcher.progress({run.seed: self.step for run, is_alive in alive if is_alive})
+        if self.config.checkpoint_interval and time.monotonic() - self._saved_time >= SECONDS_BETWEEN_CHECKPOINTS:
+            self.save()
+        if self.step < self.steps:
+            self.watcher.turn(self.step)
+        return is_asked
+
+    def _finish(self) -> None:
+        """Save at the end, or where a stop was asked for; leave the newest policies."""
+        self._settle()
+        self._stop_diverged()
+        for index, alive in enumerate(self.environments.alive.tolist()):
+            self.recorders[index].flush()
+            if alive:
+                self._save_policy(index)
+                self.runs[index].update_manifest(steps_done=self.step)
+        if self.config.checkpoint_interval:
+            self.save()
+
+    def _snapshot(self, index: int) -> Snapshot:
+        learnt, environment = self.learner.save(index), self.environments.save(index)
+        arrays = {
+            **{f"learner.{name}": array for name, array in learnt.arrays.items()},
+            **{f"environment.{name}": array for name, array in environment.arrays.items()},
+            "actions": self._actions[index],
+        }
+        return Snapshot(arrays, {"learner": learnt.values, "environment": environment.values})
+
+    def _save_policy(self, index: int) -> None:
+        network = self.learner.networks()[index]
+        if _is_finite(network):
+            Policy(network, self._contract, step=self.step).save_in(self.runs[index].policies, ("last",))
+
+    def _record_metrics(self) -> None:
+        for index, metrics in enumerate(self.learner.metrics()):
+            if self.environments.alive[index]:
+                self.recorders[index].add("metrics", [{"seed": self.runs[index].seed, "step": self.step, **metrics}])
+        if self.step % METRICS_INTERVAL == 0:
+            self.learner.forget_metrics()
+
+    def _stop_diverged(self) -> None:
+        """Stop each seed whose parameters, or what they led to, are not finite. Its last checkpoint stays sound."""
+        for index in np.flatnonzero(self.environments.alive).tolist():
+            bad = self.learner.first_bad(index)
+            if bad is None and not np.isfinite(self._actions[index]).all():
+                bad = "the policy's action"
+            if bad is not None:
+                self.environments.stop(index)
+                self._fail(index, f"{bad} is not finite: learning has diverged (a lower learning rate may help)")
+
+    def _fail(self, index: int, reason: str, details: str = "") -> None:
+        run = self.runs[index]
+        run.log(f"stopped at step {self.step}: {reason}\n{details}".rstrip())
+        run.update_manifest(state="failed", failure=f"step {self.step}: {reason}", steps_done=self.step)
+        self.watcher.failed(run.seed, self.step, reason)
+
+    def _note(self, run: RunDirectory, text: str) -> None:
+        run.log(text)
+        self.watcher.note(text)
+
+    def _tell_unheard(self) -> None:
+        """Say which events no evaluation episode has held, after the first evaluation, and what there is instead."""
+        there = self.evaluator.info_names
+        for name in sorted(self._unheard - there):
+            known = ", ".join(sorted(there)) or "nothing"
+            self._note(self.runs[0], f"note: no episode's last info holds a number called {name!r}; it holds {known}")
+        self._unheard = set()
+
+    def _perturb(self, step: int) -> None:
+        """Have the task as it is in the environment step after the first `step`."""
+        if self._perturbations:
+            self.environments.perturb(values_at(self._perturbations, step))
+
+    def _is_due(self, interval: int) -> bool:
+        return bool(interval) and self.step % interval == 0
+
+
+def _evaluator(program: Program, config: Any) -> Evaluator | EvaluationPool:
+    evaluator = Evaluator(
+        program.task, config.environment_arguments, config.evaluation_episodes, config.evaluation_seed, config.events
+    )
+    if not program.evaluation_processes:
+        return evaluator
+    pool = EvaluationPool(evaluator, program.evaluation_processes)
+    pool.start()
+    return pool
+
+
+def _others(run: RunDirectory) -> dict[str, bytes]:
+    """Return what a checkpoint has beside the state: the tables, the best policy and the manifest."""
+    paths = [*map(run.table, TABLES), run.policy_file("best")]
+    contents = {path.name: path.read_bytes() for path in paths if path.exists()}
+    return {**contents, MANIFEST: written(run.manifest)}
+
+
+def _is_finite(network: PolicyNetwork) -> bool:
+    return all(np.isfinite(array).all() for array in jax.tree.leaves(network.parameters))
+

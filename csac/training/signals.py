@@ -1,0 +1,119 @@
+"""Signals while training: the first SIGINT or SIGTERM asks for a stop, the second is taken literally."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import threading
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+from csac.record.run import StorageFailure
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from csac.record.sets import RunSet
+
+
+class Interrupted(Exception):
+    """Training was stopped by a signal, and everything that can be saved is saved.
+
+    `can_resume` says whether `resume` goes on with it.
+    """
+
+    def __init__(self, runs: RunSet, signal_number: int) -> None:
+        saved = [run.manifest.last_checkpoint for run in runs.runs if run.manifest.state == "interrupted"]
+        can_resume = bool(runs.config.checkpoint_interval)
+        where = f"saved in {runs.path}" if all(saved) else f"{runs.path} has no checkpoint of every seed yet"
+        super().__init__(f"stopped by {signal.Signals(signal_number).name}; {where}")
+        self.runs, self.signal_number, self.can_resume = runs, signal_number, can_resume
+
+
+class StopRequest:
+    """The SIGINTs and SIGTERMs so far, and the handler that notes them; the second raises KeyboardInterrupt(its number)."""
+
+    def __init__(self, tell: Callable[[str], None] | None = None) -> None:
+        self.received: list[int] = []
+        self._tell, self._process = tell, os.getpid()
+
+    def __call__(self, number: int, _: Any = None) -> None:
+        if os.getpid() != self._process:  # a helper that the task has forked
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        if self.received:
+            raise KeyboardInterrupt(number)
+        self.received.append(number)
+        if self._tell:
+            self._tell("stopping at the next step where all can be saved; once more to leave at once")
+
+    def is_set(self) -> bool:
+        """Return whether a signal has come."""
+        return bool(self.received)
+
+
+@contextmanager
+def stop_requested(tell: Callable[[str], None] | None = None) -> Iterator[StopRequest]:
+    """Yield the stop request that SIGINT and SIGTERM set; SIGHUP is ignored, as a run outlives its terminal.
+
+    Within another one that is the same request: a signal to a study stops every run in it. `tell` is called with a
+    line for the user. Outside of the main thread nothing is handled.
+    """
+    outer = signal.getsignal(signal.SIGINT)
+    request = outer if isinstance(outer, StopRequest) else StopRequest(tell)
+    with _handled(request):
+        yield request
+
+
+@contextmanager
+def leaving_at_once() -> Iterator[None]:
+    """Let SIGINT and SIGTERM end this process at once, with their exit code and a line, while nothing is to be saved.
+
+    An exception in their place does not always arrive: imports and finalisers swallow some.
+    """
+
+    def leave(number: int, _: Any) -> None:
+        with suppress(OSError):
+            os.write(2, f"csac: stopped by {signal.Signals(number).name} before training\n".encode())
+        os._exit(128 + number)
+
+    with _handled(leave):
+        yield
+
+
+@contextmanager
+def _handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    if hasattr(signal, "SIGHUP"):
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        for number, former in before.items():
+            signal.signal(number, former)
+
+
+_CANNOT_WRITE = {
+    getattr(errno, name)
+    for name in (
+        *("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "ENOENT", "EIO", "EFBIG", "EMFILE", "ENFILE", "ESTALE"),
+        *("ETIMEDOUT", "ENOTDIR", "ENOTCONN", "ENODEV", "ENXIO", "EHOSTDOWN"),
+    )
+}
+
+
+@contextmanager
+def storage_failures(path: Path) -> Iterator[None]:
+    """Raise StorageFailure where a file below this folder can no longer be written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _CANNOT_WRITE and str(error.filename or path).startswith(str(path)):
+            raise StorageFailure(f"{path} cannot be written: {error.strerror}") from error
+        raise

@@ -1,0 +1,224 @@
+"""One supervisor for whatever trains in processes: starts them, hands on what they tell and signals, restarts the dead."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+import traceback
+from collections import deque
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING, Any
+
+from csac.processes import Child, die_with_parent, end, move_to, outlive_termination, usable_cores
+from csac.record.run import RunDirectory, StorageFailure
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+    from pathlib import Path
+
+    from csac.training.loop import Program, Watcher
+
+SECONDS_TO_CLOSE = 5.0  # that a process has to close its environments
+
+
+def supervise(
+    programs: Iterable[Program], watcher: Watcher, should_stop: Callable[[], bool], workers: int, turns: int | None = None
+) -> None:
+    """Run each program in a process of its own, `workers` at a time, until all are over or stopped.
+
+    A process that dies is replaced once: its runs resume from their newest checkpoint. If it dies again, they fail.
+    With `turns`, so many processes train at a time, a few hundred steps each, and the one furthest behind comes next:
+    five that share two cores at will make four fifths of the steps.
+
+    Raises:
+        InputError: a program's arguments are wrong, such as a checkpoint that does not fit.
+        StorageFailure: a run directory can no longer be written; the other programs are stopped and saved.
+    """
+    waiting, running, over = deque(programs), {}, []
+    restarted: set[tuple[Path, ...]] = set()
+    errors: list[Exception] = []
+    try:
+        while running or (waiting and not errors and not should_stop()):
+            while waiting and len(running) < workers and not errors and not should_stop():
+                worker = _Worker(waiting.popleft())
+                running[worker.connection] = worker
+            if errors or should_stop():
+                for worker in running.values():
+                    worker.stop()
+            _give_turns(running.values(), turns)
+            ready = set(wait(list(running), timeout=0.1))
+            for worker in list(running.values()):
+                is_dead = worker.process.exitcode is not None  # a helper of its task may keep its pipe open
+                if worker.connection not in ready and not is_dead:
+                    continue
+                message = worker.receive()
+                if message is None:
+                    del running[worker.connection]
+                    waiting.extend(_replace(worker, watcher, restarted, errors))
+                elif message[0] == "over":
+                    over.append(running.pop(worker.connection))
+                elif message[0] == "error":
+                    errors.append(message[1])
+                elif message[0] == "turn":
+                    worker.step, worker.has_turn = message[1], False
+                else:
+                    answer = getattr(watcher, message[0])(*message[1:])
+                    if message[0] == "evaluated" and worker.program.asks:
+                        worker.tell(("answer", bool(answer)))
+    finally:
+        for worker in running.values():
+            worker.kill()
+        end(over, SECONDS_TO_CLOSE)
+    if errors:
+        raise errors[0]
+
+
+def _give_turns(workers: Iterable[_Worker], turns: int | None) -> None:
+    """Give free turns to the workers that wait for one and are furthest behind."""
+    workers = list(workers)
+    waiting = sorted((worker for worker in workers if worker.has_turn is False), key=lambda worker: worker.step)
+    free = len(workers) if turns is None else turns - sum(worker.has_turn is True for worker in workers)
+    for worker in waiting[: max(free, 0)]:
+        worker.has_turn = True
+        worker.tell(("turn",))
+
+
+def _replace(worker: _Worker, watcher: Watcher, restarted: set[tuple[Path, ...]], errors: list[Exception]) -> list[Program]:
+    """Return the program to start again, or note how its runs failed."""
+    try:
+        reason = worker.cause_of_death()
+    except InputError as error:
+        errors.append(error)
+        return []
+    if worker.is_stopping:  # its runs go on from their newest checkpoint when they are resumed
+        return []
+    runs = [RunDirectory.open(path) for path in worker.program.directories]
+    if worker.program.directories not in restarted:
+        restarted.add(worker.program.directories)
+        for run in runs:
+            run.log(f"{reason}; its process is restarted")
+        watcher.note(f"{_seeds(runs)}: {reason}; restarting from the newest checkpoint")
+        return [worker.program]
+    for run in runs:
+        if run.manifest.state == "running":
+            step = run.manifest.steps_done
+            run.log(f"stopped at step {step}: {reason}")
+            run.update_manifest(state="failed", failure=f"step {step}: {reason}")
+            watcher.failed(run.seed, step, f"{reason}, for the second time")
+    return []
+
+
+class _Worker(Child):
+    """The parent's end of one program's process."""
+
+    def __init__(self, program: Program) -> None:
+        super().__init__(_work, program, daemon=False)
+        self.program, self.is_stopping = program, False
+        self.has_turn: bool | None = None  # False while it waits for one, None before it has asked
+        self.step = 0
+
+    def receive(self) -> tuple[Any, ...] | None:
+        """Return the next message, or None where the process is gone."""
+        with suppress(EOFError, OSError):
+            if self.connection.poll(0.0) or self.process.exitcode is None:
+                return self.connection.recv()
+        return None
+
+    def stop(self) -> None:
+        """Ask the process to save and end."""
+        if not self.is_stopping:
+            self.is_stopping = True
+            self.tell(("stop",))
+
+
+def _work(connection: Connection, program: Program) -> None:
+    """Train a program in a process of its own."""
+    die_with_parent()
+    outlive_termination()
+    begin_with(program.threads)
+    from csac.training.train import train_program
+
+    watcher = _RemoteWatcher(connection, program.asks)
+    try:
+        train_program(program, watcher, watcher.stopped.is_set)
+        connection.send(("over",))
+    except (BrokenPipeError, EOFError, ConnectionResetError):
+        return  # the parent is gone
+    except (InputError, StorageFailure) as error:
+        connection.send(("error", error))
+        connection.send(("over",))
+    except Exception as error:
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        for path in program.directories:
+            run = RunDirectory.open(path)
+            run.log(f"{reason}\n{traceback.format_exc()}")
+            run.update_manifest(state="failed", failure=f"step {run.manifest.steps_done}: {reason}")
+            connection.send(("failed", run.seed, run.manifest.steps_done, reason))
+        connection.send(("over",))
+
+
+class _RemoteWatcher:
+    """Hands what happens to the parent, and hears from it in a thread of its own."""
+
+    def __init__(self, connection: Connection, asks: bool) -> None:
+        self._connection, self._asks = connection, asks
+        self.stopped = threading.Event()
+        self._answers: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._turns: queue.SimpleQueue[None] = queue.SimpleQueue()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def turn(self, step: int) -> None:
+        if not self.stopped.is_set():
+            self._connection.send(("turn", step))
+            self._turns.get()
+
+    def progress(self, steps: Mapping[int, int]) -> None:
+        self._connection.send(("progress", dict(steps)))
+
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
+        self._connection.send(("evaluated", step, dict(returns)))
+        return self._asks and self._answers.get()
+
+    def failed(self, seed: int, step: int, reason: str) -> None:
+        self._connection.send(("failed", seed, step, reason))
+
+    def note(self, text: str) -> None:
+        self._connection.send(("note", text))
+
+    def _listen(self) -> None:
+        while not self.stopped.is_set():
+            try:
+                message = self._connection.recv()
+            except (EOFError, OSError):
+                message = ("stop",)
+            if message[0] == "answer":
+                self._answers.put(message[1])
+                continue
+            if message[0] == "stop":
+                self.stopped.set()
+                self._answers.put(True)
+            self._turns.put(None)
+
+
+def begin_with(threads: int) -> None:
+    """Have XLA divide its work for so many cores, and let this process run on every one.
+
+    XLA sizes its threads by the cores that it sees when JAX first looks for devices; later this does nothing.
+    """
+    import jax
+
+    cores = usable_cores()
+    if threads >= len(cores):
+        return
+    move_to(cores[os.getpid() % (len(cores) - threads + 1) :][:threads])
+    try:
+        jax.devices()
+    finally:
+        move_to(cores)
+
+
+def _seeds(runs: list[RunDirectory]) -> str:
+    return f"seed{'s' if len(runs) > 1 else ''} {', '.join(str(run.seed) for run in runs)}"
