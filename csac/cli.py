@@ -210,7 +210,7 @@ def _evaluate(arguments: list[str]) -> int:
     from csac.deploy.choosing import step_of_policy
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.play import evaluate_run, perturbation_notes
-    from csac.record.csv_tables import COLUMNS, check_new, write_rows
+    from csac.record.tables import COLUMNS, check_new, write_rows
     from csac.record.run import RunDirectory
 
     console = make_console()
@@ -343,7 +343,7 @@ def _latency(arguments: list[str]) -> int:
     from csac.console.tables import make_console
     from csac.deploy.artefact import open_artefact
     from csac.evaluation.latency import check_measurement, measure
-    from csac.record.csv_tables import check_new
+    from csac.record.tables import check_new
 
     console, measured = make_console(), {}
     if options.plot:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.types import InputError, Spec
 
 if TYPE_CHECKING:

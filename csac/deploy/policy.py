@@ -12,7 +12,7 @@ from csac.checks import check_flag, check_path
 from csac.deploy import tensors
 from csac.deploy.contract import Activation, Contract, read_file
 from csac.deploy.parameters import check_network, copied, from_tensors, to_tensors
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork
 
 CONTRACT, SAVED = "contract.json", "policy.safetensors"  # in the folder of a policy that was saved by itself
@@ -130,6 +130,13 @@ class Policy:
             self.save_layers(folder / SAVED)
         except OSError as error:
             raise InputError(f"{folder} cannot be written: {error.strerror}") from error
+
+    def save_in(self, folder: Path, names: tuple[str, ...]) -> None:
+        """Stand-in."""
+        folder.mkdir(exist_ok=True)
+        self.contract.save(folder / CONTRACT)
+        for name in names:
+            self.save_layers(folder / f"{name}.safetensors")
 
     def save_layers(self, path: str | Path) -> None:
         """Write the layers alone as safetensors, and the step, whole or not at all; a contract belongs to them."""

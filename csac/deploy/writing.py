@@ -15,7 +15,7 @@ from csac.deploy.artefact_contract import CONTRACT, POLICY_FILES, sha256_of
 from csac.deploy.contract import read_json
 from csac.deploy.parameters import to_tensors
 from csac.deploy.templates import LOADER
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.types import InputError
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from csac.deploy.guards import Guards, make_guards
 from csac.deploy.policy import Policy
 from csac.deploy.writing import CARD, CURVE, check_place, placed, write_artefact, write_contract
 from csac.evaluation.verify import Compared, Returns, compare_actions, compare_returns, record, returns_as_fields
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.record.run import RunDirectory, Which
 from csac.record.statistics import last_evaluations
 from csac.tasks.environment import Environment

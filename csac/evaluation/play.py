@@ -14,7 +14,7 @@ from csac.checks import check_flag
 from csac.deploy.choosing import has_policy, load, no_policies
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
-from csac.record.atomic import check_name
+from csac.record.files import check_name
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
 from csac.tasks.known import adapter_of

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.record.curves import INTERVAL, NEXT, curves_of, last_step, limits, note
 from csac.record.rendering import short
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from csac.record.csv_tables import COLUMNS
+from csac.record.tables import COLUMNS
 from csac.record.curve_measures import Recovery, recovery
 from csac.record.statistics import (
     FEWEST_FOR_INTERVAL,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from csac.record.atomic import check_name, name_aside
+from csac.record.files import check_name, name_aside
 from csac.types import InputError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.record.scalars import Point, Scalars
 from csac.types import InputError
 

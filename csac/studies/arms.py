@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
-from csac.record.csv_tables import COLUMNS, structured
+from csac.record.tables import COLUMNS, structured
 from csac.record.statistics import evaluation_matrix, maximum_average_return
 from csac.record.summaries import over_seeds
 from csac.types import InputError

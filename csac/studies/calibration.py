@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.processes import Child, die_with_parent, end, move_to, outlive_termination, usable_cores
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_type_h
 from csac.algorithms import ALGORITHMS
 from csac.checks import did_you_mean
 from csac.console.tables import short
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.record.run import LOCK, MANIFEST, RunDirectory, is_locked, is_run
 from csac.tasks.known import events_of
 from csac.tasks.perturbations import perturbations_of

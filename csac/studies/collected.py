@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from csac.record import manifest as manifests
-from csac.record.csv_tables import read_rows
+from csac.record.tables import read_rows
 from csac.types import InputError
 
 if TYPE_CHECKING:

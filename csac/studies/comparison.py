@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from csac.checks import check_whole
-from csac.record.csv_tables import check_ends, read_evaluations, read_rows
+from csac.record.tables import check_ends, read_evaluations, read_rows
 from csac.record.manifest import STEPS_LIMIT
 from csac.record.run import RunDirectory, find_runs, is_run
 from csac.record.summaries import case_names, last_rows

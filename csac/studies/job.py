@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from csac.record.csv_tables import COLUMNS, read_rows, write_rows
+from csac.record.tables import COLUMNS, read_rows, write_rows
 from csac.record.run import Occupied, RunDirectory, is_run
 from csac.studies.cells import LOST_EPISODE, Cell, is_final, is_in_use, read_history, restarting_seeds, write_history
 from csac.studies.collected import ROLLOUTS

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from csac.record import rendering
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.record.rendering import Table
 from csac.types import InputError
 

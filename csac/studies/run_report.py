@@ -6,7 +6,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.record.plots import learning_curve
 from csac.record.rendering import Cell, Row, Table, between_markers, markdown
 from csac.record.summary_tables import case_comparison_table, comparison_table

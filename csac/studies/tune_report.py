@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from csac.record.atomic import write_atomically
+from csac.record.files import write_atomically
 from csac.record.plots import COLOURS, STYLE, grouped, save
 from csac.record.rendering import EMPTY, Cell, Row, Table, markdown, number, numeric
 from csac.studies.cells import complete

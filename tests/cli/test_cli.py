@@ -18,7 +18,7 @@ from typed import NOTHING, SUPPORT, TINY, Pictures, csac, make_run, words
 import csac.training.train as training
 from csac.cli import main
 from csac.commands import Chosen
-from csac.record.csv_tables import read_rows
+from csac.record.tables import read_rows
 from csac.record.manifest import Origin
 from csac.record.run import RunDirectory
 from csac.training import interruptions

@@ -17,7 +17,7 @@ from csac.cli import main
 from csac.deploy.contract import Contract
 from csac.evaluation import play as playing
 from csac.evaluation.play import evaluate_run, play
-from csac.record.csv_tables import read_rows
+from csac.record.tables import read_rows
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.types import InputError

@@ -14,8 +14,8 @@ import pytest
 from csac.deploy.choosing import load
 from csac.record import csv_tables
 from csac.record import run as record
-from csac.record.atomic import write_atomically
-from csac.record.csv_tables import COLUMNS, check_new, read_rows, write_rows
+from csac.record.files import write_atomically
+from csac.record.tables import COLUMNS, check_new, read_rows, write_rows
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory, find_runs
 from csac.types import InputError

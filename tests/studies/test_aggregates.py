@@ -7,7 +7,7 @@ import numpy as np
 import plotly.graph_objects
 import pytest
 
-from csac.record.csv_tables import COLUMNS, structured
+from csac.record.tables import COLUMNS, structured
 from csac.record.rendering import Table, markdown
 from csac.studies.aggregates import Block, largest_block, over_tasks, profiles
 from csac.studies.arms import Arm

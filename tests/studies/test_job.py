@@ -14,7 +14,7 @@ from shown import Clock
 from studying import cell, jobs, make_run
 
 from csac.evaluation.evaluator import EvaluationEpisode
-from csac.record.csv_tables import COLUMNS, write_rows
+from csac.record.tables import COLUMNS, write_rows
 from csac.record.run import RunDirectory
 from csac.studies import job as module
 from csac.studies.cells import Store, is_in_use, read_history, write_history

@@ -1,6 +1,6 @@
 """How steadily methods learn, worked by hand."""
 
-from csac.record.csv_tables import COLUMNS, structured
+from csac.record.tables import COLUMNS, structured
 from csac.record.rendering import markdown
 from csac.studies.arms import Arm
 from csac.studies.stability import stability_table

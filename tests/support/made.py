@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from csac.record.csv_tables import structured
+from csac.record.tables import structured
 from csac.record.manifest import EvaluationPlan, Machine, Manifest
 from csac.record.run import RunDirectory
 from csac.studies.cells import Cell

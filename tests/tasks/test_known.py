@@ -30,7 +30,7 @@ from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import EPISODES_AT_ONCE, EvaluationFailure, Evaluator, _number
 from csac.evaluation.play import evaluate_run
 from csac.evaluation.pool import EvaluationPool, choose_processes
-from csac.record.csv_tables import read_rows
+from csac.record.tables import read_rows
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.tasks import known
