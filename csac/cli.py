@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from contextlib import AbstractContextManager
 
-    from csac.record.manifest import Manifest
-    from csac.record.run import RunDirectory
+    from csac.record.sets import RunSet
 
 HELP = """\
 usage: csac COMMAND ...
@@ -126,7 +125,7 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def _signals_before_training() -> AbstractContextManager[None]:
-    from csac.training.interruptions import leaving_at_once  # NumPy comes with it
+    from csac.training.signals import leaving_at_once  # NumPy comes with it
 
     return leaving_at_once()
 
@@ -146,6 +145,10 @@ def _train(arguments: list[str]) -> int:
         lambda: train(
             getattr(options, chosen.algorithm),
             options.task,
+            seeds=options.seeds,
+            first_seed=options.first_seed,
+            seeds_per_process=options.seeds_per_process,
+            evaluation_processes=options.evaluation_processes,
             directory=options.directory,
             resume=options.resume,
             start_from=options.start_from,
@@ -183,24 +186,22 @@ def _resume(arguments: list[str]) -> int:
     )
 
 
-def _exit_code(training: Callable[[], RunDirectory]) -> int:
+def _exit_code(training: Callable[[], RunSet]) -> int:
     """Train, and turn how it ended into an exit code and, where it did not reach its end, the line to type next."""
     from csac.console.tables import program
     from csac.record.run import StorageFailure
-    from csac.training.interruptions import Interrupted, StoppedAtOnce
+    from csac.training.signals import Interrupted
 
     try:
-        run = training()
-    except (Interrupted, StoppedAtOnce) as stop:
-        line = f"; to go on, type: {program()} resume {shlex.quote(str(stop.run.path))}" if stop.can_go_on else ""
-        if isinstance(stop, Interrupted):
-            return _complain(f"{stop}{line}", 128 + stop.signal_number)
-        return _complain(
-            f"stopped at once: what {stop.run.path} did since its last checkpoint is lost{line}", _code(stop)
-        )
+        runs = training()
+    except Interrupted as stop:
+        line = f"; to go on, type: {program()} resume {shlex.quote(str(stop.runs.path))}" if stop.can_resume else ""
+        return _complain(f"{stop}{line}", 128 + stop.signal_number)
+    except KeyboardInterrupt as second:
+        return _complain("stopped at once: what was done since the last checkpoint is lost", _code(second))
     except StorageFailure as failure:
         return _complain(f"{failure}; the run can go on from its last checkpoint (csac resume) once that is mended", 1)
-    return 3 if run.manifest.state == "failed" else 0
+    return 3 if runs.failures else 0
 
 
 def _evaluate(arguments: list[str]) -> int:
@@ -210,8 +211,8 @@ def _evaluate(arguments: list[str]) -> int:
     from csac.deploy.choosing import step_of_policy
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.play import evaluate_run, perturbation_notes
+    from csac.record.sets import RunSet
     from csac.record.tables import COLUMNS, check_new, write_rows
-    from csac.record.run import RunDirectory
 
     console = make_console()
     told = perturbation_notes(options.run, options.perturb)
@@ -237,22 +238,22 @@ def _evaluate(arguments: list[str]) -> int:
         return _complain(error, 1)
     for line in told:
         console.print(line, soft_wrap=True)
-    run = RunDirectory.open(options.run)
-    manifest = run.manifest
-    console.print(evaluation_table(results, manifest.failures))
-    sound = {seed: episodes for seed, episodes in results.items() if seed not in manifest.failures}
+    runs = RunSet.open(options.run)
+    failures = runs.failures
+    console.print(evaluation_table(results, failures))
+    sound = {seed: episodes for seed, episodes in results.items() if seed not in failures}
     if (cases := case_table(sound)) is not None:
         console.print(cases)
     for name in silent_events(results):
         _say(f"note: no episode's last info holds a number called {name!r}")
-    if options.seed is None and (others := [one for one in run.seeds_with_policies() if one not in results]):
+    if options.seed is None and (others := [one for one in runs.seeds if one not in results]):
         names = ", ".join(map(str, others))
-        _say(f"note: not tested, never evaluated in training and so without a best policy: seed {names}")
-    for seed in sorted(results.keys() & manifest.failures.keys()):
-        _say(f"note: seed {seed} failed at {manifest.failures[seed]}; it is in no mean, and in no file of rows")
-    _tell_of_warmup(manifest)
+        _say(f"note: not tested, without such a policy yet: seed {names}")
+    for seed in sorted(results.keys() & failures.keys()):
+        _say(f"note: seed {seed} failed at {failures[seed]}; it is in no mean, and in no file of rows")
+    _tell_of_warmup(runs)
     if options.csv:
-        steps = {seed: step_of_policy(run, seed, options.checkpoint) for seed in sound}
+        steps = {seed: step_of_policy(runs.run(seed), options.checkpoint) for seed in sound}
         rows = [episode.row(seed, steps[seed]) for seed, episodes in sound.items() for episode in episodes]
         if not rows:
             return _complain(f"{options.csv} is not written: every seed that was tested had failed in training", 1)
@@ -300,7 +301,7 @@ def _export(arguments: list[str]) -> int:
     from csac.console.waiting import progress_shown
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.export import export_run
-    from csac.record.run import RunDirectory
+    from csac.record.sets import RunSet
 
     console, exported = make_console(), []
     try:
@@ -324,13 +325,14 @@ def _export(arguments: list[str]) -> int:
         console.print(sizes)
     for line in dict.fromkeys(line for one in exported for line in one.notes):  # most are of every format's
         _say(f"note: {line}")
-    _tell_of_warmup(RunDirectory.open(options.run).manifest)
+    _tell_of_warmup(RunSet.open(options.run))
     return 0
 
 
-def _tell_of_warmup(manifest: Manifest) -> None:
+def _tell_of_warmup(runs: RunSet) -> None:
     """Say where a policy is as it began, since its run was stopped in the warm-up."""
-    warmup = manifest.hyperparameters.get("warmup_steps", 0)
+    manifest = runs.runs[0].manifest
+    warmup = manifest.config.hyperparameters.get("warmup_steps", 0)
     if manifest.steps_done < warmup and not manifest.forked_from:
         _say(f"note: this policy has never learnt: {manifest.steps_done:,} of {warmup:,} warm-up steps are done")
 
@@ -365,11 +367,11 @@ def _latency(arguments: list[str]) -> int:
 def _runs(arguments: list[str]) -> int:
     options = parse(Runs, arguments, "csac runs")
     from csac.console.tables import make_console, print_runs
-    from csac.record.run import find_runs
+    from csac.record.sets import find_sets
 
     is_default = options.directory == Path("runs")
     damaged: list[InputError] = []
-    runs = [] if is_default and not options.directory.exists() else find_runs(options.directory, damaged.append)
+    runs = [] if is_default and not options.directory.exists() else find_sets(options.directory, damaged.append)
     if runs:
         print_runs(make_console(), runs)
     for error in damaged:
@@ -440,7 +442,7 @@ def _tune(arguments: list[str]) -> int:
         environment_arguments=json_object("--env-kwargs", options.env_kwargs),
     )
     try:
-        return run_tune(question, options.home(), options.trials, options.groups, arguments)
+        return run_tune(question, options.home(), options.trials, arguments)
     except StorageFailure as failure:
         return _complain(f"{failure}; the same line goes on once that is mended", 1)
 

@@ -17,8 +17,8 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from csac.evaluation.export import ExportOptions
-    from csac.record.manifest import Manifest
-    from csac.training.options import PlanOptions
+    from csac.record.sets import RunSet
+    from csac.training.config import TrainOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,23 +56,22 @@ class Train(Options):
             "action_noise. With --from, none drops what that run had planned.",
         ),
     ] = ()
-    groups: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
-    """Processes to split the seeds over."""
+    seeds_per_process: Annotated[int | None, arg(help_behavior_hint="(default: 1 on a CPU, a few on a GPU)")] = None
+    """Seeds that train in one program."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
-    """Processes per group that evaluate while it trains on; 0 evaluates in between. The results are the same."""
+    """Processes per program that evaluate while it trains on; 0 evaluates in between. The results are the same."""
     wandb: FlagCreatePairsOff[bool] = False
     """Also log to Weights & Biases: one run per seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
 
-    def plan_options(self) -> PlanOptions:
+    def plan_options(self) -> TrainOptions:
         """Return the options of `train` that are given here."""
-        same = {item.name: getattr(self, item.name) for item in dataclasses.fields(Options)}
+        names = {item.name for item in dataclasses.fields(Options)} - {"seeds", "first_seed"}
+        same = {name: getattr(self, name) for name in names}
         options: Any = {
             **same,
             "environment_arguments": json_object("--env-kwargs", self.env_kwargs),
             "perturbations": _perturbations(self.perturb),
             "events": None if self.events is None else self.events.split(","),
-            "groups": self.groups,
-            "evaluation_processes": self.evaluation_processes,
         }
         return options
 
@@ -112,8 +111,6 @@ class Tune(Options):
     """The directory of the search: new, empty, or of the same search."""
     env_kwargs: Annotated[str, arg(metavar="JSON")] = "{}"
     """Keyword arguments for the environment, as a JSON object."""
-    groups: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
-    """Processes to split the seeds of a trial over."""
 
     def home(self) -> Path:
         """Return the study's directory."""
@@ -340,7 +337,7 @@ class Chosen(NamedTuple):
 
     algorithm: str
     preset: str | None
-    source: Manifest | None
+    source: RunSet | None
     """Of the run to begin with."""
 
     @classmethod
@@ -350,11 +347,11 @@ class Chosen(NamedTuple):
 
         source = None
         if (where := peek(arguments, "--from", None)) is not None:
-            from csac.training.plan import Before
+            from csac.record.sets import RunSet
 
-            before = Before.find(peek(arguments, "--directory", None), "--resume" in arguments, where)
-            source = before.run.manifest if before.run else None
-        name = peek(arguments, "--algorithm", source.algorithm if source else "csac")
+            name, at, _ = where.rpartition("@")
+            source = RunSet.open(name if at and not Path(where).exists() else where)
+        name = peek(arguments, "--algorithm", source.config.algorithm if source else "csac")
         if name not in ALGORITHMS:
             hint = nearest(name, ALGORITHMS) or f": choose {' or '.join(ALGORITHMS)}"
             raise InputError(f"no algorithm is called {name!r}{hint}")
@@ -372,10 +369,10 @@ class Chosen(NamedTuple):
         values = hyperparameters(self.preset, self.algorithm, task) if self.preset else {}
         algorithm, fields = ALGORITHMS[self.algorithm](**values), []
         if self.source:
-            from csac.training.plan import algorithm_of
+            from csac.training.config import algorithm_of
 
-            is_same = self.source.algorithm == self.algorithm and not self.preset
-            algorithm = algorithm_of(self.source) if is_same else algorithm
+            is_same = self.source.config.algorithm == self.algorithm and not self.preset
+            algorithm = algorithm_of(self.source.config) if is_same else algorithm
             fields += [(name, kind, field(default=value)) for name, kind, value in _inherited(self.source)]
         fields += [
             ("algorithm", Literal[tuple(ALGORITHMS)], field(default=self.algorithm)),
@@ -387,9 +384,9 @@ class Chosen(NamedTuple):
             base.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace=documented
         )
 
-    def inherited(self) -> PlanOptions:
+    def inherited(self) -> TrainOptions:
         """Return what a run takes from the one that it begins with and no option tells."""
-        return {"evaluation_seed": self.source.evaluation.first_seed} if self.source else {}
+        return {"evaluation_seed": self.source.config.evaluation_seed} if self.source else {}
 
     def others(self) -> dict[str, type[Any]]:
         """Return the algorithms that were not chosen, by name."""
@@ -398,15 +395,15 @@ class Chosen(NamedTuple):
         return {name: kind for name, kind in ALGORITHMS.items() if name != self.algorithm}
 
 
-def _inherited(source: Manifest) -> list[tuple[str, Any, Any]]:
+def _inherited(source: RunSet) -> list[tuple[str, Any, Any]]:
     """Return the options of `Train`, with their types, that a run takes from the one it begins with."""
     return [
-        ("steps", int, source.steps),
+        ("steps", int, source.config.steps),
         ("seeds", int, len(source.seeds)),
         ("first_seed", int, source.seeds[0]),
-        ("evaluation_interval", int, source.evaluation.interval),
-        ("evaluation_episodes", int, source.evaluation.episodes),
-        ("env_kwargs", Annotated[str, arg(metavar="JSON")], json.dumps(source.environment_arguments)),
+        ("evaluation_interval", int, source.config.evaluation_interval),
+        ("evaluation_episodes", int, source.config.evaluation_episodes),
+        ("env_kwargs", Annotated[str, arg(metavar="JSON")], json.dumps(source.config.environment_arguments)),
     ]
 
 

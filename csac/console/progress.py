@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console, RenderableType
 
-    from csac.record.manifest import Manifest
-    from csac.record.run import RunDirectory
+    from csac.record.sets import RunSet
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 CURVE_WIDTH = 24
@@ -52,20 +51,29 @@ class Reporter:
         self._begin = 0
         self._curves: dict[int, list[float]] = {}
         self._failed: dict[int, str] = {}
+        self._waiting: dict[int, dict[int, float]] = {}  # evaluations that some seeds have not passed yet
         self._just_told: set[int] = set()  # failed seeds of which the last lines tell
         self._evaluated_at = 0
         self._speed = Speed(clock)
         self._began = self._spoke = clock()
 
-    def start(
-        self, task: str, algorithm: str, seeds: list[int], steps: int, directory: str | Path, notes: Sequence[str] = ()
-    ) -> None:
-        """Say what is trained and where it goes; `steps` are environment steps per seed."""
-        self._steps, self._directory = steps, str(directory)
-        self._done = dict.fromkeys(seeds, 0)
+    def start(self, runs: RunSet, notes: Sequence[str] = ()) -> None:
+        """Say what is trained and where it goes, and from where each seed goes on."""
+        config, seeds = runs.config, runs.seeds
+        self._steps, self._directory = config.steps, str(runs.path)
+        self._done = {run.seed: run.manifest.steps_done for run in runs.runs}
+        self._begin = min(self._done.values())
         self._curves = {seed: [] for seed in seeds}
+        steps, known, returns = evaluation_matrix(runs.evaluations)
+        self._evaluated_at = int(steps.max(initial=0))
+        for seed, line in zip(known.tolist(), returns, strict=True):
+            self._curves[seed] = line[~np.isnan(line)].tolist()
         self._began = self._spoke = self._clock()
-        self._print(Text.assemble((f"{algorithm} on {task}", "bold"), f", {_seeds(seeds)}, {steps:,} steps each"))
+        self._print(
+            Text.assemble(
+                (f"{config.algorithm} on {config.task}", "bold"), f", {_seeds(seeds)}, {config.steps:,} steps each"
+            )
+        )
         self._print(Text(self._directory, "dim"))
         for note in notes:
             self._print(Text(note, "dim"))
@@ -73,16 +81,6 @@ class Reporter:
             self._print(Text())
             self._live = Live(get_renderable=self._display, console=self.console, refresh_per_second=2, transient=True)
             self._live.start()
-
-    def go_on(self, step: int, evaluations: np.ndarray, failures: Mapping[int, str]) -> None:
-        """Show what was there when the run was taken up again at `step`."""
-        self._failed = {seed: f"failed at {reason}" for seed, reason in failures.items()}
-        self._begin = step
-        self._done.update(dict.fromkeys(self._done, step))
-        steps, seeds, returns = evaluation_matrix(evaluations)
-        self._evaluated_at = int(steps.max(initial=0))
-        for seed, line in zip(seeds.tolist(), returns, strict=True):
-            self._curves[seed] = line[~np.isnan(line)].tolist()
 
     def progress(self, steps_by_seed: Mapping[int, int]) -> None:
         """Note how far each seed is."""
@@ -98,10 +96,14 @@ class Reporter:
         for seed, value in returns.items():
             self._curves[seed].append(value)
             self._done[seed] = max(step, self._done[seed])  # it may be told of before the step is
-        if not self._live and returns:
-            mean = float(np.mean(list(returns.values())))
-            text = f"step {step:,} of {self._steps:,}: mean return {number(mean)}{_spread(returns)}"
+        waiting = self._waiting.setdefault(step, {})
+        waiting.update(returns)
+        if not self._live and waiting.keys() >= self._living().keys():  # one line once all seeds have passed it
+            mean = float(np.mean(list(waiting.values())))
+            text = f"step {step:,} of {self._steps:,}: mean return {number(mean)}{_spread(waiting)}"
             self._say(text + self._pace())
+        if waiting.keys() >= self._living().keys():
+            del self._waiting[step]
 
     def failed(self, seed: int, step: int, reason: str) -> None:
         """Show that a seed has stopped; the others go on."""
@@ -113,24 +115,24 @@ class Reporter:
         """Show one line about the run as a whole."""
         self._print(Text(text, "dim"))
 
-    def finish(self, run: RunDirectory) -> None:
+    def finish(self, runs: RunSet) -> None:
         """Replace the display by the results, and say where they are and what to type next."""
         self.close()
         self._print(Text())
-        self._print(Text(_outcome(run.manifest, duration(self._clock() - self._began)), "bold"))
-        evaluations = run.evaluations
+        self._print(Text(_outcome(runs, duration(self._clock() - self._began)), "bold"))
+        evaluations = runs.evaluations
         if len(evaluations):
-            self._print(results_table(run))
-            if (events := events_table(run.sound_evaluations)) is not None:
+            self._print(results_table(runs))
+            if (events := events_table(runs.sound_evaluations)) is not None:
                 self._print(events)
-            for table in recovery_tables(run):
+            for table in recovery_tables(runs):
                 self._print(table)
         else:
             self._print(Text("no evaluations yet"))
-        for seed, reason in run.manifest.failures.items():
+        for seed, reason in runs.failures.items():
             if seed not in self._just_told:
                 self._print(Text(f"seed {seed} failed at {reason}", "red"))
-        self._print_next(run, bool(len(evaluations)))
+        self._print_next(runs, bool(len(evaluations)))
 
     def close(self) -> None:
         """Give the terminal back as it was. May be called at any time, and again."""
@@ -138,23 +140,19 @@ class Reporter:
             self._live.stop()
             self._live = None
 
-    def _print_next(self, run: RunDirectory, has_curve: bool) -> None:
-        directory, csac = shlex.quote(str(run.path)), program()
-        one, film = run.manifest, shlex.quote(str(run.path / "play.mp4"))
-        is_sound = len(one.failures) < len(one.seeds)
-        log = run.path / "log.txt"
-        lines = [("why", f"the traceback is in {log}")] if one.failures and _has_traceback(log) else []
-        lines += [("curve", str(run.path / "curve.png"))] if has_curve else []
-        # A failed seed that was never evaluated would fail in a test as well: its task does not run.
-        if one.steps_done and run.seeds_with_policies() and (is_sound or has_curve):
-            if one.task_is_callable:  # which no command line can name
-                task = one.task if one.task.isidentifier() else "your_task"
-                more = f", environment_arguments={one.environment_arguments}" if one.environment_arguments else ""
-                lines += [("test it", f"in Python: evaluate(load({str(run.path)!r}), {task}{more})")] * is_sound
-            else:
-                lines.append(("test it", f"{csac} evaluate {directory}"))
-                is_seen = is_sound and can_be_drawn(one.task)
-                lines += [("watch it", f"{csac} play {directory} --video {film}")] * is_seen
+    def _print_next(self, runs: RunSet, has_curve: bool) -> None:
+        directory, csac, config = shlex.quote(str(runs.path)), program(), runs.config
+        film, failed = shlex.quote(str(runs.path / "play.mp4")), runs.failures
+        logs = [run.path / "log.txt" for run in runs.runs if run.seed in failed]
+        lines = [("why", f"the traceback is in {log}") for log in logs if _has_traceback(log)]
+        lines += [("curve", str(runs.curve))] if has_curve else []
+        has_policy = any(run.policy_file().exists() for run in runs.runs if run.seed not in failed)
+        if has_policy and config.task_is_callable:  # which no command line can name
+            task = config.task if config.task.isidentifier() else "your_task"
+            lines.append(("test it", f"in Python: evaluate(load({str(runs.path)!r}), {task})"))
+        elif has_policy:
+            lines.append(("test it", f"{csac} evaluate {directory}"))
+            lines += [("watch it", f"{csac} play {directory} --video {film}")] * can_be_drawn(config.task)
         for label, line in lines:
             self._print(Text.assemble((f"{label:<9}", "dim"), line))
 
@@ -249,10 +247,10 @@ def _has_traceback(log: Path) -> bool:
     return log.exists() and "\nTraceback (most recent" in log.read_text(encoding="utf-8", errors="replace")
 
 
-def _outcome(manifest: Manifest, time_taken: str) -> str:
-    steps, failed, seeds = f"{manifest.steps_done:,}", len(manifest.failures), len(manifest.seeds)
-    if manifest.state == "interrupted":
-        return f"stopped at step {steps} of {manifest.steps:,} after {time_taken}"
+def _outcome(runs: RunSet, time_taken: str) -> str:
+    steps, failed, seeds = f"{runs.steps_done:,}", len(runs.failures), len(runs.seeds)
+    if runs.state in ("interrupted", "killed", "running"):
+        return f"stopped at step {steps} of {runs.config.steps:,} after {time_taken}"
     if failed == seeds:
         return f"failed at step {steps} after {time_taken}"
     return f"finished {steps} steps in {time_taken}" + (f", but {failed} of {seeds} seeds failed" if failed else "")

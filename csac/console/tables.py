@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rich.console import ConsoleOptions
 
     from csac.evaluation.evaluator import EvaluationEpisode
-    from csac.record.run import RunDirectory
+    from csac.record.sets import RunSet
 
 STATE_STYLES = {"running": "cyan", "finished": "green", "failed": "red", "interrupted": "yellow", "killed": "red"}
 WIDTH_ELSEWHERE = 200  # characters where there is no terminal: lines stay whole for grep
@@ -111,19 +111,19 @@ class Fitted:
         return part
 
 
-def results_table(run: RunDirectory) -> Fitted:
+def results_table(run: RunSet) -> Fitted:
     """Return the results of a run, one row per seed, and below them what the seeds that did not fail have in common."""
     trained, episodes = np.unique(run.rows("episodes")["seed"], return_counts=True)
     counts = dict(zip(trained.tolist(), episodes.tolist(), strict=True))
     return Fitted(summary_tables.results_table(run_results(run.evaluations, _failed(run), counts)))
 
 
-def recovery_tables(run: RunDirectory) -> list[Fitted]:
+def recovery_tables(run: RunSet) -> list[Fitted]:
     """Return a table for each step at which the task was perturbed: what it cost each seed, and how it came back.
 
     Each looks as far as the next perturbation. There is none where no evaluation lies before the step or none after it.
     """
-    perturbed = by_step(perturbations_of(run.manifest.perturbations))
+    perturbed = by_step(perturbations_of(run.config.perturbations))
     costs = perturbation_recoveries(run.evaluations, perturbed, _failed(run))
     return [Fitted(summary_tables.recovery_table([cost])) for cost in costs]
 
@@ -178,7 +178,7 @@ def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[st
     return [name for name in names if all(episode.events.get(name) is None for episode in episodes)]
 
 
-def print_runs(console: Console, runs: Sequence[RunDirectory]) -> None:
+def print_runs(console: Console, runs: Sequence[RunSet]) -> None:
     """Print what was trained in each run, how far it is, its last return and where it is.
 
     The last return is the mean over the seeds that have not failed.
@@ -190,9 +190,9 @@ def print_runs(console: Console, runs: Sequence[RunDirectory]) -> None:
     for heading in headings:
         table.add_column(heading, justify="right" if heading in ("seeds", "steps", "last return") else "left")
     for run in runs:
-        manifest, state, last = run.manifest, run.state, _last_return(run)
-        task, algorithm, seeds = manifest.task, manifest.algorithm, len(manifest.seeds)
-        steps = f"{short(manifest.steps_done)} / {short(manifest.steps)}"
+        state, last, config = run.state, _last_return(run), run.config
+        task, algorithm, seeds = config.task, config.algorithm, len(run.seeds)
+        steps = f"{short(run.steps_done)} / {short(config.steps)}"
         coloured = Text(state, STATE_STYLES.get(state, ""))
         table.add_row(Text(task), algorithm, str(seeds), steps, coloured, last, Text(str(run.path)))
         of_seeds = f"{seeds} seed{'s' * (seeds > 1)}"
@@ -202,8 +202,8 @@ def print_runs(console: Console, runs: Sequence[RunDirectory]) -> None:
     console.print(table if natural <= console.width else lines, soft_wrap=True, end="")
 
 
-def _failed(run: RunDirectory) -> set[int]:
-    return set(run.manifest.failures)
+def _failed(run: RunSet) -> set[int]:
+    return set(run.failures)
 
 
 def _rows(results: Mapping[int, Sequence[EvaluationEpisode]]) -> np.ndarray:
@@ -219,7 +219,7 @@ def _rows(results: Mapping[int, Sequence[EvaluationEpisode]]) -> np.ndarray:
     return rows
 
 
-def _last_return(run: RunDirectory) -> str:
+def _last_return(run: RunSet) -> str:
     try:
         returns = last_evaluations(run.sound_evaluations, points=1)
     except InputError:

@@ -12,7 +12,7 @@ import numpy as np
 
 from csac.deploy.contract import FLOAT32_MAX, Contract, read_file, read_json
 from csac.deploy.guards import NO_GUARDS, Guards
-from csac.record.manifest import SEED_LIMIT
+from csac.record.config import SEED_LIMIT
 from csac.types import InputError
 
 if TYPE_CHECKING:

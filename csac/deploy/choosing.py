@@ -15,7 +15,8 @@ from csac.deploy.artefact_contract import ArtefactContract, artefacts_below, is_
 from csac.deploy.contract import Contract, read_json
 from csac.deploy.policy import CONTRACT, SAVED, Policy
 from csac.record.run import RunDirectory, Which, is_run
-from csac.record.statistics import evaluation_matrix, last_evaluations
+from csac.record.sets import RunSet
+from csac.record.statistics import last_evaluations
 from csac.types import InputError
 
 _OPENED = "open it with csac.deploy.artefact.open_artefact, or load its run"
@@ -25,7 +26,7 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
     """Return a policy of a run, or one that was saved by itself (`Policy.save`).
 
     Args:
-        directory: the run directory, or the folder of the saved policy, which has neither seeds nor a choice of them.
+        directory: a set of runs, a run, or the folder of a policy that was saved by itself.
         seed: the seed's label; by default the seed with the best mean return over its last three evaluation points,
             among those that did not fail. That choice favours a lucky seed: report the policy on fresh evaluation
             seeds.
@@ -41,15 +42,18 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
         raise InputError(f"which={which!r}: choose 'last' or 'best'")
     check_path("a run directory", directory)
     folder = Path(directory)
-    if not is_run(folder) and os.path.exists(folder / SAVED):
+    if os.path.exists(folder / SAVED):
         return _saved(folder, seed, which)
-    if not is_run(folder) and os.path.isdir(folder):
+    if folder.is_dir() and not is_run(folder):
         _refuse_artefacts(folder)
-    run = RunDirectory.open(directory)
-    label = choose_seed(run, seed)
-    if not has_policy(run, label, which):
-        raise InputError(f"{run.path} has no best policy of seed {label}, which was never evaluated: load its last")
-    return Policy.load(run.policy(label, which), Contract.load(run.contract))
+    return load_run(choose_run(RunSet.open(directory), seed), which)
+
+
+def load_run(run: RunDirectory, which: Which = "last") -> Policy:
+    """Return a policy of one run. Raises InputError where it has none, or a damaged file."""
+    if not has_policy(run, which):
+        raise InputError(f"{run.path} has no {which} policy yet: its first evaluation writes it")
+    return Policy.load(run.policy_file(which), Contract.load(run.policies / CONTRACT))
 
 
 def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
@@ -78,74 +82,35 @@ def _refuse_artefacts(folder: Path) -> None:
         raise InputError(f"{folder} holds no run, and exported artefacts in {', '.join(map(str, below))}: {_OPENED}")
 
 
-def no_policies(run: RunDirectory) -> InputError:
-    """Return what to raise for a run without policies."""
-    when = "any more" if len(run.evaluations) else "yet: its first evaluation writes them"
-    return InputError(f"{run.path} holds no policies {when}")
+def has_policy(run: RunDirectory, which: Which) -> bool:
+    """Return whether a run has left this policy; a best one comes with its first evaluation."""
+    return run.policy_file(which).exists()
 
 
-def has_policy(run: RunDirectory, seed: int, which: Which) -> bool:
-    """Whether a seed that has left a policy has this one: a best one comes with its first evaluation."""
-    return which == "last" or run.policy(seed, which).exists() or bool((run.evaluations["seed"] == seed).any())
-
-
-def choose_seed(run: RunDirectory, seed: int | None = None) -> int:
-    """Return the label of the seed that `load` takes. Raises InputError as `load` does."""
-    seeds = run.seeds_with_policies()
-    if not seeds:
-        raise no_policies(run)
-    if seed is None:
-        return _best_seed(run, _without_failed(run, seeds))
-    if isinstance(seed, bool) or not isinstance(seed, Integral):
-        raise InputError(f"seed is the label of one, a whole number, not {seed!r:.40}")
-    if seed not in seeds:
-        raise InputError(f"{run.path} has no policy of seed {seed}; it has those of {_listed(seeds)}")
-    return int(seed)
-
-
-def _without_failed(run: RunDirectory, seeds: list[int]) -> list[int]:
-    """Return the seeds that did not fail. What a failed one has left may never have learnt anything."""
-    failures = run.manifest.failures
-    sound = [seed for seed in seeds if seed not in failures]
+def choose_run(runs: RunSet, seed: int | None = None) -> RunDirectory:
+    """Return the run that `load` takes. Raises InputError as `load` does."""
+    if seed is not None:
+        if isinstance(seed, bool) or not isinstance(seed, Integral):
+            raise InputError(f"seed is the label of one, a whole number, not {seed!r:.40}")
+        return runs.run(int(seed))
+    sound = [run for run in runs.runs if run.manifest.state != "failed" and has_policy(run, "last")]
+    if not sound and runs.failures:
+        failed, reason = next(iter(runs.failures.items()))
+        raise InputError(f"every seed of {runs.path} failed (seed {failed} at {reason}): train again, or give a seed")
     if not sound:
-        raise InputError(
-            f"every seed of {run.path} failed (seed {seeds[0]} at {failures[seeds[0]]}): train again, "
-            f"or ask for what one has left by its seed, one of {_listed(seeds)}"
-        )
-    return sound
-
-
-def _best_seed(run: RunDirectory, seeds: list[int]) -> int:
-    if len(seeds) == 1:
-        return seeds[0]
-    rows = run.evaluations
-    if "return" not in (rows.dtype.names or ()):
-        raise InputError(f"the evaluations.csv of {run.path} has no returns: give a seed, or restore it from a copy")
-    scores = {seed: score for seed, score in last_evaluations(rows).items() if not math.isnan(score)}
-    ranked = [(scores[seed], -seed) for seed in seeds if seed in scores]
-    if not ranked:
-        raise InputError(f"{run.path} has no evaluations to choose by: give a seed, one of {_listed(seeds)}")
-    return -max(ranked)[1]
+        raise InputError(f"{runs.path} holds no policies yet: its first evaluation writes them")
+    scores = last_evaluations(np.concatenate([run.evaluations[["seed", "step", "return"]] for run in sound]))
+    scores = {seed: score for seed, score in scores.items() if not math.isnan(score)}
+    if len(sound) > 1 and not scores:
+        raise InputError(f"{runs.path} has no evaluations to choose by: give a seed, one of {_listed(runs.seeds)}")
+    return max(sound, key=lambda run: (scores.get(run.seed, -math.inf), -run.seed))
 
 
 def _listed(seeds: list[int]) -> str:
     return ", ".join(str(seed) for seed in seeds)
 
 
-def step_of_policy(run: RunDirectory, seed: int, which: Which) -> int:
-    """Return how many environment steps a seed had made when its last or best policy was taken.
-
-    The file of the policy says so. One from before it did is taken for that of the best evaluation, or for as old as
-    its seed. Raises InputError for a file that is not there or damaged.
-    """
-    step = Policy.load(run.policy(seed, which), Contract.load(run.contract)).step
-    if step is not None:
-        return step
-    rows = run.evaluations
-    return best_step(rows[rows["seed"] == seed]) if which == "best" else run.manifest.steps_of(seed)
-
-
-def best_step(rows: np.ndarray) -> int:
-    """Return the step of the evaluation with the highest mean return, the first of equals; the rows are of one seed."""
-    steps, _, returns = evaluation_matrix(rows)
-    return int(steps[np.argmax(returns[0])])
+def step_of_policy(run: RunDirectory, which: Which) -> int:
+    """Return how many environment steps a run had made when its last or best policy was taken. Raises InputError."""
+    step = load_run(run, which).step
+    return run.manifest.steps_done if step is None else step

@@ -12,7 +12,7 @@ import numpy as np
 from csac.checks import check_flag, check_whole
 from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy, noise_generator
-from csac.record.config import SEED_LIMIT
+from csac.record.manifest import SEED_LIMIT
 from csac.tasks.environment import Environment
 from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import constant_perturbations, values_at
@@ -157,25 +157,6 @@ class Evaluator:
         except EvaluationFailure:
             self.close()  # what has raised may be broken for good, and the next policy is to fail by itself alone
             raise
-
-    def begin(self, policies: Sequence[Policy]) -> Any:
-        """Stand-in."""
-        outer = self
-
-        class Pending:
-            is_over = True
-            notes: list[str] = []
-
-            def results(self) -> Any:
-                found = []
-                for policy in policies:
-                    try:
-                        found.append(outer.run(policy))
-                    except EvaluationFailure as error:
-                        found.append(error)
-                return found
-
-        return Pending()
 
     def close(self) -> None:
         """Close the environments; another `run` makes new ones."""

@@ -14,7 +14,7 @@ from csac.deploy.artefact import compiler, open_artefact
 from csac.deploy.artefact_contract import ArtefactContract, Format, Weights
 from csac.deploy.c_size import Size, sizes
 from csac.deploy.card import model_card
-from csac.deploy.choosing import choose_seed, step_of_policy
+from csac.deploy.choosing import choose_run, load_run, step_of_policy
 from csac.deploy.contract import FLOAT32_MAX, Contract
 from csac.deploy.guards import Guards, make_guards
 from csac.deploy.policy import Policy
@@ -22,6 +22,7 @@ from csac.deploy.writing import CARD, CURVE, check_place, placed, write_artefact
 from csac.evaluation.verify import Compared, Returns, compare_actions, compare_returns, record, returns_as_fields
 from csac.record.files import write_atomically
 from csac.record.run import RunDirectory, Which
+from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import unlike_training
@@ -104,21 +105,21 @@ def export_run(
             that is not the policy: then nothing of it is left behind.
         EvaluationFailure: an environment raised, or gave what is not finite.
     """
-    run = RunDirectory.open(directory)
-    label = choose_seed(run, seed)
-    policy = Policy.load(run.policy(label, which), Contract.load(run.contract))
-    places = _places(run, formats, place)
+    runs = RunSet.open(directory)
+    run = choose_run(runs, seed)
+    policy = load_run(run, which)
+    places = _places(runs.path, formats, place)
     _check(formats, options, policy)
     told, recording = _Told(), None
     if options.episodes:
         task = _task(run, task, trust_task)
-        told = _asked(task, run.manifest.environment_arguments)
+        told = _asked(task, run.manifest.config.environment_arguments)
         deterministic = options.noise_seed is None
-        recording = record(policy, task, run.manifest.environment_arguments, options.episodes, deterministic)
+        recording = record(policy, task, run.manifest.config.environment_arguments, options.episodes, deterministic)
         if on_progress:
             on_progress(options.episodes, options.episodes * (1 + len(formats)))
     guards = _guards(policy.contract, options, told, recording)
-    notes = _notes(run, label, options, guards)
+    notes = _notes(run, options, guards)
     for number, name in enumerate(formats):
         contract = ArtefactContract(
             policy.contract,
@@ -129,13 +130,13 @@ def export_run(
             control_rate=told.control_rate,
             noise_seed=options.noise_seed,
             guards=guards,
-            provenance=provenance(run, label, which),
+            provenance=provenance(runs, run, which),
         )
         with placed(places[name]) as folder:
             exported = _exported(folder, places[name], contract, policy, recording, task, run)
             exported = exported._replace(notes=(*notes, *exported.notes))
             if options.card:
-                _write_card(folder, exported, run)
+                _write_card(folder, exported, runs)
         if on_progress:
             on_progress(options.episodes * (2 + number), options.episodes * (1 + len(formats)))
         yield exported
@@ -156,7 +157,7 @@ def _exported(
     compared = compare_actions(artefact, policy, None if recording is None else recording.observations)
     returns = None
     if recording is not None and task is not None:
-        returns = compare_returns(artefact, recording, task, run.manifest.environment_arguments)
+        returns = compare_returns(artefact, recording, task, run.manifest.config.environment_arguments)
     not_measured: list[str] = []
     measured = sizes(folder, not_measured.append) if contract.format == "c" else []
     contract = dataclasses.replace(contract, verification=_verification(compared, returns, measured))
@@ -164,13 +165,15 @@ def _exported(
     return Exported(place, contract, compared, returns, measured, tuple(not_measured))
 
 
-def _notes(run: RunDirectory, seed: int, options: ExportOptions, guards: Guards) -> list[str]:
+def _notes(run: RunDirectory, options: ExportOptions, guards: Guards) -> list[str]:
     """Return what is to be said of every format's artefact."""
     notes, manifest = [], run.manifest
-    if (reason := manifest.failures.get(seed)) is not None:
-        notes.append(f"seed {seed} failed at {reason}; this is the policy that it has left")
+    if manifest.state == "failed":
+        notes.append(f"seed {run.seed} failed at {manifest.failure}; this is the policy that it has left")
     if options.episodes:
-        notes += [f"{line}: csac evaluate --perturb tests it so" for line in unlike_training(manifest.perturbations)]
+        notes += [
+            f"{line}: csac evaluate --perturb tests it so" for line in unlike_training(manifest.config.perturbations)
+        ]
     if options.observation_range == "recorded" and guards.observation_high is not None:
         unbounded = int((guards.observation_high == np.float32(FLOAT32_MAX)).sum())
         if unbounded:
@@ -213,7 +216,7 @@ def control_rate(raw: Any) -> float | None:
     return float(pictures) if isinstance(pictures, int | float) and pictures > 0 else None
 
 
-def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
+def provenance(runs: RunSet, run: RunDirectory, which: Which) -> dict[str, Any]:
     """Return where a policy comes from and how good it was in training, as JSON holds it.
 
     The returns are those of the seed's newest evaluation up to the policy, which is `steps` old: the policy's own, but
@@ -223,28 +226,27 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
     seed failed, and is None where it did not. `learnt_weights` are those of entropy and relative entropy that the
     hyperparameters leave to be learnt, as metrics.csv last told of them by then.
     """
-    manifest, rows = run.manifest, run.evaluations
-    own = rows[rows["seed"] == seed] if len(rows) else rows
-    at, evaluation = step_of_policy(run, seed, which), {}
+    manifest, own, rows = run.manifest, run.evaluations, runs.evaluations
+    at, evaluation = step_of_policy(run, which), {}
     if len(own := own[own["step"] <= at]):
         step = int(own["step"].max())
         evaluation = {"step": step, **returns_as_fields(own["return"][own["step"] == step])}
     last = last_evaluations(rows, points=1) if len(rows) else {}
-    sound = [value for label, value in last.items() if label not in manifest.failures]
+    sound = [value for label, value in last.items() if label not in runs.failures]
     over = returns_as_fields(np.array(sound)) if sound else {}
     over = {"seeds" if name == "episodes" else name: value for name, value in over.items()}
     return {
-        "task": manifest.task,
-        "environment_arguments": manifest.environment_arguments,
-        "perturbations": list(manifest.perturbations),
-        "algorithm": manifest.algorithm,
-        "hyperparameters": manifest.hyperparameters,
+        "task": manifest.config.task,
+        "environment_arguments": manifest.config.environment_arguments,
+        "perturbations": list(manifest.config.perturbations),
+        "algorithm": manifest.config.algorithm,
+        "hyperparameters": manifest.config.hyperparameters,
         "preset": manifest.preset,
-        "seed": seed,
+        "seed": run.seed,
         "checkpoint": which,
         "steps": at,
-        "failure": manifest.failures.get(seed),
-        "learnt_weights": _learnt_weights(run, seed, at),
+        "failure": manifest.failure or None,
+        "learnt_weights": _learnt_weights(run, at),
         "commit": manifest.commit,
         "versions": manifest.versions,
         "command": manifest.command,
@@ -254,18 +256,18 @@ def provenance(run: RunDirectory, seed: int, which: Which) -> dict[str, Any]:
     }
 
 
-def _learnt_weights(run: RunDirectory, seed: int, step: int) -> dict[str, float]:
+def _learnt_weights(run: RunDirectory, step: int) -> dict[str, float]:
     """Return what the weights that are learnt had become at this step, as far as metrics.csv knows."""
-    learnt = [name for name, value in run.manifest.hyperparameters.items() if value in ("auto", "automatic")]
+    learnt = [name for name, value in run.manifest.config.hyperparameters.items() if value in ("auto", "automatic")]
     if not learnt:
         return {}
     rows = run.rows("metrics")
-    rows = rows[(rows["seed"] == seed) & (rows["step"] <= step)]
+    rows = rows[rows["step"] <= step]
     columns = [name for name in learnt if name in (rows.dtype.names or ()) and len(rows)]
     return {name: float(rows[name][-1]) for name in columns if np.isfinite(rows[name][-1])}
 
 
-def _places(run: RunDirectory, formats: Sequence[Format], place: str | Path | None) -> dict[str, Path]:
+def _places(home: Path, formats: Sequence[Format], place: str | Path | None) -> dict[str, Path]:
     """Return where each format goes. Raises InputError for a format that there is not, or a place that is taken."""
     for name in formats:
         if name not in get_args(Format):
@@ -273,7 +275,7 @@ def _places(run: RunDirectory, formats: Sequence[Format], place: str | Path | No
     if not formats or len(set(formats)) < len(formats):
         raise InputError("give each format once, such as numpy,onnx,c")
     if place is None:
-        places = {name: run.path / "export" / name for name in formats}
+        places = {name: home / "export" / name for name in formats}
     else:
         places = {name: Path(place) / name if len(formats) > 1 else Path(place) for name in formats}
     for path in places.values():
@@ -324,13 +326,13 @@ def _task(run: RunDirectory, task: Task | None, trust_task: bool) -> Task:
     """Return what makes the task. Raises InputError where nobody can here."""
     if task is not None:
         return task
-    if run.manifest.task_is_callable:
+    if run.manifest.config.task_is_callable:
         raise InputError(
-            f"the task of {run.path} was made by a Python function, {run.manifest.task}: export it with --no-rollouts, "
+            f"the task of {run.path} was made by a Python function, {run.config.task}: export it with --no-rollouts, "
             "or in Python with csac.evaluation.export.export_run and task="
         )
-    refuse_untrusted(run.manifest.task, run.path, trust_task)
-    return run.manifest.task
+    refuse_untrusted(run.manifest.config.task, run.path, trust_task)
+    return run.manifest.config.task
 
 
 def _guards(contract: Contract, options: ExportOptions, told: _Told, recording: Recording | None) -> Guards:
@@ -373,8 +375,8 @@ def _verification(compared: list[Compared], returns: Returns | None, measured: l
     return fields
 
 
-def _write_card(folder: Path, exported: Exported, run: RunDirectory) -> None:
-    has_curve = run.curve.exists()
+def _write_card(folder: Path, exported: Exported, runs: RunSet) -> None:
+    has_curve = runs.curve.exists()
     if has_curve:
-        write_atomically(folder / CURVE, run.curve.read_bytes())
+        write_atomically(folder / CURVE, runs.curve.read_bytes())
     write_atomically(folder / CARD, model_card(exported.contract, CURVE if has_curve else None).encode())

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.checks import check_flag
-from csac.deploy.choosing import has_policy, load, no_policies
+from csac.deploy.choosing import has_policy, load, load_run
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.files import check_name
-from csac.record.run import RunDirectory
+from csac.record.sets import RunSet
 from csac.tasks.environment import Environment
 from csac.tasks.known import adapter_of
 from csac.tasks.perturbations import constant_perturbations, unlike_training, values_at
@@ -59,22 +59,19 @@ def evaluate_run(
         EvaluationFailure: an environment raised, or gave what is not finite; or a process died.
     """
     check_flag("deterministic", deterministic)
-    run = _open(directory, trust_task)
-    evaluator = Evaluator(
-        run.manifest.task,
-        run.manifest.environment_arguments,
-        episodes,
-        FRESH_EVALUATION_SEED,
-        run.manifest.events,
-    )
+    runs = _open(directory, trust_task)
+    config = runs.config
+    evaluator = Evaluator(config.task, config.environment_arguments, episodes, FRESH_EVALUATION_SEED, config.events)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
-    labels = _seeds_with_policies(run, which) if seed is None else [seed]
-    policies = [load(directory, label, which) for label in labels]
+    chosen = [run for run in runs.runs if has_policy(run, which)] if seed is None else [runs.run(seed)]
+    if not chosen:
+        raise InputError(f"{runs.path} holds no {which} policies yet: the first evaluation writes them")
+    labels, policies = [run.seed for run in chosen], [load_run(run, which) for run in chosen]
     processes = choose_processes(evaluator, len(policies)) if processes is None else processes
     if processes == 1:
         workers = evaluator
     else:
-        Environment(run.manifest.task, run.manifest.environment_arguments).close()  # says what is to be said
+        Environment(config.task, config.environment_arguments).close()  # says what is to be said
         workers = EvaluationPool(evaluator, processes)
     try:
         yield from zip(labels, workers.run_all(policies, deterministic, on_progress), strict=True)
@@ -87,10 +84,9 @@ def perturbation_notes(
 ) -> list[str]:
     """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
     given = constant_perturbations(perturbations)
-    manifest = RunDirectory.open(directory).manifest
     if given:
         return [f"perturbed: {', '.join(item.label for item in given)}"]
-    return [f"{line}: see --perturb" for line in unlike_training(manifest.perturbations)]
+    return [f"{line}: see --perturb" for line in unlike_training(RunSet.open(directory).config.perturbations)]
 
 
 def play(
@@ -123,7 +119,7 @@ def play(
         _check_video(Path(video))
         _draw_off_screen()
     environment = _drawn_environment(run, "human" if video is None else "rgb_array")
-    adapter = adapter_of(run.manifest.task)
+    adapter = adapter_of(run.config.task)
     picture = adapter.camera(environment.raw) if adapter and adapter.camera else environment.raw.render
     frames_per_second = round(
         (adapter and adapter.pictures_per_second)
@@ -162,15 +158,15 @@ def _longest_episode(environment: Environment) -> int:
     return min(limit or LONGEST_EPISODE, LONGEST_EPISODE)
 
 
-def _open(directory: str | Path, trust_task: bool) -> RunDirectory:
+def _open(directory: str | Path, trust_task: bool) -> RunSet:
     """Open a run whose task is to be made."""
-    run = RunDirectory.open(directory)
-    if run.manifest.task_is_callable:
+    run = RunSet.open(directory)
+    if run.config.task_is_callable:
         raise InputError(
-            f"the task of {directory} was made by a Python function, {run.manifest.task}: "
+            f"the task of {directory} was made by a Python function, {run.config.task}: "
             "evaluate it in Python, with csac.load and csac.evaluate"
         )
-    refuse_untrusted(run.manifest.task, run.path, trust_task)
+    refuse_untrusted(run.config.task, run.path, trust_task)
     return run
 
 
@@ -181,15 +177,6 @@ def _follow(environment: Environment) -> None:
         return
     with suppress(KeyError):  # no such camera
         renderer.camera_id = renderer.model.camera("track").id
-
-
-def _seeds_with_policies(run: RunDirectory, which: Which) -> list[int]:
-    seeds = run.seeds_with_policies()
-    if not seeds:
-        raise no_policies(run)
-    if not (those := [seed for seed in seeds if has_policy(run, seed, which)]):
-        raise InputError(f"{run.path} has no best policies, since no seed of it was evaluated: take the last ones")
-    return those
 
 
 def _require_display() -> None:
@@ -212,8 +199,8 @@ def _check_video(path: Path) -> None:
         raise InputError(f"{path} is a directory: give the name of a file for the video")
 
 
-def _drawn_environment(run: RunDirectory, render_mode: str) -> Environment:
-    task, arguments = run.manifest.task, run.manifest.environment_arguments
+def _drawn_environment(run: RunSet, render_mode: str) -> Environment:
+    task, arguments = run.config.task, run.config.environment_arguments
     adapter = adapter_of(task)
     if adapter and render_mode == "rgb_array":
         arguments = {**adapter.picture_arguments, **arguments}

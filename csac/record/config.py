@@ -40,7 +40,7 @@ class RunConfig:
     device: Literal["cpu", "gpu"] = "cpu"
     """Device that the networks are trained on."""
     evaluation_interval: int = 5_000
-    """Environment steps between evaluations; there is always one at the last step."""
+    """Environment steps between evaluations; there is always one at the last step. 0: none at all."""
     evaluation_episodes: int = 10
     """Episodes per evaluation."""
     evaluation_seed: int = EVALUATION_SEED
@@ -74,7 +74,7 @@ class RunConfig:
 _RANGES = (
     ("seed", 0, SEED_LIMIT - 1),
     ("steps", 1, STEPS_LIMIT),
-    ("evaluation_interval", 1, NEVER),
+    ("evaluation_interval", 0, NEVER),
     ("evaluation_episodes", 1, MOST_EPISODES),
     ("evaluation_seed", 0, 2**30 - 1),
     ("checkpoint_interval", 0, NEVER),

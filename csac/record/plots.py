@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from csac.record.files import write_atomically
 from csac.record.curves import INTERVAL, NEXT, curves_of, last_step, limits, note
+from csac.record.files import write_atomically
 from csac.record.rendering import short
 
 if TYPE_CHECKING:

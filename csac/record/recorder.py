@@ -9,9 +9,10 @@ import numpy as np
 
 from csac.record.run import TABLES
 from csac.record.statistics import best_returns
+from csac.record.wandb import WandbLog
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from csac.record.run import RunDirectory, Table
 
@@ -23,22 +24,25 @@ class Recorder:
         run: the run directory.
         begin: the step that it goes on from; 0 for its beginning.
         tensorboard: whether to write TensorBoard files too.
+        wandb: whether to log to W&B too, with TensorBoard's values, or the project to log to.
     """
 
-    def __init__(self, run: RunDirectory, begin: int, tensorboard: bool) -> None:
+    def __init__(self, run: RunDirectory, begin: int, tensorboard: bool, wandb: bool | str = False) -> None:
         self.run = run
         self._waiting: dict[Table, list[dict[str, Any]]] = defaultdict(list)
         origin, known = run.manifest.forked_from, run.evaluations
         if origin and origin.changed("task ", "environment_arguments"):  # whose returns are of another task
             known = known[known["step"] > origin.step]
         self.best = best_returns(known).get(run.seed, -np.inf) if run.policy_file("best").exists() else -np.inf
-        self._log = None
-        if tensorboard:
+        self._log = self._wandb = None
+        if tensorboard or wandb:
             from csac.record.tensorboard import TensorBoardLog  # slow to import
 
             episodes = run.rows("episodes")
             before = [dict(zip(episodes.dtype.names or (), row, strict=True)) for row in episodes.tolist()[-100:]]
             self._log = TensorBoardLog(run.tensorboard, begin, before)
+        if wandb:
+            self._wandb = self._guarded(lambda: WandbLog(run, wandb))
 
     def add(self, table: Table, rows: Sequence[dict[str, Any]]) -> None:
         """Take rows of a table, to be written at the next `flush`."""
@@ -49,8 +53,9 @@ class Recorder:
         for table in TABLES:
             if rows := self._waiting.pop(table, []):
                 self.run.append(table, rows)
-                if self._log:
-                    self._log.write(table, rows)
+                points = self._log.write(table, rows) if self._log else {}
+                if self._wandb:
+                    self._guarded(lambda points=points: self._wandb and self._wandb.write(points))
 
     def sync(self) -> None:
         """Write the rows that wait, and TensorBoard's: what comes before a checkpoint is not made again."""
@@ -59,6 +64,16 @@ class Recorder:
             self._log.flush()
 
     def close(self) -> None:
-        """Close the TensorBoard file."""
+        """Close the TensorBoard file, and finish the W&B run."""
         if self._log:
             self._log.close()
+        if self._wandb:
+            self._guarded(self._wandb.close)
+
+    def _guarded(self, call: Callable[[], Any]) -> Any:
+        """Return what a call to W&B gives; where it fails, W&B gets no more of this run, which goes on."""
+        try:
+            return call()
+        except Exception as error:
+            self._wandb = None
+            self.run.log(f"W&B gets no more of this run: {type(error).__name__}: {error}")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 
 from csac.checks import check_path
 from csac.record.run import MANIFEST, RunDirectory, is_run
@@ -44,7 +45,7 @@ class RunSet:
         runs = sorted(map(RunDirectory.open, below), key=lambda run: run.seed)
         if not runs:
             if (path / "evaluations.csv").exists() or (path / "policy").exists():
-                raise InputError(f"{path} is a run of an older csac, or its manifest is lost: use the csac that wrote it")
+                raise InputError(f"{path} has no manifest, or is a run of an older csac: use the one that wrote it")
             RunDirectory.open(path)  # which says what is there instead
         return cls(path, runs)
 
@@ -64,6 +65,18 @@ class RunSet:
         return {run.seed: run.manifest.failure for run in self.runs if run.manifest.state == "failed"}
 
     @property
+    def state(self) -> str:
+        """What the runs are, the most urgent of it: running, killed, interrupted, failed, or else finished."""
+        states = {run.state for run in self.runs}
+        return next((one for one in ("running", "killed", "interrupted", "failed") if one in states), "finished")
+
+    @property
+    def steps_done(self) -> int:
+        """The fewest steps that a seed has made that did not fail."""
+        steps = [run.manifest.steps_done for run in self.runs if run.manifest.state != "failed"]
+        return min(steps or [run.manifest.steps_done for run in self.runs])
+
+    @property
     def curve(self) -> Path:
         """The picture of the evaluations."""
         return self.path / "curve.png"
@@ -81,7 +94,7 @@ class RunSet:
         if not tables:
             return structured(COLUMNS[name], [])
         common = [item for item in tables[0].dtype.names or () if all(item in (t.dtype.names or ()) for t in tables)]
-        return np.concatenate([table[common] for table in tables])
+        return np.concatenate([repack_fields(table[common]) for table in tables])
 
     @property
     def evaluations(self) -> np.ndarray:

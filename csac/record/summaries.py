@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from csac.record.tables import COLUMNS
 from csac.record.curve_measures import Recovery, recovery
 from csac.record.statistics import (
     FEWEST_FOR_INTERVAL,
@@ -25,6 +24,7 @@ from csac.record.statistics import (
     probability_of_improvement,
     stratified_bootstrap_interval,
 )
+from csac.record.tables import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -47,15 +47,17 @@ class TensorBoardLog:
         if begin or has_earlier:  # TensorBoard drops what was written after the step that the run goes on from
             self._add(Event(step=begin + 1, session_log=SessionLog(status=SessionLog.START)))
 
-    def write(self, table: Table, rows: Sequence[Row]) -> None:
-        """Write the points of these rows. Raises OSError."""
+    def write(self, table: Table, rows: Sequence[Row]) -> dict[int, dict[str, float]]:
+        """Write the values of these rows; return them by step and tag. Raises OSError."""
         steps: dict[int, list[Row]] = defaultdict(list)
         for row in rows:
             steps[row["step"]].append(row)
         scalars = {"episodes": self._episodes, "metrics": self._metrics, "evaluations": self._evaluations}[table]
-        for step, rows_of_step in steps.items():
-            values = [Summary.Value(tag=tag, simple_value=value) for tag, value in scalars(rows_of_step).items()]
-            self._add(Event(step=step, summary=Summary(value=values)))
+        points = {step: scalars(rows_of_step) for step, rows_of_step in steps.items()}
+        for step, values in points.items():
+            summary = Summary(value=[Summary.Value(tag=tag, simple_value=value) for tag, value in values.items()])
+            self._add(Event(step=step, summary=summary))
+        return points
 
     def flush(self) -> None:
         """Have everything in the file. Raises OSError."""

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
-from csac.record.tables import COLUMNS, structured
 from csac.record.statistics import evaluation_matrix, maximum_average_return
 from csac.record.summaries import over_seeds
+from csac.record.tables import COLUMNS, structured
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def _add(arm: Arm, record: Record, seed: int) -> None:
     arm.manifests.append(record.manifest)
     if record.seconds:
         one = record.manifest
-        arm.times.append(Time(record.seconds, one.steps, tuple(one.seeds), record.interrupted))
+        arm.times.append(Time(record.seconds, one.config.steps, (one.config.seed,), record.interrupted))
     arm.evaluations.append(record.evaluations)
     arm.tests += [] if record.rollouts is None else [record.rollouts]
     if record.longer:

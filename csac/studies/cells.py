@@ -82,19 +82,17 @@ class Cell:
 
         A hyperparameter that an older run has not got is the default: that is what it did.
         """
-        if len(manifest.seeds) != 1:
-            raise InputError("it has several seeds, and a cell has one")
         return cls.make(
-            manifest.task,
-            manifest.algorithm,
-            manifest.hyperparameters,
-            perturbations=manifest.perturbations,
-            environment_arguments=manifest.environment_arguments,
-            events=manifest.events,
-            steps=manifest.steps,
-            seed=manifest.seeds[0],
-            evaluation_interval=manifest.evaluation.interval,
-            evaluation_episodes=manifest.evaluation.episodes,
+            manifest.config.task,
+            manifest.config.algorithm,
+            manifest.config.hyperparameters,
+            perturbations=manifest.config.perturbations,
+            environment_arguments=manifest.config.environment_arguments,
+            events=manifest.config.events,
+            steps=manifest.config.steps,
+            seed=manifest.config.seed,
+            evaluation_interval=manifest.config.evaluation_interval,
+            evaluation_episodes=manifest.config.evaluation_episodes,
         )
 
     @functools.cached_property
@@ -181,7 +179,7 @@ class Store:
         if is_in_use(path):
             return Status("running", steps, "", seconds)
         if manifest.state == "failed":
-            return Status("failed", steps, "; ".join(map(str, manifest.failures.values())), seconds)
+            return Status("failed", steps, manifest.failure, seconds)
         return Status("failed" if reason else "partial", steps, reason, seconds)
 
 
@@ -199,7 +197,7 @@ def restarting_seeds(path: Path) -> tuple[int, ...]:
     """Return the seeds that restart their episode where this run goes on: its checkpoint could not hold it."""
     with suppress(InputError):
         if is_run(path) and (manifest := RunDirectory.open(path).manifest).last_checkpoint:
-            return manifest.inexact_seeds
+            return (manifest.config.seed,) if manifest.restarts_episode else ()
     return ()
 
 

@@ -232,7 +232,7 @@ def _better(claim: str, arm: Arm, other: Arm, value: Callable[[Arm], np.ndarray]
     """Return a claim of `value` [seed] of two arms; of an arm without rows there is none."""
     ours, others = (value(one) if len(one.rows) else np.zeros(0) for one in (arm, other))
     steps = paper.STEPS.get(arm.task, np.inf)
-    is_whole = all(manifest.steps >= steps for one in (arm, other) for manifest in one.manifests)
+    is_whole = all(manifest.config.steps >= steps for one in (arm, other) for manifest in one.manifests)
     in_time = all(change.step == paper.FRICTION_STEP for change in perturbations_of(arm.condition))
     failed = tuple(_lost(one) for one in (arm, other) if one.failures)
     return Comparison(claim, ours, others, variant_of(arm.label), is_whole and in_time, failed)

@@ -18,7 +18,7 @@ from csac.processes import move_to, usable_cores
 from csac.studies.cells import is_in_use, read_history, write_history
 from csac.studies.engines import SECONDS_BETWEEN_LOOKS
 from csac.studies.job import Ended, Job, Message, Started, Stopped, execute
-from csac.training.interruptions import signals_noted
+from csac.training.signals import signals_noted
 from csac.types import InputError
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ class Record(NamedTuple):
     @property
     def failure(self) -> str:
         """Why it failed, or nothing."""
-        return "; ".join(self.manifest.failures.values()) if self.manifest.state == "failed" else ""
+        return self.manifest.failure if self.manifest.state == "failed" else ""
 
 
 def find_collected(directory: str | Path) -> list[Path]:

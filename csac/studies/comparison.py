@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from csac.checks import check_whole
-from csac.record.tables import check_ends, read_evaluations, read_rows
-from csac.record.manifest import STEPS_LIMIT
-from csac.record.run import RunDirectory, find_runs, is_run
+from csac.record.config import STEPS_LIMIT
+from csac.record.run import RunDirectory, is_run
+from csac.record.sets import find_sets
 from csac.record.summaries import case_names, last_rows
+from csac.record.tables import check_ends, read_evaluations, read_rows
 from csac.studies.arms import Arm, Time
 from csac.studies.collected import ROLLOUTS, find_collected, read_collected, rollouts_of
 from csac.studies.configurations import differing, filled_in, labels, merged, name_of, settings_of
@@ -95,8 +96,8 @@ class Comparison:
     def _task(self, run: Given) -> str:
         """Return what a run of a label learns: a file of rows, which cannot tell, what the runs beside it learn."""
         if run.manifest:
-            return run.manifest.task
-        tasks = sorted({one.manifest.task for one in self.runs if one.label == run.label and one.manifest})
+            return run.manifest.config.task
+        tasks = sorted({one.manifest.config.task for one in self.runs if one.label == run.label and one.manifest})
         if len(tasks) > 1:
             raise InputError(
                 f"{run.label}: {run.path} does not tell which of {' and '.join(tasks)} it is of; label it apart"
@@ -106,17 +107,17 @@ class Comparison:
     def _arm(self, runs: Sequence[Given]) -> Arm:
         manifests = [run.manifest for run in runs if run.manifest]
         self._refuse_differing(runs[0].label, manifests)
-        condition = manifests[0].perturbations if manifests else self.perturbations
-        task = manifests[0].task if manifests else ""
+        condition = manifests[0].config.perturbations if manifests else self.perturbations
+        task = manifests[0].config.task if manifests else ""
         arm = Arm(runs[0].label or "", task, tuple(map(str, perturbations_of(condition))))
         end = max(self._end(run) for run in runs)
         for run in runs:
-            failed = run.manifest.failures if run.manifest else {}
+            failed = _failures(run.manifest)
             rows = run.rows[~np.isin(run.rows["seed"], list(failed))]
             rows = rows if self.until is None else rows[rows["step"] <= self.until]
             arm.failures.update(failed)
             if run.manifest and _is_on_its_way(run.manifest) and self._end(run) < end:
-                arm.missing += sorted(set(run.manifest.seeds) - failed.keys())
+                arm.missing += sorted({run.manifest.config.seed} - failed.keys())
                 arm.manifests.append(run.manifest)
                 continue
             arm.evaluations.append(rows)
@@ -125,7 +126,10 @@ class Comparison:
                 arm.manifests.append(run.manifest)
                 arm.times += run.times
         if manifests:
-            arm.algorithm, arm.hyperparameters = manifests[0].algorithm, merged([settings_of(one) for one in manifests])
+            arm.algorithm, arm.hyperparameters = (
+                manifests[0].config.algorithm,
+                merged([settings_of(one) for one in manifests]),
+            )
         return arm
 
     def _end(self, run: Given) -> int:
@@ -149,10 +153,10 @@ class Comparison:
         """Raise InputError where the runs of one label cannot be one arm."""
         told = [
             {
-                "algorithm": one.algorithm,
-                "perturbations": ", ".join(map(str, perturbations_of(one.perturbations))) or "none",
-                "steps": one.steps if self.until is None else min(one.steps, self.until),
-                "evaluation interval": one.evaluation.interval,
+                "algorithm": one.config.algorithm,
+                "perturbations": ", ".join(map(str, perturbations_of(one.config.perturbations))) or "none",
+                "steps": one.config.steps if self.until is None else min(one.config.steps, self.until),
+                "evaluation interval": one.config.evaluation_interval,
             }
             for one in manifests
         ]
@@ -192,10 +196,15 @@ def _read(path: Path, label: str | None, on_damaged: Callable[[InputError], None
         rows = read_evaluations(path)
         check_ends(path)
         return [Given(label, path, rows, None)]
-    runs = [] if is_run(path) or not path.is_dir() else find_runs(path, on_damaged)
+    sets = [] if is_run(path) or not path.is_dir() else find_sets(path, on_damaged)
+    runs = [run for one in sets for run in one.runs]
     if not runs and not is_run(path) and (collected := find_collected(path)):
         return [_given_cell(label, manifest) for manifest in collected]
     return [_given_run(label, run) for run in runs or [RunDirectory.open(path)]]
+
+
+def _failures(manifest: Manifest | None) -> dict[int, str]:
+    return {manifest.config.seed: manifest.failure} if manifest and manifest.state == "failed" else {}
 
 
 def _given_run(label: str | None, run: RunDirectory) -> Given:
@@ -206,7 +215,7 @@ def _given_cell(label: str | None, path: Path) -> Given:
     cell = read_collected(path)
     one = cell.manifest
     is_whole = cell.seconds and not cell.failure
-    took = (Time(cell.seconds, one.steps, tuple(one.seeds), cell.interrupted),) if is_whole else ()
+    took = (Time(cell.seconds, one.config.steps, (one.config.seed,), cell.interrupted),) if is_whole else ()
     return Given(label, path.with_suffix(".csv"), cell.evaluations, one, rollouts_of(path), took)
 
 
@@ -220,7 +229,7 @@ def _key(run: Given) -> str:
     one = run.manifest
     if not one:
         return f"file {run.path}"
-    fields = [one.task, one.algorithm, one.perturbations, settings_of(one)]
+    fields = [one.config.task, one.config.algorithm, one.config.perturbations, settings_of(one)]
     return f"run {json.dumps(fields, sort_keys=True, default=str)}"
 
 
@@ -250,5 +259,5 @@ def _times(path: Path, manifest: Manifest) -> tuple[Time, ...]:
     with suppress(OSError, ValueError, IndexError):
         last = (path / "log.txt").read_text(encoding="utf-8").splitlines()[-1]
         took = datetime.fromisoformat(last.split(" ")[0]) - datetime.fromisoformat(manifest.created)
-        return (Time(took.total_seconds(), manifest.steps_done, tuple(manifest.seeds), interrupted=False),)
+        return (Time(took.total_seconds(), manifest.steps_done, (manifest.config.seed,), interrupted=False),)
     return ()

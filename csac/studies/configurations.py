@@ -27,27 +27,28 @@ def filled_in(manifests: Sequence[Manifest | None]) -> list[Manifest | None]:
     """
     names: dict[str, set[frozenset[str]]] = {}
     for one in filter(None, manifests):
-        names.setdefault(one.algorithm, set()).add(frozenset(one.hyperparameters))
-    return [_complete(one) if one and len(names[one.algorithm]) > 1 else one for one in manifests]
+        names.setdefault(one.config.algorithm, set()).add(frozenset(one.config.hyperparameters))
+    return [_complete(one) if one and len(names[one.config.algorithm]) > 1 else one for one in manifests]
 
 
 def _complete(manifest: Manifest) -> Manifest:
     from csac.studies.cells import complete  # which imports JAX
 
     with suppress(InputError):
-        known = complete(manifest.algorithm, manifest.hyperparameters)
-        return dataclasses.replace(manifest, hyperparameters=known)
+        known = complete(manifest.config.algorithm, manifest.config.hyperparameters)
+        config = dataclasses.replace(manifest.config, hyperparameters=known)
+        return dataclasses.replace(manifest, config=config)
     return manifest
 
 
 def name_of(manifest: Manifest) -> str:
     """Return the algorithm, the preset that a run follows, if any, and what was fitted to its length beside that."""
-    name, own = manifest.algorithm.upper(), manifest.hyperparameters
+    name, own = manifest.config.algorithm.upper(), manifest.config.hyperparameters
     if manifest.preset:
         return f"{name} ({manifest.preset})"
     for preset in PRESETS:
         with suppress(InputError):  # of a preset that says nothing of the algorithm
-            given = hyperparameters(preset, manifest.algorithm, manifest.task)
+            given = hyperparameters(preset, manifest.config.algorithm, manifest.config.task)
             fitted = {item: own[item] for item in FITTED if item in own and plain(own[item]) != plain(given.get(item))}
             if fitted and _follows(manifest, {**given, **fitted}):
                 return ", ".join([f"{name} ({preset})", *(f"{item} {plain(value)}" for item, value in fitted.items())])
@@ -56,24 +57,24 @@ def name_of(manifest: Manifest) -> str:
 
 def _follows(manifest: Manifest, given: Mapping[str, Any]) -> bool:
     """Whether a run has these hyperparameters, and the default of each other one."""
-    own = manifest.hyperparameters
+    own = manifest.config.hyperparameters
     if any(plain(own.get(name)) != plain(value) for name, value in given.items()):
         return False
     from csac.studies.cells import complete  # which imports JAX
 
-    whole = complete(manifest.algorithm, given)
+    whole = complete(manifest.config.algorithm, given)
     return all(plain(whole.get(name)) == plain(value) for name, value in own.items())
 
 
 def settings_of(manifest: Manifest) -> dict[str, Any]:
     """Return what a run was given that its numbers depend on, beside task, algorithm and perturbations."""
-    settings = {**manifest.hyperparameters, LENGTH: manifest.steps}
+    settings = {**manifest.config.hyperparameters, LENGTH: manifest.config.steps}
     settings |= {
-        "evaluation interval": manifest.evaluation.interval,
-        "evaluation episodes": manifest.evaluation.episodes,
-        "evaluation seed": manifest.evaluation.first_seed,
+        "evaluation interval": manifest.config.evaluation_interval,
+        "evaluation episodes": manifest.config.evaluation_episodes,
+        "evaluation seed": manifest.config.evaluation_seed,
     }
-    settings |= {f"environment: {name}": value for name, value in manifest.environment_arguments.items()}
+    settings |= {f"environment: {name}": value for name, value in manifest.config.environment_arguments.items()}
     return settings
 
 

@@ -14,7 +14,7 @@ from csac.processes import Child, end, usable_cores
 from csac.studies.cells import read_history, write_history
 from csac.studies.job import Ended, Job, Message, Started, Stopped, execute
 from csac.studies.worker import work
-from csac.training.interruptions import signals_noted
+from csac.training.signals import signals_noted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from csac.record.run import RunDirectory, is_run
 from csac.record.tables import COLUMNS, read_rows, write_rows
-from csac.record.run import Occupied, RunDirectory, is_run
 from csac.studies.cells import LOST_EPISODE, Cell, is_final, is_in_use, read_history, restarting_seeds, write_history
 from csac.studies.collected import ROLLOUTS
 from csac.tasks.perturbations import Perturbation, perturbations_of, values_at
-from csac.training.interruptions import caught_signals
+from csac.training.signals import signals_noted
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
     def spent() -> dict[str, float]:
         return {"seconds": round(seconds + time.monotonic() - began, 1)}
 
-    from csac.training.train import Interrupted  # JAX, which a worker imports once it has its cores
+    from csac.training.signals import Interrupted  # JAX, which a worker imports once it has its cores
 
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a seed that failed is told of below
@@ -125,8 +125,7 @@ def execute(job: Job, tell: Callable[[Message], Any]) -> Ended:
             _roll_out(job, run)
             write_history(job.path, spent())
     except InputError as error:
-        # Another process has it, or has begun it since this one looked.
-        taken = is_in_use(job.path) or (isinstance(error, Occupied) and is_run(job.path))
+        taken = is_in_use(job.path)
         return Ended(key, "elsewhere") if taken else _failed(job, spent(), str(error))
     except (Interrupted, Stopped) as stop:
         write_history(job.path, spent())
@@ -152,14 +151,13 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
     cell = job.cell
     if restarting_seeds(job.path):
         tell(Noted(cell.key, f"restarts {LOST_EPISODE}"))
-    return train(
+    train(
         cell.make_algorithm(),
         cell.task,
         steps=cell.steps,
         seeds=1,
         first_seed=cell.seed,
-        directory=job.path,
-        groups=1,
+        directory=job.path.parent,
         evaluation_interval=cell.evaluation_interval,
         evaluation_episodes=cell.evaluation_episodes,
         evaluation_processes=0,
@@ -174,6 +172,7 @@ def _train(job: Job, tell: Callable[[Message], Any]) -> RunDirectory:
         command=job.command,
         on_evaluation=lambda step, returns: tell(Advanced(cell.key, step, returns.get(cell.seed, float("nan")))),
     )
+    return RunDirectory.open(job.path)
 
 
 def _roll_out(job: Job, run: RunDirectory) -> None:
@@ -189,7 +188,7 @@ def _roll_out(job: Job, run: RunDirectory) -> None:
 
     last = values_at(perturbations_of(job.cell.perturbations), job.cell.steps)
     perturbed = [Perturbation(kind, value) for kind, value in last.items()]
-    with run.locked(), caught_signals() as (_, received):
+    with run.locked(), signals_noted() as received:
 
         def stop_if_asked(done: int, wanted: int) -> None:
             if received and done < wanted:
@@ -203,7 +202,7 @@ def _roll_out(job: Job, run: RunDirectory) -> None:
             episodes=job.rollouts,
             perturbations=perturbed,
             processes=1,
-            trust_task=run.manifest.task == job.cell.task,  # which the study names, on whatever machine it was trained
+            trust_task=run.config.task == job.cell.task,  # which the study names, on whatever machine it was trained
             on_progress=stop_if_asked,
         )
         rows = [episode.row(seed, job.cell.steps) for episode in episodes]
@@ -220,7 +219,7 @@ def is_tested(job: Job) -> bool:
 def _ended(key: str, run: RunDirectory) -> Ended:
     """Say how a cell ended whose run is final."""
     if run.manifest.state != "finished":
-        return Ended(key, "failed", "; ".join(map(str, run.manifest.failures.values())))
+        return Ended(key, "failed", run.manifest.failure)
     return Ended(key, "complete")
 
 

@@ -64,15 +64,15 @@ def write_report(studies: Sequence[Study], source: Source, directory: Path, comm
 def train_command(arm: Arm) -> str:
     """Return the `csac train` that trains every seed of an arm in one run."""
     one = arm.manifests[0]
-    seeds = {*arm.missing, *arm.failures, *(seed for manifest in arm.manifests for seed in manifest.seeds)}
-    words = ["csac", "train", one.task, "--algorithm", one.algorithm, "--steps", str(one.steps)]
+    seeds = {*arm.missing, *arm.failures, *(manifest.config.seed for manifest in arm.manifests)}
+    words = ["csac", "train", one.config.task, "--algorithm", one.config.algorithm, "--steps", str(one.config.steps)]
     words += ["--seeds", str(len(seeds)), *(["--first-seed", str(min(seeds))] if min(seeds) else [])]
-    words += ["--evaluation-interval", str(one.evaluation.interval)]
-    words += ["--evaluation-episodes", str(one.evaluation.episodes)]
-    words += [word for perturbation in one.perturbations for word in ("--perturb", perturbation)]
-    words += ["--env-kwargs", json.dumps(one.environment_arguments)] * bool(one.environment_arguments)
-    words += ["--events", ",".join(one.events)] * bool(one.events)
-    words += changed(complete(one.algorithm, one.hyperparameters), complete(one.algorithm, {}))
+    words += ["--evaluation-interval", str(one.config.evaluation_interval)]
+    words += ["--evaluation-episodes", str(one.config.evaluation_episodes)]
+    words += [word for perturbation in one.config.perturbations for word in ("--perturb", perturbation)]
+    words += ["--env-kwargs", json.dumps(one.config.environment_arguments)] * bool(one.config.environment_arguments)
+    words += ["--events", ",".join(one.config.events)] * bool(one.config.events)
+    words += changed(complete(one.config.algorithm, one.config.hyperparameters), complete(one.config.algorithm, {}))
     return shlex.join(words)
 
 

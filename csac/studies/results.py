@@ -9,8 +9,8 @@ from typing import Protocol
 
 from csac.record import manifest as manifests
 from csac.record.files import write_atomically
-from csac.record.tables import COLUMNS
 from csac.record.run import RunDirectory
+from csac.record.tables import COLUMNS
 from csac.studies.cells import Cell, Status, Store, is_final, read_history
 from csac.studies.collected import ROLLOUTS, Record, read_collected, read_rollouts, rollouts_of
 from csac.types import InputError

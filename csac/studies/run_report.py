@@ -192,7 +192,7 @@ def _runs_table(comparison: Comparison) -> Table:
     for run in comparison.runs:
         one, seeds = run.manifest, sorted(seeds_of([run]))
         steps = one.steps_done if one else int(run.rows["step"].max(initial=0))
-        told = (one.task, one.algorithm) if one else ("", "")
+        told = (one.config.task, one.config.algorithm) if one else ("", "")
         texts = (str(run.path), *told, ", ".join(map(str, seeds)))
         rows.append(Row((*map(Cell, texts), Cell(f"{steps:,}", steps), Cell(one.state if one else ""))))
     return Table(("run", "task", "algorithm", "seeds", "steps", "state"), tuple(rows))

@@ -396,4 +396,4 @@ def _case_bar(arm: Arm, rows: np.ndarray, name: str, is_beside_paper: bool) -> B
 
 def _device(manifest: Manifest) -> str:
     model = manifest.machine.gpu or manifest.machine.processor
-    return f"{manifest.device} ({model})" if model else manifest.device
+    return f"{manifest.config.device} ({model})" if model else manifest.config.device

@@ -13,9 +13,9 @@ from typing import IO, TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from csac.record.tables import drop_torn_line
-from csac.record.manifest import differences
+from csac.record.config import differences
 from csac.record.run import is_locked, is_run, kept_from_children
+from csac.record.tables import drop_torn_line
 from csac.tasks.seeds import TUNING_EVALUATION_SEED
 from csac.training.options import Options
 from csac.types import InputError

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.presets import hyperparameters as preset_of
-from csac.record.manifest import SEED_LIMIT, STEPS_LIMIT
+from csac.record.config import MOST_EPISODES, NEVER, SEED_LIMIT, STEPS_LIMIT
 from csac.studies import paper
 from csac.studies.cells import Cell, complete, similar
 from csac.tasks.known import adapter_of, check_events
 from csac.tasks.making import registered
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
-from csac.training.options import LONGEST_INTERVAL, MOST_EPISODES
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -372,7 +371,7 @@ _RANGES: Mapping[str, tuple[int, int]] = {
     "seeds": (1, SEED_LIMIT),
     "first_seed": (0, SEED_LIMIT - 1),
     "steps": (1, STEPS_LIMIT),
-    "evaluation_interval": (1, LONGEST_INTERVAL),
+    "evaluation_interval": (1, NEVER),
     "evaluation_episodes": (1, MOST_EPISODES),
     "rollouts": (0, MOST_EPISODES),
 }

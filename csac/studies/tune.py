@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.checks import check_whole
-from csac.record import manifest as manifests
-from csac.record.run import MANIFEST, RunDirectory, is_run
+from csac.record.sets import RunSet
 from csac.record.statistics import evaluation_matrix, last_evaluations
 from csac.studies.cells import restarting_seeds
 from csac.studies.job import Stopped
 from csac.studies.shared_study import POINTS
 from csac.tasks.seeds import TUNING_EVALUATION_SEED
-from csac.training.checkpoint import FOLDER, steps_in
-from csac.training.interruptions import signals_noted
+from csac.training.checkpoint import steps_in
+from csac.training.signals import signals_noted
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -52,7 +51,6 @@ def tune(
     study: SharedStudy,
     trials: int,
     watcher: Watcher,
-    groups: int | None = None,
     command: str | None = None,
 ) -> None:
     """Run trials, one after another, until the study has so many.
@@ -63,7 +61,7 @@ def tune(
         StorageFailure: the directory can no longer be written.
     """
     check_whole("trials", trials, 1, MOST_TRIALS)
-    options = {"groups": groups, "command": command}
+    options = {"command": command}
     with signals_noted() as received:
         while not received and (attempt := study.next(trials)):
             with attempt.lock:
@@ -108,6 +106,7 @@ def _run(study: SharedStudy, attempt: Attempt, watcher: Watcher, options: dict[s
                 environment_arguments=question.environment_arguments,
                 steps=question.steps,
                 seeds=question.seeds,
+                seeds_per_process=question.seeds,
                 first_seed=question.first_seed,
                 evaluation_interval=question.evaluation_interval,
                 evaluation_episodes=question.evaluation_episodes,
@@ -123,14 +122,15 @@ def _run(study: SharedStudy, attempt: Attempt, watcher: Watcher, options: dict[s
     except InputError:
         study.drop(attempt)
         raise
-    if failures := run.manifest.failures:
+    if failures := run.failures:
         study.prune(attempt, "; ".join(f"seed {seed}: {reason}" for seed, reason in failures.items()))
     elif is_pruned:
         study.prune(attempt)
     else:
         study.complete(attempt, last_evaluations(run.evaluations, POINTS))
     # Nobody goes on with it any more, and the replay takes most of the room.
-    shutil.rmtree(run.checkpoints, ignore_errors=True)
+    for one in run.runs:
+        shutil.rmtree(one.checkpoints, ignore_errors=True)
 
 
 def _points_before(path: Path) -> dict[int, dict[int, float]]:
@@ -139,34 +139,16 @@ def _points_before(path: Path) -> dict[int, dict[int, float]]:
     A trial that has no checkpoint yet begins anew. One that has is left as it is: `train` restores a damaged table, of
     which nothing is known until then, and refuses a manifest that it cannot use.
     """
-    if not is_run(path):
-        return {}
-    if _begins_anew(path):
-        shutil.rmtree(path)
-        return {}
     with suppress(InputError):
-        run = RunDirectory.open(path)
-        # A process that dies after a checkpoint may not have told the manifest of it.
-        newest = max(steps_in(run.checkpoints), default=run.manifest.last_checkpoint)
-        steps, seeds, returns = evaluation_matrix(run.evaluations)
+        runs = RunSet.open(path)
+        newest = min(max(steps_in(run.checkpoints), default=0) for run in runs.runs)
+        steps, seeds, returns = evaluation_matrix(runs.evaluations)
         return {
             step: dict(zip(seeds.tolist(), column.tolist(), strict=True))
             for step, column in zip(steps.tolist(), returns.T, strict=True)
             if step <= newest
         }
     return {}
-
-
-def _begins_anew(path: Path) -> bool:
-    """Whether a run surely has no checkpoint: a manifest may be unreadable for a moment only, or of a newer csac."""
-    if steps_in(path / FOLDER):
-        return False
-    try:
-        return not manifests.read((path / MANIFEST).read_bytes()).last_checkpoint
-    except (OSError, manifests.NewerError):
-        return False
-    except InputError:  # half-written, since the machine lost power
-        return True
 
 
 def _objective(points: Mapping[int, Mapping[int, float]], step: int) -> float:

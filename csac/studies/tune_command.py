@@ -17,7 +17,6 @@ from csac.studies.shared_study import Question, SharedStudy, import_optuna
 from csac.studies.tune import MOST_TRIALS, tune
 from csac.studies.tune_progress import TuneProgress
 from csac.tasks.environment import Environment, try_arguments
-from csac.training.options import check_groups
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,19 +25,17 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-def run_tune(question: Question, directory: Path, trials: int, groups: int | None, arguments: Sequence[str]) -> int:
+def run_tune(question: Question, directory: Path, trials: int, arguments: Sequence[str]) -> int:
     """Search, and return the exit code; `arguments` are what was typed after `csac tune`.
 
     Raises:
-        InputError: fewer than one trial, no such task, groups that the seeds do not fill, a device that there is not,
+        InputError: fewer than one trial, no such task, a device that there is not,
             Optuna is missing, or a directory of something else.
         StorageFailure: the directory can no longer be written.
     """
     from csac.training.devices import choose_device  # JAX
 
     check_whole("trials", trials, 1, MOST_TRIALS)
-    if groups is not None:
-        check_groups(groups, question.seeds)
     import_optuna()
     choose_device(question.device)
     with closing(Environment(question.task, question.environment_arguments)) as environment:  # says what is to be said
@@ -50,7 +47,7 @@ def run_tune(question: Question, directory: Path, trials: int, groups: int | Non
     with closing(TuneProgress(trials, question.steps, console)) as progress:
         progress.start(study)
         try:
-            tune(study, trials, progress, groups=groups, command=line)
+            tune(study, trials, progress, command=line)
         except Stopped as stop:
             stopped = stop
     _conclude(study, line, console)

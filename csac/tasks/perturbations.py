@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from csac.checks import did_you_mean
-from csac.record.manifest import STEPS_LIMIT
+from csac.record.config import STEPS_LIMIT
 from csac.tasks.physics import NOISES, PHYSICS
 from csac.types import InputError
 

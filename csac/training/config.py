@@ -16,6 +16,7 @@ from csac.tasks.environment import Environment, try_arguments
 from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.trust import remember
+from csac.training.options import MOST_SEEDS
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -25,10 +26,8 @@ if TYPE_CHECKING:
     from csac.training.resume import Source
     from csac.types import Algorithm, Spec
 
-MOST_SEEDS = 10_000
 
-
-class Options(TypedDict, total=False):
+class TrainOptions(TypedDict, total=False):
     """The keyword arguments of `train` that say what a run computes, as `RunConfig` explains them."""
 
     steps: int
@@ -44,7 +43,7 @@ class Options(TypedDict, total=False):
 
 
 def make_configs(
-    algorithm: Algorithm, task: Task, seeds: Sequence[int], given: Options, source: Source | None
+    algorithm: Algorithm, task: Task, seeds: Sequence[int], given: TrainOptions, source: Source | None
 ) -> tuple[list[RunConfig], Spec]:
     """Return the configuration of each seed's run, and the sizes of the task, which is made and perturbed once.
 
@@ -68,6 +67,7 @@ def make_configs(
         if arguments:
             try_arguments(environment, arguments)
         remember(task)
+        asked_for = tuple(map(str, perturbations_of(asked or ())))
         configs = [
             RunConfig(
                 task=name,
@@ -75,7 +75,7 @@ def make_configs(
                 hyperparameters=hyperparameters,
                 seed=seed,
                 environment_arguments=arguments,
-                perturbations=source.perturbations(seed, asked) if source else tuple(map(str, perturbations_of(asked or ()))),
+                perturbations=source.perturbations(seed, asked) if source else asked_for,
                 events=tuple(events),
                 task_is_callable=not isinstance(task, str),
                 **options,
@@ -121,12 +121,14 @@ def check_algorithm(algorithm: object) -> None:
         raise InputError(f"{given:.60} is no algorithm with hyperparameters: give {names.get(given.lower(), 'CSAC')}()")
 
 
-def _refuse_unknown(given: Options, algorithm: Algorithm) -> None:
-    known = Options.__annotations__
+def _refuse_unknown(given: TrainOptions, algorithm: Algorithm) -> None:
+    known = TrainOptions.__annotations__
     for name in given:
         if name in known:
             continue
         if name in (item.name for item in dataclasses.fields(algorithm)):  # pyright: ignore[reportArgumentType]
-            raise InputError(f"train takes no {name}: it is a hyperparameter, as in {type(algorithm).__name__}({name}=...)")
+            raise InputError(
+                f"train takes no {name}: it is a hyperparameter, as in {type(algorithm).__name__}({name}=...)"
+            )
         hint = called_in_python(name, known) or did_you_mean(name, known)
         raise InputError(f"train takes no {name}" + (f": {hint}" if hint else ""))

@@ -118,7 +118,7 @@ class Loop:
             self._pending: tuple[int, list[int], list[Policy], Any] | None = None
             self._unheard = set(self.config.events) if not len(runs[0].evaluations) else set()
             self._begin(points)
-            self.recorders = [Recorder(run, self.step, program.tensorboard) for run in runs]
+            self.recorders = [Recorder(run, self.step, program.tensorboard, program.wandb) for run in runs]
             self._saved_at, self._saved_time = self.step, time.monotonic()
             self.is_over = False
             self._opened = stack.pop_all()
@@ -210,7 +210,9 @@ class Loop:
             lost = checkpoint.fill(rows)
             for text in lost:
                 self._note(run, f"warning: {text}")
-            self._writers[index] = Writer(run.checkpoints, self.config.keep_checkpoints, {} if lost else checkpoint.files)
+            self._writers[index] = Writer(
+                run.checkpoints, self.config.keep_checkpoints, {} if lost else checkpoint.files
+            )
 
         return fill
 
@@ -382,4 +384,3 @@ def _others(run: RunDirectory) -> dict[str, bytes]:
 
 def _is_finite(network: PolicyNetwork) -> bool:
     return all(np.isfinite(array).all() for array in jax.tree.leaves(network.parameters))
-

@@ -51,7 +51,7 @@ def refuse_differences(run: RunDirectory, wanted: RunConfig, has_schedule: bool)
     if wanted.steps < before.steps:
         raise InputError(f"{run.path} is a run of {before.steps:,} steps: steps={wanted.steps:,} would shorten it")
     if wanted.steps > before.steps and has_schedule:
-        raise InputError(f"{run.path} cannot be extended beyond {before.steps:,} steps: its learning rate has a schedule")
+        raise InputError(f"{run.path} cannot go beyond {before.steps:,} steps: its learning rate has a schedule")
 
 
 def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
@@ -66,7 +66,10 @@ def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
     while len({point.step for point in points}) > 1:
         until = min(point.step for point in points)
         points = [_find(run, until) if point.step > until else point for run, point in zip(runs, points, strict=True)]
-    return [ResumePoint(point.checkpoint, point.notes + _restore(run, point)) for run, point in zip(runs, points, strict=True)]
+    return [
+        ResumePoint(point.checkpoint, point.notes + _restore(run, point))
+        for run, point in zip(runs, points, strict=True)
+    ]
 
 
 def _find(run: RunDirectory, until: int | None) -> ResumePoint:
@@ -119,7 +122,12 @@ def _cut_back(path: Path, content: bytes) -> bool:
 
 def _remove_unfinished(run: RunDirectory) -> None:
     """Remove what a process was writing when it was killed."""
-    for path in [*run.path.glob(".*.*"), *run.policies.glob(".*"), *run.checkpoints.glob(".*"), *run.checkpoints.glob("replay/.*")]:
+    for path in [
+        *run.path.glob(".*.*"),
+        *run.policies.glob(".*"),
+        *run.checkpoints.glob(".*"),
+        *run.checkpoints.glob("replay/.*"),
+    ]:
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
@@ -184,7 +192,9 @@ class Source(NamedTuple):
             checkpoint, complaints = newest_sound(run.checkpoints, step)
             if checkpoint is None or checkpoint.step != step:
                 known = ", ".join(map(str, steps_in(run.checkpoints))) or "none"
-                raise InputError("; ".join(complaints) or f"{run.path} has no checkpoint of step {step}; it has {known}")
+                raise InputError(
+                    "; ".join(complaints) or f"{run.path} has no checkpoint of step {step}; it has {known}"
+                )
             checkpoints[seed] = checkpoint
         return cls(found.path, runs, checkpoints)
 

@@ -33,13 +33,14 @@ class Interrupted(Exception):
 
 
 class StopRequest:
-    """The SIGINTs and SIGTERMs so far, and the handler that notes them; the second raises KeyboardInterrupt(its number)."""
+    """Note SIGINT and SIGTERM as their handler; the second of them raises KeyboardInterrupt(its number)."""
 
     def __init__(self, tell: Callable[[str], None] | None = None) -> None:
         self.received: list[int] = []
         self._tell, self._process = tell, os.getpid()
 
     def __call__(self, number: int, _: Any = None) -> None:
+        """Take a signal."""
         if os.getpid() != self._process:  # a helper that the task has forked
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
@@ -66,6 +67,13 @@ def stop_requested(tell: Callable[[str], None] | None = None) -> Iterator[StopRe
     request = outer if isinstance(outer, StopRequest) else StopRequest(tell)
     with _handled(request):
         yield request
+
+
+@contextmanager
+def signals_noted() -> Iterator[list[int]]:
+    """Yield the signals that have come; runs that are trained within share the request to stop."""
+    with stop_requested() as request:
+        yield request.received
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""One supervisor for whatever trains in processes: starts them, hands on what they tell and signals, restarts the dead."""
+"""One supervisor for whatever trains in processes: it starts them, passes messages and signals on, restarts the dead."""
 
 from __future__ import annotations
 
@@ -25,7 +25,11 @@ SECONDS_TO_CLOSE = 5.0  # that a process has to close its environments
 
 
 def supervise(
-    programs: Iterable[Program], watcher: Watcher, should_stop: Callable[[], bool], workers: int, turns: int | None = None
+    programs: Iterable[Program],
+    watcher: Watcher,
+    should_stop: Callable[[], bool],
+    workers: int,
+    turns: int | None = None,
 ) -> None:
     """Run each program in a process of its own, `workers` at a time, until all are over or stopped.
 
@@ -83,10 +87,12 @@ def _give_turns(workers: Iterable[_Worker], turns: int | None) -> None:
     free = len(workers) if turns is None else turns - sum(worker.has_turn is True for worker in workers)
     for worker in waiting[: max(free, 0)]:
         worker.has_turn = True
-        worker.tell(("turn",))
+        worker.tell(("turn", None))
 
 
-def _replace(worker: _Worker, watcher: Watcher, restarted: set[tuple[Path, ...]], errors: list[Exception]) -> list[Program]:
+def _replace(
+    worker: _Worker, watcher: Watcher, restarted: set[tuple[Path, ...]], errors: list[Exception]
+) -> list[Program]:
     """Return the program to start again, or note how its runs failed."""
     try:
         reason = worker.cause_of_death()
@@ -131,7 +137,7 @@ class _Worker(Child):
         """Ask the process to save and end."""
         if not self.is_stopping:
             self.is_stopping = True
-            self.tell(("stop",))
+            self.tell(("stop", None))
 
 
 def _work(connection: Connection, program: Program) -> None:
@@ -166,7 +172,7 @@ class _RemoteWatcher:
     def __init__(self, connection: Connection, asks: bool) -> None:
         self._connection, self._asks = connection, asks
         self.stopped = threading.Event()
-        self._answers: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._turns: queue.SimpleQueue[None] = queue.SimpleQueue()
         threading.Thread(target=self._listen, daemon=True).start()
 
@@ -193,7 +199,7 @@ class _RemoteWatcher:
             try:
                 message = self._connection.recv()
             except (EOFError, OSError):
-                message = ("stop",)
+                message = ("stop", None)
             if message[0] == "answer":
                 self._answers.put(message[1])
                 continue

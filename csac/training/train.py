@@ -16,6 +16,7 @@ from csac.processes import core_quota, end_if_unguarded, usable_cores
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory
 from csac.record.statistics import last_evaluations
+from csac.record.wandb import import_wandb
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.tasks.trust import refuse_untrusted
 from csac.training.compilation import tidy_programs
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from csac.console.progress import Reporter
     from csac.record.config import RunConfig
     from csac.tasks.making import Task
-    from csac.training.config import Options
+    from csac.training.config import TrainOptions
     from csac.training.loop import Watcher
     from csac.training.resume import ResumePoint
     from csac.types import Algorithm
@@ -68,7 +69,7 @@ def train(
     command: str | None = None,
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
-    **options: Unpack[Options],
+    **options: Unpack[TrainOptions],
 ) -> RunSet:
     """Train independent seeds of an algorithm on a task and return their runs.
 
@@ -108,6 +109,8 @@ def train(
     check_path("directory", directory) if directory is not None else None
     if resume and directory is None:
         raise InputError("resume needs the `directory` of the runs (csac.resume(directory) does without a task)")
+    if wandb:
+        import_wandb()
     watch = _Watch.make(reporter, progress, on_evaluation, stop_when)
     choose_device(options.get("device", "cpu"))
     wanted = labels(seeds, first_seed)
@@ -122,7 +125,8 @@ def train(
     for config in configs:
         group = next(group for group in groups if config.seed in group)
         _create_or_extend(place, config, group, existing.get(config.seed), source)
-    return _run(RunSet.open(place), programs, watch, notes)
+    runs = RunSet(place, [RunDirectory.open(place / f"seed-{seed}") for seed in wanted])
+    return _run(runs, programs, watch, notes)
 
 
 def resume(
@@ -223,7 +227,9 @@ def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_sched
                 raise InputError(f"{path} already holds a run: resume it, or choose another directory")
             existing[config.seed] = run = RunDirectory.open(path)
             refuse_differences(run, config, has_schedule)
-    strangers = [p for p in place.iterdir() if not p.name.startswith((".", "seed-", "curve.png"))] if place.is_dir() else []
+    strangers = (
+        [p for p in place.iterdir() if not p.name.startswith((".", "seed-", "curve.png"))] if place.is_dir() else []
+    )
     if strangers or (place.exists() and not place.is_dir()):
         raise InputError(f"{place} is not empty and holds no set of runs: choose a new or an empty directory")
     return existing
@@ -291,10 +297,21 @@ class _How(NamedTuple):
             processes = min(batches, max(1, spare // len(directories))) if pays and _can_be_sent(self.task) else 0
         check_whole("evaluation_processes", processes, 0, 1_000)
         if (processes or len(directories) > 1) and not _can_be_sent(self.task):
-            raise InputError("the task cannot be sent to another process: make it a function of a module that can be imported, or train with seeds_per_process=seeds and evaluation_processes=0")
+            raise InputError(
+                "the task cannot be sent to another process: make it a function of a module that can be imported, or "
+                "train with seeds_per_process=seeds and evaluation_processes=0"
+            )
         return [
             Program(
-                tuple(group), self.algorithm, self.task, threads, processes, self.tensorboard, self.wandb, self.asks, self.command
+                tuple(group),
+                self.algorithm,
+                self.task,
+                threads,
+                processes,
+                self.tensorboard,
+                self.wandb,
+                self.asks,
+                self.command,
             )
             for group in directories
         ]
@@ -303,7 +320,9 @@ class _How(NamedTuple):
 class _Watch:
     """Tells the caller what happens: the reporter and the caller's own functions."""
 
-    def __init__(self, reporter: Reporter | None, on_evaluation: OnEvaluation | None, stop_when: StopWhen | None) -> None:
+    def __init__(
+        self, reporter: Reporter | None, on_evaluation: OnEvaluation | None, stop_when: StopWhen | None
+    ) -> None:
         self.reporter, self.on_evaluation, self.stop_when = reporter, on_evaluation, stop_when
 
     @classmethod
@@ -373,8 +392,8 @@ def _run(runs: RunSet, programs: list[Program], watch: _Watch, notes: list[str])
         elif programs:
             turns = len(usable_cores()) // programs[0].threads if runs.config.device == "cpu" else None
             supervise(programs, watch, request.is_set, _workers(), turns)
-        runs = RunSet.open(runs.path)
-        draw_curve(runs, watch.note)
+        runs = RunSet(runs.path, [RunDirectory.open(run.path) for run in runs.runs])
+        draw_curve(RunSet.open(runs.path), watch.note)
         if reporter:
             reporter.finish(runs)
     if request.is_set() and any(run.manifest.state in ("running", "interrupted") for run in runs.runs):
@@ -414,4 +433,8 @@ def _can_be_sent(task: Task) -> bool:
 
 def _warmup_note(algorithm: Algorithm, config: RunConfig) -> list[str]:
     first = algorithm.cadence.first_update
-    return [f"note: no updates: steps ({config.steps:,}) < {first:,}, where the first one comes"] if config.steps < first else []
+    return (
+        [f"note: no updates: steps ({config.steps:,}) < {first:,}, where the first one comes"]
+        if config.steps < first
+        else []
+    )
