@@ -7,14 +7,15 @@ from contextlib import closing
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from csac.algorithms import ALGORITHMS
-from csac.checks import check_arguments, check_whole, did_you_mean
+from csac.checks import check_whole, did_you_mean
 from csac.presets import matching_preset
-from csac.record.config import SEED_LIMIT, RunConfig, as_json
+from csac.record.config import SEED_LIMIT, RunConfig
 from csac.record.manifest import Manifest
 from csac.synonyms import called_in_python
-from csac.tasks.environment import Environment, try_arguments
-from csac.tasks.known import check_events, events_of
+from csac.tasks.environment import Environment
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
+from csac.tasks.preflight import json_arguments, seed_warning, try_task, wrapper_warnings
+from csac.tasks.registry import check_events, events_of
 from csac.tasks.trust import remember
 from csac.training.options import MOST_SEEDS
 from csac.types import InputError
@@ -22,7 +23,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from csac.tasks.making import Task
+    from csac.tasks.registry import Task
     from csac.training.resume import Source
     from csac.types import Algorithm, Spec
 
@@ -44,16 +45,17 @@ class TrainOptions(TypedDict, total=False):
 
 def make_configs(
     algorithm: Algorithm, task: Task, seeds: Sequence[int], given: TrainOptions, source: Source | None
-) -> tuple[list[RunConfig], Spec]:
-    """Return the configuration of each seed's run, and the sizes of the task, which is made and perturbed once.
+) -> tuple[list[RunConfig], Spec, list[str]]:
+    """Return the configuration of each seed's run, the sizes of the task, and what the user should know of it.
+
+    The task is made, stepped and perturbed once.
 
     Raises:
         InputError: a mistake in the options, or a task that csac cannot learn.
     """
     _refuse_unknown(given, algorithm)
     options: Any = dict(given)
-    check_arguments("environment_arguments", options.get("environment_arguments"))
-    arguments = as_json("environment_arguments", dict(options.pop("environment_arguments", None) or {}))
+    arguments = json_arguments(options.pop("environment_arguments", None))
     asked, events = options.pop("perturbations", None), options.pop("events", None)
     if events is not None:
         check_events(events)
@@ -64,8 +66,8 @@ def make_configs(
     hyperparameters = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
     with closing(Environment(task, arguments)) as environment:
         spec, name = environment.spec, environment.task_name
-        if arguments:
-            try_arguments(environment, arguments)
+        try_task(environment)
+        notes = [*wrapper_warnings(environment), *filter(None, [seed_warning(environment)])]
         remember(task)
         asked_for = tuple(map(str, perturbations_of(asked or ())))
         configs = [
@@ -86,7 +88,7 @@ def make_configs(
         refuse_late(changes, configs[0].steps, planned=source is not None and asked is None)
         for item in changes:
             environment.perturb({item.kind: item.value})
-    return configs, spec
+    return configs, spec, [f"note: {line}" for line in notes]
 
 
 def labels(seeds: int, first_seed: int) -> list[int]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from csac.evaluation.evaluator import EvaluationEpisode
     from csac.record.run import RunDirectory
-    from csac.tasks.making import Task
+    from csac.tasks.registry import Task
     from csac.types import Algorithm, PolicyNetwork
 
 METRICS_INTERVAL = 1_000
@@ -103,8 +103,16 @@ class Loop:
         with ExitStack() as stack:
             self.environments = SeedEnvironments(program.task, arguments, seeds)
             stack.callback(self.environments.close)
-            self.evaluator = _evaluator(program, self.config)
-            stack.callback(self.evaluator.close)
+            self._base_evaluator = Evaluator(
+                *(program.task, arguments, self.config.evaluation_episodes, self.config.evaluation_seed),
+                self.config.events,
+            )
+            stack.callback(self._base_evaluator.close)
+            self.evaluator: Evaluator | EvaluationPool = self._base_evaluator
+            if program.evaluation_processes:
+                self.evaluator = pool = EvaluationPool(self._base_evaluator, program.evaluation_processes)
+                stack.callback(pool.close)
+                pool.start()
             self.learner = Learner(program.algorithm, self.environments.spec, seeds, self.steps)
             self._contract = Contract(
                 self.environments.task_name,
@@ -190,7 +198,7 @@ class Loop:
             environment = saved.part("environment")
             if origin and origin.step == self.step and origin.changed("task "):
                 environment.values["exact"] = False
-            if not self.environments.take_back(index, environment):
+            if not self.environments.restore(index, environment):
                 restarted.append(index)
             fills.append(self._filler(index, point))
         self.learner.take_back(learnt, fills)
@@ -245,7 +253,7 @@ class Loop:
         networks = self.learner.networks()
         places = [i for i in np.flatnonzero(self.environments.alive).tolist() if _is_finite(networks[i])]
         policies = [Policy(networks[i], self._contract, step=self.step) for i in places]
-        self.evaluator.perturb(values_at(self._perturbations, self.step - 1))
+        self._base_evaluator.perturb(values_at(self._perturbations, self.step - 1))
         self._pending = (self.step, places, policies, self.evaluator.begin(policies))
         return is_asked or (self._pending[3].is_over and self._settle())
 
@@ -362,17 +370,6 @@ class Loop:
 
     def _is_due(self, interval: int) -> bool:
         return bool(interval) and self.step % interval == 0
-
-
-def _evaluator(program: Program, config: Any) -> Evaluator | EvaluationPool:
-    evaluator = Evaluator(
-        program.task, config.environment_arguments, config.evaluation_episodes, config.evaluation_seed, config.events
-    )
-    if not program.evaluation_processes:
-        return evaluator
-    pool = EvaluationPool(evaluator, program.evaluation_processes)
-    pool.start()
-    return pool
 
 
 def _others(run: RunDirectory) -> dict[str, bytes]:

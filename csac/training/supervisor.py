@@ -1,4 +1,4 @@
-"""One supervisor for whatever trains in processes: it starts them, passes messages and signals on, restarts the dead."""
+"""One supervisor for whatever trains in processes: starts them, passes messages and signals on, restarts the dead."""
 
 from __future__ import annotations
 

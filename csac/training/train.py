@@ -18,6 +18,7 @@ from csac.record.sets import RunSet, new_set_directory
 from csac.record.statistics import last_evaluations
 from csac.record.wandb import import_wandb
 from csac.tasks.perturbations import by_step, perturbations_of
+from csac.tasks.preflight import seed_globals
 from csac.tasks.trust import refuse_untrusted
 from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs, make_manifest
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
     from csac.console.progress import Reporter
     from csac.record.config import RunConfig
-    from csac.tasks.making import Task
+    from csac.tasks.registry import Task
     from csac.training.config import TrainOptions
     from csac.training.loop import Watcher
     from csac.training.resume import ResumePoint
@@ -115,13 +116,13 @@ def train(
     choose_device(options.get("device", "cpu"))
     wanted = labels(seeds, first_seed)
     source = Source.find(start_from, wanted) if start_from is not None else None
-    configs, spec = make_configs(algorithm, task, wanted, options, source)
+    configs, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
     place = Path(os.path.abspath(directory)) if directory else new_set_directory(configs[0].task, algorithm.name)
     existing = _existing(place, configs, resume, algorithm.cadence.has_schedule)
     groups = _groups(wanted, existing, seeds_per_process, configs[0].device, task)
     how = _How(algorithm, task, evaluation_processes, tensorboard, wandb, command, stop_when is not None)
     programs = how.programs([[place / f"seed-{seed}" for seed in group] for group in groups], existing, configs[0])
-    notes = [memory_needed(programs, configs[0], spec, _workers()), *_warmup_note(algorithm, configs[0])]
+    notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
     for config in configs:
         group = next(group for group in groups if config.seed in group)
         _create_or_extend(place, config, group, existing.get(config.seed), source)
@@ -187,6 +188,7 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
             stack.enter_context(run.locked())
             run.read_again()  # another process may have gone on with it before we had the lock
         choose_device(runs[0].config.device)
+        seed_globals(runs[0].seed)
         points = roll_back(runs)
         current = provenance(program.task, program.command, program.threads)
         for run, point in zip(runs, points, strict=True):
