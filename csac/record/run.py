@@ -172,6 +172,9 @@ class RunDirectory:
         Raises:
             InputError: another process holds it, or the file system has none to give.
         """
+        for path in self.path.iterdir():
+            if path.is_symlink():  # what it points to would be overwritten
+                raise InputError(f"{path} is a link: replace it by what it points to")
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
         try:
             file = kept_from_children(os.fdopen(os.open(self.path / LOCK, flags, 0o666), "r+"))

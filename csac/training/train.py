@@ -114,10 +114,11 @@ def train(
         import_wandb()
     watch = _Watch.make(reporter, progress, on_evaluation, stop_when)
     choose_device(options.get("device", "cpu"))
+    place = None if directory is None else Path(os.path.abspath(directory))  # a task may change where we are
     wanted = labels(seeds, first_seed)
     source = Source.find(start_from, wanted) if start_from is not None else None
     configs, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
-    place = Path(os.path.abspath(directory)) if directory else new_set_directory(configs[0].task, algorithm.name)
+    place = place or new_set_directory(configs[0].task, algorithm.name)
     existing = _existing(place, configs, resume, algorithm.cadence.has_schedule)
     groups = _groups(wanted, existing, seeds_per_process, configs[0].device, task)
     how = _How(algorithm, task, evaluation_processes, tensorboard, wandb, command, stop_when is not None)

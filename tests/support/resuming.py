@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from logs import without_times
-
 from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
+from csac.record.run import RunDirectory
 from csac.training.train import train
 
-FILES = ("evaluations.csv", "episodes.csv", "metrics.csv", "log.txt", "policy/seed_0.safetensors")
+FILES = ("evaluations.csv", "episodes.csv", "metrics.csv", "policy/last.safetensors", "policy/best.safetensors")
 SMALL: dict[str, Any] = {
     "actor_hidden_sizes": (8, 8),
     "critic_hidden_sizes": (8, 8),
@@ -26,13 +25,11 @@ LEARNERS = [
     SD3(noise_samples=4, **SMALL),
     ROLLOUT,
     SAC(update_interval=7, **SMALL),
-    CSAC(update_interval=3, **SMALL),
 ]
 ADAPTIVE = CSAC(
     entropy_weight="auto",
     relative_entropy_weight="auto",
     weight_learning_rate=0.01,
-    critic_reference="earlier",
     reference_policy="periodic",
     reference_period=30,
     relative_entropy_estimator="closed_form",
@@ -42,19 +39,22 @@ ADAPTIVE = CSAC(
     adam_momentum=0.5,
     **SMALL,
 )
-SHORT: dict[str, Any] = {"evaluation_interval": 100, "evaluation_episodes": 2, "tensorboard": False}
+SHORT: dict[str, Any] = {
+    "evaluation_interval": 100,
+    "evaluation_episodes": 2,
+    "tensorboard": False,
+    "evaluation_processes": 0,
+    "checkpoint_interval": 120,
+}
 
 
 def run(directory: Path, algorithm=LEARNERS[0], steps: int = 500, task: Any = "Hopper-v4", **settings: Any):
-    settings = {"checkpoint_interval": 120, **SHORT, **settings}
-    return train(algorithm, task, steps=steps, directory=directory, **settings)
+    return train(algorithm, task, steps=steps, directory=directory, **{**SHORT, **settings})
 
 
-def contents(directory: Path) -> dict[str, bytes]:
-    """The files that an uninterrupted run would have too."""
-    files = [*FILES, *(path.relative_to(directory).as_posix() for path in directory.glob("policy/*"))]
-    found = {name: (directory / name).read_bytes() for name in files if (directory / name).exists()}
-    return {name: without_times(content) if name == "log.txt" else content for name, content in found.items()}
+def contents(run: RunDirectory) -> dict[str, bytes]:
+    """The files of a run that one that was never stopped would have too."""
+    return {name: (run.path / name).read_bytes() for name in FILES if (run.path / name).exists()}
 
 
 class Crash(Exception):

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+import tempfile
 from contextlib import closing
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
-from unittest.mock import patch
 
-from plans import settings
-
-from csac.training import group, messages
+from csac.record.config import RunConfig
+from csac.record.run import RunDirectory
+from csac.record.manifest import Manifest
+from csac.training.loop import Loop, Program
+from csac.training.resume import ResumePoint
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,26 +21,54 @@ if TYPE_CHECKING:
 
 
 class Outcome(NamedTuple):
-    """`states` and `memories` hold one entry per seed; `messages` is everything that the loop yielded."""
+    """What the seeds have learnt and remembered, their last evaluations and how they failed."""
 
     states: list[Any]
     memories: list[np.ndarray]  # [steps, width] packed transitions, in the order of the steps
-    messages: list[messages.GroupMessage]
+    evaluations: list[np.ndarray]
+    failures: list[str]
+
+
+class Silent:
+    """Watches and says nothing; stops at the first evaluation from `stop_at` on."""
+
+    def __init__(self, stop_at: int | None = None) -> None:
+        self.stop_at = stop_at
+
+    def turn(self, step: int) -> None: ...
+
+    def progress(self, steps: Any) -> None: ...
+
+    def evaluated(self, step: int, returns: Any) -> bool:
+        return self.stop_at is not None and step >= self.stop_at
+
+    def failed(self, seed: int, step: int, reason: str) -> None: ...
+
+    def note(self, text: str) -> None: ...
 
 
 def run(
     algorithm: Algorithm, task: Any, steps: int, seeds: tuple[int, ...] = (0,), episodes: int = 1, **arguments: Any
 ) -> Outcome:
-    """Train `seeds` together, evaluating at the end alone, and return what there is to look at."""
-    learners: list[group.Learner] = []
-
-    class Kept(group.Learner):
-        def __init__(self, *arguments: Any) -> None:
-            super().__init__(*arguments)
-            learners.append(self)
-
-    given = settings(algorithm, task, steps, environment_arguments=arguments, evaluation_episodes=episodes)
-    with patch.object(group, "Learner", Kept), closing(group.Group(given, seeds)) as made:
-        told = list(made.run(lambda: False))
-    carries = [learners[0].carry(index) for index in range(len(seeds))]
-    return Outcome([carry.state for carry in carries], [carry.memory.rows for carry in carries], told)
+    """Train `seeds` in one program, evaluating at the end alone, and return what there is to look at."""
+    with tempfile.TemporaryDirectory() as folder:
+        runs = []
+        for seed in seeds:
+            config = RunConfig(
+                task=task if isinstance(task, str) else "probe",
+                algorithm=algorithm.name,
+                hyperparameters=dataclasses.asdict(algorithm),  # pyright: ignore[reportArgumentType]
+                seed=seed,
+                steps=steps,
+                evaluation_interval=steps,
+                evaluation_episodes=episodes,
+                checkpoint_interval=0,
+                environment_arguments=arguments,
+            )
+            runs.append(RunDirectory.create(Path(folder, f"seed-{seed}"), Manifest(config=config)))
+        program = Program(tuple(one.path for one in runs), algorithm, task, threads=1, tensorboard=False)
+        with closing(Loop(program, runs, [ResumePoint(None, [])] * len(runs), Silent())) as loop:
+            loop.run(lambda: False)
+            carries = [loop.learner.carry(index) for index in range(len(seeds))]
+            states, memories = [carry.state for carry in carries], [carry.memory.rows for carry in carries]
+            return Outcome(states, memories, [one.evaluations for one in runs], [one.manifest.failure for one in runs])

@@ -9,7 +9,6 @@ import pytest
 from trainer import run
 
 from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
-from csac.training.messages import Evaluated
 
 SETTINGS: dict[str, Any] = {
     "discount": 0.95,
@@ -32,10 +31,9 @@ class Climbing(CSAC):
 
 
 def mean_return(algorithm, steps: int = 3000, seed: int = 0) -> float:
-    events = run(algorithm, "Pendulum-v1", steps, (seed,), episodes=10).messages
-    rows = [row for event in events if isinstance(event, Evaluated) for row in event.rows]
+    (rows,) = run(algorithm, "Pendulum-v1", steps, (seed,), episodes=10).evaluations
     assert len(rows) == 10
-    return float(np.mean([row["return"] for row in rows]))
+    return float(np.mean(rows["return"]))
 
 
 @pytest.mark.parametrize(

@@ -52,13 +52,24 @@ def digest(name: str, seeds: int, directory: Path) -> str:
         "Hopper-v4",
         steps=500,
         seeds=seeds,
+        seeds_per_process=seeds,
+        evaluation_processes=0,
         directory=directory,
         evaluation_interval=250,
         evaluation_episodes=2,
         checkpoint_interval=0,
         tensorboard=False,
     )
-    return hashlib.sha256(b"".join((run.path / table).read_bytes() for table in TABLES)).hexdigest()[:16]
+    return hashlib.sha256(b"".join(joined([one.path / table for one in run.runs]) for table in TABLES)).hexdigest()[:16]
+
+
+def joined(tables: list[Path]) -> bytes:
+    """Return the rows of these tables, step by step and seed by seed, below their header."""
+    headers, *_ = {table.read_bytes().splitlines(keepends=True)[0] for table in tables}
+    rows = [line for table in tables for line in table.read_bytes().splitlines(keepends=True)[1:]]
+    columns = headers.decode().strip().split(",")
+    order = [columns.index(name) for name in ("step", "seed", "episode") if name in columns]
+    return headers + b"".join(sorted(rows, key=lambda row: [int(row.split(b",")[place]) for place in order]))
 
 
 def machine() -> str:

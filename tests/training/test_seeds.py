@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +10,6 @@ import pytest
 from trainer import run
 
 from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
-from csac.training.train import train
 
 SMALL: dict[str, Any] = {
     "actor_hidden_sizes": (16, 16),
@@ -43,31 +40,3 @@ def test_seeds_together_equal_seeds_alone(algorithm):
         for our, their in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(our, their, rtol=1e-3, atol=1e-5)
     assert not np.allclose(together.memories[0], together.memories[1], atol=0.1)
-
-
-TABLES = ("evaluations.csv", "episodes.csv", "metrics.csv")
-
-
-def tables(directory: Path, **settings: Any) -> dict[str, bytes]:
-    """Train on Pendulum and return the bytes of each table."""
-    algorithm = CSAC(**SMALL)
-    settings = {"steps": 410, "evaluation_interval": 200, "evaluation_episodes": 2, "tensorboard": False, **settings}
-    path = train(algorithm, "Pendulum-v1", directory=directory, **settings).path
-    return {name: (path / name).read_bytes() for name in TABLES}
-
-
-def lines(table: bytes) -> list[dict[str, str]]:
-    return list(csv.DictReader(table.decode().splitlines()))
-
-
-def test_equal_runs_write_equal_tables_and_groups_change_nothing(tmp_path):
-    grouped = tables(tmp_path / "groups", seeds=2, groups=2)
-    first, second = (tables(tmp_path / str(seed), first_seed=seed) for seed in (0, 1))
-    assert tables(tmp_path / "again") == first
-    for name in TABLES:
-        apart = sorted(
-            lines(first[name]) + lines(second[name]),
-            key=lambda row: (int(row["step"]), int(row["seed"]), int(row.get("episode", 0))),
-        )
-        assert lines(grouped[name]) == apart
-        assert [row for row in apart if row["seed"] == "0"] != [row for row in apart if row["seed"] == "1"]

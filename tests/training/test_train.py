@@ -1,0 +1,193 @@
+"""`train`: a set of runs, one seed each, in processes of their own or together; how each fails alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+from probes import Probe
+from resuming import LEARNERS, SMALL, contents, run
+
+import csac
+from csac import InputError
+from csac.algorithms import SAC
+from csac.record.sets import RunSet
+
+
+class Falling(Probe):
+    """Raises at its 60th step, but for evaluations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 60:
+            raise RuntimeError("the arm fell off")
+        return super().step(action)
+
+
+class Panicking(Falling):
+    """Raises what is no Exception, as a panic of an extension does."""
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 60:
+            raise type("Panic", (BaseException,), {})("rust")
+        return Probe.step(self, action)
+
+
+def test_a_set_has_a_whole_run_for_each_seed(tmp_path):
+    runs = run(tmp_path / "set", steps=200, seeds=2, first_seed=3)
+    assert runs.seeds == [3, 4]
+    assert sorted(path.name for path in runs.path.iterdir()) == ["curve.png", "seed-3", "seed-4"]
+    for one in runs.runs:
+        assert {path.name for path in one.path.iterdir()} >= {"manifest.json", "evaluations.csv", "policy", "checkpoint"}
+        assert json.loads((one.path / "manifest.json").read_text())["config"]["seed"] == one.seed
+        assert one.manifest.state == "finished"
+        assert set(one.evaluations["seed"]) == {one.seed}
+    assert len(runs.evaluations) == 2 * 2 * 2
+    assert csac.load(runs, seed=4).predict(np.zeros(11, np.float32))[0].shape == (3,)
+
+
+def test_seeds_in_one_program_equal_seeds_in_processes(tmp_path):
+    together = run(tmp_path / "together", steps=300, seeds=2, seeds_per_process=2)
+    apart = run(tmp_path / "apart", steps=300, seeds=2)
+    assert together.runs[0].manifest.program == (0, 1)
+    for one, other in zip(together.runs, apart.runs, strict=True):
+        for table in ("evaluations", "episodes", "metrics"):
+            ours, theirs = one.rows(table), other.rows(table)
+            for name in ours.dtype.names or ():
+                np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-3, atol=1e-4)
+    assert not np.allclose(apart.runs[0].evaluations["return"], apart.runs[1].evaluations["return"])
+
+
+def test_evaluating_beside_training_gives_the_same_files(tmp_path):
+    beside = run(tmp_path / "beside", steps=300, evaluation_processes=1)
+    between = run(tmp_path / "between", steps=300, evaluation_processes=0)
+    assert contents(beside.runs[0]) == contents(between.runs[0])
+
+
+@pytest.mark.parametrize("task", [Falling, Panicking])
+def test_a_failing_environment_fails_its_seed(tmp_path, task):
+    with pytest.warns(RuntimeWarning, match="seed 0 failed"):
+        runs = run(tmp_path / "set", SAC(**SMALL), task=task, steps=200, evaluation_episodes=1)
+    (one,) = runs.runs
+    assert one.manifest.state == "failed"
+    assert one.manifest.failure.startswith("step 60:")
+    assert runs.failures == {0: one.manifest.failure}
+    assert "Traceback" in (one.path / "log.txt").read_text()
+
+
+def test_a_failed_evaluation_ends_nothing(tmp_path):
+    made: list[int] = []
+
+    class Once(Probe):
+        """Only the environments of training can be stepped."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            made.append(1)
+            self.is_first = len(made) <= 2  # the trial's and training's
+
+        def step(self, action):
+            if not self.is_first:
+                raise RuntimeError("there is one robot alone")
+            return super().step(action)
+
+    runs = run(tmp_path / "set", SAC(**SMALL), task=Once, steps=200, evaluation_episodes=1)
+    (one,) = runs.runs
+    assert one.manifest.state == "finished"
+    assert not len(one.evaluations)
+    assert "there is one robot alone" in (one.path / "log.txt").read_text()
+
+
+def test_without_evaluations_a_run_leaves_its_policy(tmp_path):
+    runs = run(tmp_path / "set", steps=200, evaluation_interval=0)
+    assert not len(runs.evaluations)
+    assert csac.load(runs).step == 200
+
+
+def test_learning_that_diverges_fails_its_seed(tmp_path):
+    algorithm = SAC(**{**SMALL, "critic_learning_rate": 1e30, "actor_learning_rate": 1e30})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        runs = run(tmp_path / "set", algorithm, steps=1_000)
+    assert "not finite" in runs.failures[0]
+
+
+def test_callbacks_hear_of_each_evaluation_and_may_end_a_run_early(tmp_path):
+    heard: list[tuple[int, list[int]]] = []
+    runs = run(
+        tmp_path / "set",
+        steps=500,
+        on_evaluation=lambda step, returns: heard.append((step, list(returns))),
+        stop_when=lambda step, returns: step >= 200,
+    )
+    assert heard == [(100, [0]), (200, [0])]
+    assert runs.runs[0].manifest.state == "finished"
+    assert runs.runs[0].manifest.steps_done == 200
+
+
+def test_stop_when_is_asked_by_processes_too(tmp_path):
+    runs = run(tmp_path / "set", steps=1_500, seeds=2, stop_when=lambda step, returns: step >= 200)
+    assert all(one.evaluations["step"].max() == 200 for one in runs.runs)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"steps": 0}, "steps"),
+        ({"seeds": 0}, "seeds"),
+        ({"evaluation_episodes": 0}, "evaluation_episodes"),
+        ({"batch_size": 3}, "batch_size"),
+        ({"device": "tpu"}, "device"),
+        ({"task": "Hoper-v4"}, "Hoper-v4"),
+        ({"environment_arguments": {1: 2.0}}, "environment_arguments"),
+        ({"resume": "no"}, "resume"),
+        ({"perturbations": ("fricton=2",)}, "fricton"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, options, name):
+    with pytest.raises(InputError, match=name) as error:
+        run(tmp_path / "set", **{"steps": 200, **options})
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "set").exists()
+
+
+def test_what_is_there_already_is_not_overwritten(tmp_path):
+    runs = run(tmp_path / "set", steps=200)
+    before = contents(runs.runs[0])
+    with pytest.raises(InputError, match="already holds a run"):
+        run(tmp_path / "set", steps=200)
+    assert contents(runs.runs[0]) == before
+    assert run(tmp_path / "set", steps=200, first_seed=1).seeds == [1]
+    assert RunSet.open(tmp_path / "set").seeds == [0, 1]
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("mine")
+    with pytest.raises(InputError, match="not empty"):
+        run(tmp_path / "other", steps=200)
+
+
+def test_a_task_that_changes_the_working_directory_moves_no_file(tmp_path, monkeypatch):
+    class Wandering(Probe):
+        def reset(self, *, seed=None, options=None):
+            os.chdir("/")
+            return super().reset(seed=seed, options=options)
+
+    monkeypatch.chdir(tmp_path)
+    runs = run("set", SAC(**SMALL), task=Wandering, steps=200, evaluation_episodes=1)  # pyright: ignore[reportArgumentType]
+    assert runs.runs[0].path == tmp_path / "set" / "seed-0"
+    assert runs.runs[0].manifest.state == "finished"
+
+
+def test_the_table_of_a_set_names_its_algorithm(tmp_path):
+    runs = run(tmp_path / "set", LEARNERS[1], steps=200)
+    settings: dict[str, Any] = runs.config.hyperparameters
+    assert runs.config.algorithm == "sac"
+    assert settings["batch_size"] == 8
