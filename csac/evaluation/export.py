@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from csac.evaluation.verify import Recording
-    from csac.tasks.making import Task
+    from csac.tasks.registry import Task
 
 ObservationRange = Literal["bounds", "recorded"]
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from csac.deploy.artefact import Artefact
     from csac.deploy.contract import Contract
     from csac.deploy.policy import Policy
-    from csac.tasks.making import Task
+    from csac.tasks.registry import Task
 
 TOLERANCE = 1e-5  # of an action's range
 ROUNDING = 10.0  # times what float32 does to the policy itself on such observations: an artefact may be no worse
