@@ -21,14 +21,13 @@ VENV := .venv$(addprefix -,$(OTHER))
 
 SETUP := $(VENV)/.installed
 PEERS := .venv-peers/.installed
-PARL := .venv-parl/.installed
 CUDA := .venv/.cuda
 
 define require_python
 @test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
 endef
 
-.PHONY: help setup train test slow chaos format check docs lock clean peers bench limit growth gpu
+.PHONY: help setup train test slow chaos results format check docs lock clean peers bench limit growth gpu
 
 help:  ## List the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
@@ -48,6 +47,9 @@ slow: $(SETUP)  ## Run the tests that need longer: processes that are killed, cl
 chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave, 20 minutes: make chaos ARGS='--kills 12'
 	.venv/bin/python tests/support/chaos.py --out results/reliability $(ARGS)
 
+results: $(SETUP)  ## Write the tables and pictures of results/ from the CSVs there
+	$(VENV)/bin/python results/make.py
+
 format: $(SETUP)  ## Put the code into its format, and mend what ruff can mend
 	$(VENV)/bin/ruff format --exclude '*.md' .
 	$(VENV)/bin/ruff check --fix .
@@ -63,9 +65,9 @@ docs: $(SETUP)  ## Make the site, with the reference from the docstrings: site/i
 	$(VENV)/bin/sphinx-build -q --fail-on-warning --keep-going --jobs auto -c docs/site -d site/.doctrees . site
 	@echo "The site is ready: site/index.html"
 
-peers: $(PEERS) $(PARL)  ## Install what to measure against: into .venv-peers, and PARL into .venv-parl
+peers: $(PEERS)  ## Install SB3 and SBX, to measure against, into .venv-peers
 
-bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS)) $(if $(PARL_PYTHON),,$(PARL))  ## Measure speed beside the peers: make bench ARGS=--quick
+bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS))  ## Measure speed beside the peers: make bench ARGS=--quick
 	.venv/bin/python -m benchmarks peers --write $(ARGS)
 
 limit: $(SETUP)  ## Measure how near training comes to the machine's limit: make limit ARGS='--repetitions 1'
@@ -104,14 +106,6 @@ $(PEERS): benchmarks/requirements-peers.txt
 	@test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
 	@.venv-peers/bin/python -m pip install --quiet --requirement $<
 	@touch $@
-
-# PARL's own list of dependencies cannot be installed: benchmarks/requirements-parl.txt is complete, and says why.
-$(PARL): benchmarks/requirements-parl.txt
-	$(require_python)
-	@echo "Installing PARL into .venv-parl"
-	@test -x .venv-parl/bin/python || $(PYTHON) -m venv .venv-parl
-	@if .venv-parl/bin/python -m pip install --quiet --no-deps --requirement $<; then touch $@; \
-		else echo "PARL cannot be installed here; the benchmark leaves it out"; fi
 
 .tools/bin/uv:
 	$(require_python)

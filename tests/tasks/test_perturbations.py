@@ -27,6 +27,7 @@ from csac.evaluation.evaluator import EvaluationFailure, Evaluator, evaluate
 from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
+from csac.tasks.failures import EnvironmentFailure
 from csac.tasks.perturbations import (
     Perturbation,
     by_step,
@@ -38,7 +39,6 @@ from csac.tasks.perturbations import (
 )
 from csac.tasks.seeds import EVALUATION_SEED, SeedEnvironments
 from csac.tasks.snapshots import _mujoco_arrays
-from csac.tasks.failures import EnvironmentFailure
 from csac.training import messages
 from csac.training.group import Group
 from csac.training.messages import Progress

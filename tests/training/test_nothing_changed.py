@@ -35,13 +35,17 @@ LEARNERS = {
     "csac": CSAC(reference_policy="periodic", reference_period=50, relative_entropy_estimator="closed_form", **SMALL),
     "csac, paper": CSAC(reference_policy="algorithm1", relative_entropy_estimator="sampled", **SMALL),
     "csac, strong": CSAC(**hyperparameters("strong", "csac", "Hopper-v4") | SMALL),
+    "csac, average": CSAC(**SMALL),
+    "csac, learnt": CSAC(
+        reference_policy="periodic", reference_period=50, entropy_weight="auto", relative_entropy_weight="auto", **SMALL
+    ),
     "sac": SAC(**SMALL),
+    "sac, paper": SAC(**hyperparameters("paper", "sac", "Hopper-v4") | SMALL),
     "sac, strong": SAC(**hyperparameters("strong", "sac", "Hopper-v4") | SMALL),
     "td3": TD3(**SMALL),
     "sd3": SD3(noise_samples=5, **SMALL),
     "ppo": PPO(rollout_steps=128, minibatches=4, hidden_sizes=(32, 32)),
 }
-LATER = {"csac, strong, 1", "sac, strong, 1"}  # of which some machines have nothing yet
 TABLES = ("evaluations.csv", "episodes.csv", "metrics.csv")
 
 
@@ -96,8 +100,8 @@ def given() -> dict[str, str]:
 
 @pytest.mark.parametrize(("name", "seeds"), CASES)
 def test_the_numbers_are_those_that_were_written_down(given, name, seeds):
-    case, known = f"{name}, {seeds}", json.loads(DIGESTS.read_text()).get(machine())
-    if known is None or (case in LATER and case not in known):
+    case, known = f"{name}, {seeds}", json.loads(DIGESTS.read_text()).get(machine(), {})
+    if case not in known:
         pytest.skip(f"nothing was written down for {case} on such a machine: {machine()}")
     assert given[case] == known[case]
 
