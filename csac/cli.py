@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from csac.arguments import HelpShown, json_object, nearest, options_in, parse
-from csac.commands import Chosen, Evaluate, Export, Latency, Play, Report, Resume, Runs, Tune
+from csac.commands import Chosen, Evaluate, Export, Latency, Play, Resume, Runs, Tune
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -379,29 +379,9 @@ def _runs(arguments: list[str]) -> int:
 
 
 def _report(arguments: list[str]) -> int:
-    options = parse(Report, arguments, "csac report")
-    from csac.studies import run_report as reports  # matplotlib is slow to import
-    from csac.studies.comparison import Comparison, read_runs
+    from csac.studies.commands import Report, report
 
-    place = options.place()
-    runs = read_runs(options.runs, options.labels(), lambda error: print(f"damaged: {error}", file=sys.stderr))
-    comparison = Comparison(runs, options.perturb, options.until)
-    reports.refuse_places(comparison, options.curve, options.out)
-    if place:
-        page, name = place
-        reports.write_table(comparison, page, name, options.table or "returns")
-        _say(str(page))
-    if options.curve:
-        reports.draw_curves(comparison, options.curve, options.title)
-        _say(str(options.curve))
-    if options.out or not (options.into or options.curve):
-        command = shlex.join(["csac", "report", *arguments])
-        path = reports.write_run_report(comparison, options.out or reports.default_page(), options.title, [command])
-        _say(f"{path}\n{path.with_suffix('.md')}")
-    if not comparison.has_rows:
-        until = "" if options.until is None else f" up to step {options.until:,}"
-        _say(f"note: there is no evaluation{until} in these runs, so there is little in it")
-    return 0
+    return report(parse(Report, arguments, "csac report"), shlex.join(["csac", "report", *arguments]))
 
 
 def _study(arguments: list[str]) -> int:
@@ -423,23 +403,23 @@ def _tune(arguments: list[str]) -> int:
     if chosen.preset:  # what it gives can depend on the task, which is known by now
         options = parse(chosen.command(options.task, Tune), arguments, "csac tune", chosen.others())
     algorithm = getattr(options, chosen.algorithm)
+    from csac.console.tables import make_console
     from csac.record.run import StorageFailure
-    from csac.studies.search_space import searched
-    from csac.studies.shared_study import Question
-    from csac.studies.tune_command import run_tune
+    from csac.studies.search import Search, space_of
+    from csac.studies.tune import tune
     from csac.training.options import Options
 
     words = None if options.search is None else options.search.replace("-", "_").split(",")
-    wanted = words and [word.strip() for word in words]
-    question = Question(
+    search = Search(
         **{item.name: getattr(options, item.name) for item in dataclasses.fields(Options)},
         task=options.task,
         algorithm=algorithm,
-        space=searched(chosen.algorithm, dataclasses.asdict(algorithm), wanted, options_in(arguments)),
+        space=space_of(algorithm, words and [word.strip() for word in words], options_in(arguments)),
         environment_arguments=json_object("--env-kwargs", options.env_kwargs),
     )
+    command = shlex.join(["csac", "tune", *arguments])
     try:
-        return run_tune(question, options.home(), options.trials, arguments)
+        return tune(search, options.home(), options.trials, command, make_console())
     except StorageFailure as failure:
         return _complain(f"{failure}; the same line goes on once that is mended", 1)
 

@@ -281,57 +281,6 @@ class Runs:
     """Where to look."""
 
 
-@dataclass(frozen=True)
-class Report:
-    """Compare runs: curves, returns, intervals, effects of perturbations, cases, hyperparameters, commands.
-
-    Runs that differ only in their seeds are merged into one arm. A cell collected by csac study run --results counts as
-    a run, and so does a CSV file with the rows of an evaluations.csv.
-    """
-
-    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="(or --label)")] = ()
-    """Run directories, directories that contain some, or the collected cells of a study."""
-    label: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=DIR,...")] = ()
-    """More runs, merged into an arm of this name on each task."""
-    perturb: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND=VALUE@STEP")] = ()
-    """The perturbation of these runs, which a CSV file alone does not record."""
-    until: Annotated[int | None, arg(help_behavior_hint="(default: the end)")] = None
-    """Ignore evaluations after this step, and rollouts of policies trained for longer."""
-    title: Annotated[str | None, arg(help_behavior_hint="(default: the task)")] = None
-    """Title of the report, or of the figure."""
-    out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="(default: runs/reports/DATE-TIME/)")] = (
-        None
-    )
-    """Where to write the report (in a directory: report.html); a Markdown version and the figures go beside it."""
-    into: Annotated[str | None, arg(metavar="FILE.md#NAME", help_behavior_hint="(default: none)")] = None
-    """Instead of a report, write one table into a page, between <!-- NAME: begin --> and <!-- NAME: end -->."""
-    table: Annotated[Literal["returns", "recovery", "cases"] | None, arg(help_behavior_hint="(default: returns)")] = (
-        None
-    )
-    """The table for --into."""
-    curve: Annotated[Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")] = None
-    """Instead of a report, draw the learning curves to this file."""
-
-    def labels(self) -> list[tuple[str, list[Path]]]:
-        """Return the labels, each with its runs. Raises InputError for one that is not written NAME=DIR,..."""
-        pairs = [text.partition("=")[::2] for text in self.label]
-        for text, (name, paths) in zip(self.label, pairs, strict=True):
-            if not (name and all(paths.split(","))):
-                raise InputError(f"--label is written NAME=DIR,DIR, not {text!r}")
-        return [(name, [Path(path) for path in paths.split(",")]) for name, paths in pairs]
-
-    def place(self) -> tuple[Path, str] | None:
-        """Return the page and the name of its markers. Raises InputError where --into is not written FILE.md#NAME."""
-        if self.into is None:
-            if self.table:
-                raise InputError("--table chooses what --into writes: give --into FILE.md#NAME too")
-            return None
-        page, _, name = self.into.rpartition("#")
-        if not (page and name):
-            raise InputError(f"--into is written FILE.md#NAME, not {self.into!r}")
-        return Path(page), name
-
-
 class Chosen(NamedTuple):
     """What is known of a `csac train` before its options can be: they and their defaults depend on it."""
 

@@ -6,7 +6,6 @@ import pytest
 
 from csac import presets
 from csac.algorithms import ALGORITHMS
-from csac.studies.cells import complete
 from csac.studies.study import read_study
 from csac.types import InputError
 
@@ -118,7 +117,7 @@ def test_strong_is_the_candidate_of_its_protocol_on_every_task(algorithm, task):
 
     given = presets.hyperparameters("strong", algorithm, task)
 
-    assert complete(algorithm, given) == candidate.hyperparameters_on(task)
+    assert ALGORITHMS[algorithm](**given) == candidate.on(task, study.common[algorithm])
 
 
 @pytest.mark.parametrize(("algorithm", "unused"), [("csac", {"target_relative_entropy"}), ("sac", set())])
@@ -145,9 +144,10 @@ def test_an_algorithm_without_the_preset_is_named():
 
 
 def test_csac_is_by_default_the_form_that_the_protocol_chose():
-    methods = {method.label: method for method in read_study(RESULTS / "reference" / "confirm.toml").methods}
+    study = read_study(RESULTS / "reference" / "confirm.toml")
+    methods = {method.label: method for method in study.methods}
 
-    assert complete("csac", {}) == methods["CSAC, average 0.05"].hyperparameters_on("Hopper-v4")
+    assert ALGORITHMS["csac"]() == methods["CSAC, average 0.05"].on("Hopper-v4", study.common["csac"])
 
 
 def test_strong_is_of_csac_and_sac_alone():

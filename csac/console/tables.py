@@ -19,7 +19,7 @@ from rich.text import Text
 from csac.record import summary_tables
 from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric, short
 from csac.record.statistics import last_evaluations
-from csac.record.summaries import case_names, last_rows, over_seeds, perturbation_recoveries, run_results
+from csac.record.summaries import case_names, last_rows, over_seeds, perturbation_recoveries
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.types import InputError
 
@@ -115,7 +115,7 @@ def results_table(run: RunSet) -> Fitted:
     """Return the results of a run, one row per seed, and below them what the seeds that did not fail have in common."""
     trained, episodes = np.unique(run.rows("episodes")["seed"], return_counts=True)
     counts = dict(zip(trained.tolist(), episodes.tolist(), strict=True))
-    return Fitted(summary_tables.results_table(run_results(run.evaluations, _failed(run), counts)))
+    return Fitted(summary_tables.results_table(run.evaluations, _failed(run), counts))
 
 
 def recovery_tables(run: RunSet) -> list[Fitted]:

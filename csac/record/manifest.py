@@ -100,7 +100,7 @@ def read(content: bytes) -> Manifest:
         raise InputError("it is not a JSON object") from None
     if version != SCHEMA_VERSION or isinstance(version, bool):
         raise NewerError(f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}")
-    return _value(Manifest, fields, "")
+    return value(Manifest, fields, "")
 
 
 def written(manifest: Manifest) -> bytes:
@@ -109,7 +109,7 @@ def written(manifest: Manifest) -> bytes:
     return (json.dumps(fields, indent=2) + "\n").encode()
 
 
-def _value(kind: Any, given: Any, name: str) -> Any:
+def value(kind: Any, given: Any, name: str) -> Any:
     """Return a JSON value as one of this type. Raises InputError, with its name, where it is none."""
     origin, arguments = get_origin(kind), get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(given, dict):
@@ -117,13 +117,13 @@ def _value(kind: Any, given: Any, name: str) -> Any:
     if kind is Any:
         return given
     if origin in (Union, types.UnionType):
-        return None if given is None else _value(arguments[0], given, name)
+        return None if given is None else value(arguments[0], given, name)
     if origin is Literal and isinstance(given, str) and given in arguments:
         return given
     if origin is tuple and isinstance(given, list):
-        return tuple(_value(arguments[0], item, name) for item in given)
+        return tuple(value(arguments[0], item, name) for item in given)
     if origin is dict and isinstance(given, dict):
-        return {key: _value(arguments[1], item, name) for key, item in given.items()}
+        return {key: value(arguments[1], item, name) for key, item in given.items()}
     if kind in (int, str, bool) and type(given) is kind:
         return given
     raise InputError(f"{name!r} is {given!r:.60}")
@@ -134,7 +134,7 @@ def _dataclass(kind: Any, given: dict[str, Any], name: str) -> Any:
     for item in dataclasses.fields(kind):
         path = f"{name}.{item.name}".lstrip(".")
         if item.name in given:
-            values[item.name] = _value(hints[item.name], given[item.name], path)
+            values[item.name] = value(hints[item.name], given[item.name], path)
         elif item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING:
             raise InputError(f"{path!r} is missing")
     return kind(**values)

@@ -6,8 +6,6 @@ import html as html_text
 import math
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from csac.types import InputError
-
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -86,16 +84,6 @@ def html(table: Table) -> str:
     span = f'<td colspan="{len(table.headings)}">{html_text.escape(table.note)}</td>'
     foot = f"<tfoot><tr>{span}</tr></tfoot>\n" if table.note else ""
     return f"<table>\n{caption}<thead><tr>{headings}</tr></thead>\n<tbody>\n{body}\n</tbody>\n{foot}</table>"
-
-
-def between_markers(page: str, name: str, text: str) -> str:
-    """Return a page in Markdown with `text` between its markers `name`. Raises InputError where it lacks them."""
-    start, stop = (f"<!-- {name}: {end} -->" for end in ("begin", "end"))
-    head, begin, rest = page.partition(start)
-    _, end, tail = rest.partition(stop)
-    if not (begin and end):
-        raise InputError(f"the page lacks the lines {start} and {stop}, between which the table goes")
-    return f"{head}{start}\n{text}{stop}{tail}"
 
 
 def _line(texts: Iterable[str]) -> str:

@@ -116,9 +116,11 @@ class RunDirectory:
 
     @property
     def state(self) -> str:
-        """The state of the manifest; "killed" where that says "running" and no process holds the run's lock."""
+        """The state of the manifest; where that says "running" and no process holds the lock, "killed" or "waiting"."""
         state = self.manifest.state
-        return "killed" if state == "running" and not is_locked(self.path / LOCK) else state
+        if state != "running" or is_locked(self.path / LOCK):
+            return state
+        return "waiting" if self.manifest.process is None else "killed"
 
     @property
     def checkpoints(self) -> Path:

@@ -66,9 +66,9 @@ class RunSet:
 
     @property
     def state(self) -> str:
-        """What the runs are, the most urgent of it: running, killed, interrupted, failed, or else finished."""
-        states = {run.state for run in self.runs}
-        return next((one for one in ("running", "killed", "interrupted", "failed") if one in states), "finished")
+        """What the runs are, the most urgent of it: running, killed, interrupted, waiting, failed, or else finished."""
+        states, order = {run.state for run in self.runs}, ("running", "killed", "interrupted", "waiting", "failed")
+        return next((state for state in order if state in states), "finished")
 
     @property
     def steps_done(self) -> int:

@@ -1,18 +1,22 @@
-"""Statistics over episodes, seeds and tasks: means, intervals and comparisons. docs/statistics.md defines each."""
+"""Statistics over episodes, seeds and tasks, and of one learning curve. docs/statistics.md defines each.
+
+A curve is `steps` [t] in order and `returns` [t], each the mean over one evaluation's episodes.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
 FEWEST_FOR_INTERVAL = 3  # seeds: of two, the t-interval is nine standard deviations to either side
 FEWEST_FOR_BOOTSTRAP = 5  # seeds: fewer have too few distinct resamples to say anything
+REGAINED = 0.9  # of the return before a perturbation: the policy is back
 
 
 class Interval(NamedTuple):
@@ -96,7 +100,7 @@ def stratified_bootstrap_interval(
     left out whole; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge
     of the Statistical Precipice".
     """
-    return _scalars(_bootstrap_interval([scores], statistic, repetitions, seed, confidence))
+    return _bootstrap_interval([scores], statistic, repetitions, seed, confidence)
 
 
 def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
@@ -116,29 +120,7 @@ def improvement_interval(
     scores: np.ndarray, others: np.ndarray, repetitions: int = 2000, seed: int = 0, confidence: float = 0.95
 ) -> tuple[float, float] | None:
     """Stratified bootstrap interval of `probability_of_improvement`; None where either has fewer than five seeds."""
-    return _scalars(_bootstrap_interval([scores, others], probability_of_improvement, repetitions, seed, confidence))
-
-
-def performance_profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
-    """Share of all runs in `scores` [seed, ...] that are above each threshold [t], NaNs left out.
-
-    Agarwal et al. 2021, there the score distribution. Its pointwise interval is the bootstrap's for each threshold.
-    """
-    known = np.asarray(scores, dtype=np.float64)
-    known = known[~np.isnan(known)]
-    above = known[None, :] > np.asarray(thresholds)[:, None]
-    return _divide(above.sum(axis=1), np.full(len(above), len(known)))
-
-
-def profile_interval(
-    scores: np.ndarray, thresholds: np.ndarray, repetitions: int = 2000, seed: int = 0, confidence: float = 0.95
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Pointwise bootstrap interval `(low [t], high [t])` of `performance_profile`; None below five seeds."""
-
-    def profile(resampled: np.ndarray) -> np.ndarray:
-        return performance_profile(resampled, thresholds)
-
-    return _bootstrap_interval([scores], profile, repetitions, seed, confidence)
+    return _bootstrap_interval([scores, others], probability_of_improvement, repetitions, seed, confidence)
 
 
 def dispersion_across(returns: np.ndarray) -> float:
@@ -174,12 +156,6 @@ def last_evaluations(rows: np.ndarray, points: int = 3) -> dict[int, float]:
     return {int(seed): float(line.mean()) for seed, line in zip(seeds, last, strict=True) if line.size}
 
 
-def mean_returns(rows: Iterable[Mapping[str, Any]]) -> dict[int, float]:
-    """Return each seed's mean return over the episodes of one evaluation, given as rows of evaluations.csv."""
-    numbers = [(row["seed"], row["step"], row["return"]) for row in rows]
-    return last_evaluations(np.array(numbers, [("seed", int), ("step", int), ("return", float)]), points=1)
-
-
 def best_returns(rows: np.ndarray) -> dict[int, float]:
     """Return the highest of each seed's evaluations, each the mean over its episodes."""
     _, seeds, returns = evaluation_matrix(rows)
@@ -187,14 +163,89 @@ def best_returns(rows: np.ndarray) -> dict[int, float]:
     return {seed: float(line.max()) for seed, line in known if line.size}
 
 
+def steps_to_reach(steps: np.ndarray, returns: np.ndarray, threshold: float) -> float:
+    """Environment steps at the first evaluation at `threshold` or above; infinite where none is: "not reached".
+
+    An infinite number says that it took longer than the curve is, and no more: take medians over seeds, not means.
+    """
+    reached = returns >= threshold  # never where it is NaN
+    return float(steps[int(reached.argmax())]) if reached.any() else np.inf
+
+
+def drawdown(returns: np.ndarray) -> float:
+    """Largest fall from the highest return so far to a later one; 0 of a curve that never falls, NaN of none."""
+    known = returns[~np.isnan(returns)]
+    return float((np.maximum.accumulate(known) - known).max()) if len(known) else np.nan
+
+
+class Recovery(NamedTuple):
+    """What a perturbation did to the returns of one seed, and how they came back. NaN where nothing can be told."""
+
+    before: float
+    """Mean return of the last three evaluations up to and including the perturbation's step."""
+    drop: float
+    """`before` minus the lowest return after it, 0 where none is lower."""
+    relative_drop: float
+    """The drop as a share of |before|."""
+    steps_to_regain: float
+    """Environment steps from the perturbation to 90 % of `before`: 0 if no evaluation fell below, infinite if never."""
+    area_lost: float
+    """Integral of max(0, before - return) over the steps after the perturbation, in return times steps."""
+    final: float
+    """Mean return of the last three evaluations after the perturbation, or of all where none is after it."""
+    worst_drawdown: float
+    """The largest fall from the highest return so far, over the whole curve, before the perturbation and after it."""
+
+
+def recovery(rows: np.ndarray, step: int, until: int | None = None, since: int = -1) -> dict[int, Recovery]:
+    """Return each seed's `Recovery` from a perturbation after `step`, of the rows of evaluations.csv until `until`.
+
+    What came until `since`, where the perturbation before it was, is no return before this one; an evaluation at `step`
+    itself still is. Of a negative return before, -100, 90 % are -110: `before` less a tenth of its size. The steps to
+    regain that end at the first evaluation that reaches it after the first one that did not. The area is the
+    trapezoids' between evaluations, beginning with no loss at `step`. Last evaluations are fewer than three where there
+    are no more; those of a seed that are NaN or missing are left out.
+    """
+    steps, seeds, returns = evaluation_matrix(rows)
+    wanted = steps <= (steps.max(initial=0) if until is None else until)
+    there = ~np.isnan(returns) & wanted
+    return {
+        int(seed): _recovery(steps[known], line[known], step, since)
+        for seed, line, known in zip(seeds, returns, there, strict=True)
+        if known.any()
+    }
+
+
+def _recovery(steps: np.ndarray, returns: np.ndarray, step: int, since: int) -> Recovery:
+    is_before, is_after = (since < steps) & (steps <= step), steps > step
+    before = returns[is_before][-3:].mean() if is_before.any() else np.nan
+    final = (returns[is_after] if is_after.any() else returns)[-3:].mean()
+    worst = drawdown(returns)
+    if np.isnan(before) or not is_after.any():
+        return Recovery(*map(float, (before, np.nan, np.nan, np.nan, np.nan, final, worst)))
+    steps, after = steps[is_after], returns[is_after]
+    drop = max(before - after.min(), 0.0)
+    shortfall = np.maximum(before - after, 0.0)
+    area = np.trapezoid([0.0, *shortfall], [step, *steps])
+    time = _time_to_regain(steps - step, after, (REGAINED if before >= 0 else 2 - REGAINED) * before)
+    relative = drop / abs(before) if before else np.nan
+    return Recovery(*map(float, (before, drop, relative, time, area, final, worst)))
+
+
+def _time_to_regain(times: np.ndarray, returns: np.ndarray, threshold: float) -> float:
+    """Return the time of the first return at the threshold or above after the first below it."""
+    below = returns < threshold
+    if not below.any():
+        return 0.0
+    fallen = int(below.argmax())
+    back = ~below[fallen:]
+    return float(times[fallen + int(back.argmax())]) if back.any() else np.inf
+
+
 def _bootstrap_interval(
-    samples: Sequence[np.ndarray],
-    statistic: Callable[..., float | np.ndarray],
-    repetitions: int,
-    seed: int,
-    confidence: float,
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Percentile interval of each element of `statistic(*samples)`, each sample [seed, ...] resampled for itself."""
+    samples: Sequence[np.ndarray], statistic: Callable[..., float], repetitions: int, seed: int, confidence: float
+) -> tuple[float, float] | None:
+    """Percentile interval of `statistic(*samples)`, each sample [seed, ...] resampled for itself."""
     arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
     arrays = [array[~np.isnan(array).any(axis=tuple(range(1, array.ndim)))] for array in arrays]
     if min(map(len, arrays)) < FEWEST_FOR_BOOTSTRAP:
@@ -204,13 +255,9 @@ def _bootstrap_interval(
     def resampled(array: np.ndarray) -> np.ndarray:
         return np.take_along_axis(array, generator.integers(len(array), size=array.shape), axis=0)
 
-    values = np.array([statistic(*map(resampled, arrays)) for _ in range(repetitions)])
-    low, high = np.quantile(values, [0.5 - confidence / 2, 0.5 + confidence / 2], axis=0)
-    return low, high
-
-
-def _scalars(bounds: tuple[np.ndarray, np.ndarray] | None) -> tuple[float, float] | None:
-    return bounds and (float(bounds[0]), float(bounds[1]))
+    values = [statistic(*map(resampled, arrays)) for _ in range(repetitions)]
+    low, high = np.quantile(values, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    return float(low), float(high)
 
 
 def _divide(numerator: np.ndarray, count: np.ndarray) -> np.ndarray:

@@ -1,7 +1,6 @@
-"""What runs have reached, as plain values: results, comparisons, cases and recoveries. Each is computed here alone.
+"""Numbers over seeds, recoveries and cases of runs, as plain values: `summary_tables` turns them into text.
 
-`summary_tables` turns them into text for the terminal, Markdown and HTML. Rows are those of evaluations.csv; a seed in
-`failed` is shown and left out of what is over seeds.
+Rows are those of evaluations.csv; a seed in `failed` is shown and left out of what is over seeds.
 """
 
 from __future__ import annotations
@@ -10,19 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from csac.record.curve_measures import Recovery, recovery
 from csac.record.statistics import (
     FEWEST_FOR_INTERVAL,
-    evaluation_matrix,
-    improvement_interval,
-    interquartile_mean,
+    Recovery,
     is_case,
-    last_evaluations,
-    maximum_average_return,
     mean_and_interval,
     mean_over_episodes,
-    probability_of_improvement,
-    stratified_bootstrap_interval,
+    recovery,
 )
 from csac.record.tables import COLUMNS
 
@@ -38,51 +31,6 @@ class OverSeeds(NamedTuple):
     std: float
     low: float
     high: float
-
-
-class SeedResult(NamedTuple):
-    """What one seed has reached: returns are means over the episodes of an evaluation."""
-
-    seed: int
-    has_failed: bool
-    last: float
-    last_three: float
-    best: float
-    best_step: int
-    episodes: int
-    """Training episodes that have ended."""
-
-
-class RunResults(NamedTuple):
-    """What a run has reached. Its best is the best evaluation of all seeds together: the maximum average return."""
-
-    seeds: tuple[SeedResult, ...]
-    last: OverSeeds
-    last_three: OverSeeds
-    best: OverSeeds
-    best_step: int | None
-
-
-class RunSummary(NamedTuple):
-    """One run among several."""
-
-    label: str
-    steps: int
-    failed: int
-    last: OverSeeds
-    """Of each seed's mean over its last evaluations, `points` of them."""
-    best: float
-    best_step: int | None
-    """The maximum average return and where it was; NaN and None where no evaluation holds every seed."""
-    middle: float
-    middle_interval: tuple[float, float] | None
-    """Interquartile mean over seeds of what `last` is the mean of; its bootstrap interval from five seeds up."""
-    above_first: float
-    above_first_interval: tuple[float, float] | None
-    """Probability that a seed's last evaluations are above those of one of the first run; NaN of the first itself."""
-    success: OverSeeds | None
-    """Share of successful episodes in the last evaluations, None where the task says nothing of success."""
-    points: int
 
 
 class RecoverySummary(NamedTuple):
@@ -116,73 +64,6 @@ def over_seeds(values: Iterable[float]) -> OverSeeds:
     if len(known) < FEWEST_FOR_INTERVAL:
         low = high = np.nan
     return OverSeeds(len(known), mean, float(known.std(ddof=1)) if len(known) > 1 else np.nan, low, high)
-
-
-def run_results(
-    rows: np.ndarray, failed: Collection[int] = (), episodes: Mapping[int, int] | None = None
-) -> RunResults:
-    """Return what each seed of a run has reached, and the seeds that did not fail together.
-
-    `episodes` are the training episodes of each seed. A seed without a return is left out.
-    """
-    steps, labels, returns = evaluation_matrix(rows)
-    last_three = last_evaluations(rows, points=3)
-    lines = {seed: line for seed, line in zip(labels.tolist(), returns, strict=True) if seed in last_three}
-    seeds = tuple(
-        SeedResult(
-            seed,
-            seed in failed,
-            float(line[~np.isnan(line)][-1]),
-            last_three[seed],
-            float(np.nanmax(line)),
-            int(steps[np.nanargmax(line)]),
-            (episodes or {}).get(seed, 0),
-        )
-        for seed, line in lines.items()
-    )
-    sound = [seed for seed in lines if seed not in failed]
-    together = np.array([lines[seed] for seed in sound]).reshape(len(sound), len(steps))
-    common = ~np.isnan(together).any(axis=0)
-    if not sound or not common.any():
-        nothing = over_seeds([])
-        return RunResults(seeds, nothing, nothing, nothing, None)
-    steps, together = steps[common], together[:, common]
-    best = int(together.mean(axis=0).argmax())
-    three = over_seeds(last_three[seed] for seed in sound)
-    return RunResults(seeds, over_seeds(together[:, -1]), three, over_seeds(together[:, best]), int(steps[best]))
-
-
-def compare(
-    runs: Sequence[tuple[str, np.ndarray]], failed: Mapping[str, Collection[int]] | None = None, points: int = 3
-) -> tuple[RunSummary, ...]:
-    """Return a summary of each run, given as `(label, rows)`, the others set against the first.
-
-    `failed` are the seeds that failed, by the label of their run. Two runs of one label are two rows.
-    """
-    summaries, first = [], np.zeros(0)
-    for index, (label, rows) in enumerate(runs):
-        lost = set((failed or {}).get(label, ()))
-        sound = rows[~np.isin(rows["seed"], list(lost))]
-        last = np.array(list(last_evaluations(sound, points).values()))
-        first = first if index else last
-        best, best_step = _best(sound)
-        summaries.append(
-            RunSummary(
-                label,
-                int(rows["step"].max(initial=0)),
-                len(lost),
-                over_seeds(last),
-                best,
-                best_step,
-                interquartile_mean(last),
-                stratified_bootstrap_interval(last, interquartile_mean),
-                probability_of_improvement(last, first) if index and len(last) and len(first) else np.nan,
-                improvement_interval(last, first) if index else None,
-                _success(sound, points),
-                points,
-            )
-        )
-    return tuple(summaries)
 
 
 def recoveries(
@@ -254,18 +135,6 @@ def last_rows(rows: np.ndarray, points: int = 1) -> np.ndarray:
         own = rows["seed"] == seed
         wanted |= own & np.isin(rows["step"], np.unique(rows["step"][own])[-points:])
     return rows[wanted]
-
-
-def _best(rows: np.ndarray) -> tuple[float, int | None]:
-    returns = evaluation_matrix(rows)[2]
-    if not returns.size or np.isnan(returns).any(axis=0).all():
-        return np.nan, None
-    return maximum_average_return(rows)
-
-
-def _success(rows: np.ndarray, points: int) -> OverSeeds | None:
-    found = [case for case in cases(last_rows(rows, points), {"success": True}) if is_case(rows["success"])]
-    return found[0].over_seeds if found else None
 
 
 def _events(rows: np.ndarray) -> set[str]:

@@ -5,77 +5,97 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from csac.record.curve_measures import REGAINED, Recovery
+import numpy as np
+
 from csac.record.rendering import EMPTY, SMALL, Cell, Row, Table, number, numeric, short
-from csac.record.statistics import FEWEST_FOR_BOOTSTRAP, FEWEST_FOR_INTERVAL
-from csac.record.summaries import OverSeeds, case_names, cases, over_seeds
+from csac.record.statistics import (
+    FEWEST_FOR_BOOTSTRAP,
+    FEWEST_FOR_INTERVAL,
+    REGAINED,
+    Recovery,
+    evaluation_matrix,
+    improvement_interval,
+    interquartile_mean,
+    is_case,
+    last_evaluations,
+    maximum_average_return,
+    probability_of_improvement,
+    stratified_bootstrap_interval,
+)
+from csac.record.summaries import OverSeeds, case_names, cases, last_rows, over_seeds
+from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
-    import numpy as np
-
-    from csac.record.summaries import CaseSummary, RecoverySummary, RunResults, RunSummary
+    from csac.record.summaries import CaseSummary, RecoverySummary
 
 ROLLOUTS = 1_000  # that cases are counted in, as in the paper
 MOST_COLUMNS = 5  # of seeds in that table; of more, only the mean and the deviation
 
 
-def results_table(results: RunResults) -> Table:
+def results_table(rows: np.ndarray, failed: Collection[int] = (), episodes: Mapping[int, int] | None = None) -> Table:
     """Return one row per seed of a run; below them mean, standard deviation and interval over those that did not fail.
 
-    The best of the mean is the best evaluation of all seeds together. Below two seeds there is no summary.
+    The best of the mean is the best evaluation of all seeds together, and the last is where all are. `episodes` are the
+    training episodes of each seed. Below two seeds there is no summary, and no row for a seed without a return.
     """
-    largest = max((abs(value) for one in results.seeds for value in (one.last, one.last_three, one.best)), default=0.0)
+    three, (steps, labels, returns) = last_evaluations(rows), evaluation_matrix(rows)
+    lines = {seed: line for seed, line in zip(labels.tolist(), returns, strict=True) if seed in three}
+    largest = max((float(np.nanmax(np.abs(line))) for line in lines.values()), default=0.0)
 
-    def returns(*values: float) -> list[Cell]:
+    def cells(*values: float) -> list[Cell]:
         return [numeric(value, number(value, largest)) for value in values]
 
-    rows = [
-        Row(
-            (
-                _whole(one.seed),
-                *returns(one.last, one.last_three, one.best),
-                _whole(one.best_step),
-                _whole(one.episodes),
-            ),
-            "failed" if one.has_failed else "plain",
-        )
-        for one in results.seeds
-    ]
-    over = (results.last, results.last_three, results.best)
-    if results.last.seeds > 1:
-        step = EMPTY if results.best_step is None else _whole(results.best_step)
-        rows.append(_summary("mean", *returns(*(one.mean for one in over)), step, EMPTY))
-        rows.append(_summary("± std", *returns(*(one.std for one in over)), EMPTY, EMPTY))
-        rows += interval_rows(over, largest, blank=2)
+    body = []
+    for seed, line in lines.items():
+        last, best = float(line[~np.isnan(line)][-1]), int(np.nanargmax(line))
+        own = [_whole(seed), *cells(last, three[seed], float(line[best])), _whole(int(steps[best]))]
+        kind = "failed" if seed in failed else "plain"
+        body.append(Row((*own, _whole((episodes or {}).get(seed, 0))), kind))
+    sound = [seed for seed in lines if seed not in failed]
+    together = np.array([lines[seed] for seed in sound]).reshape(len(sound), len(steps))
+    common = ~np.isnan(together).any(axis=0)
+    if len(sound) > 1 and common.any():
+        steps, together = steps[common], together[:, common]
+        best = int(together.mean(axis=0).argmax())
+        over = [over_seeds(values) for values in (together[:, -1], [three[seed] for seed in sound], together[:, best])]
+        body.append(_summary("mean", *cells(*(one.mean for one in over)), _whole(int(steps[best])), EMPTY))
+        body.append(_summary("± std", *cells(*(one.std for one in over)), EMPTY, EMPTY))
+        body += interval_rows(over, largest, blank=2)
     headings = ("seed", "last return", "last three", "best", "at step", "episodes")
-    return Table(headings, tuple(rows), note=few_seeds(results.last.seeds))
+    return Table(headings, tuple(body), note=few_seeds(len(sound)))
 
 
-def comparison_table(runs: Sequence[RunSummary]) -> Table:
-    """Return one row per run: its last evaluations, how certain they are, its maximum average return.
+def comparison_table(
+    runs: Sequence[tuple[str, np.ndarray]], failed: Sequence[Collection[int]] = (), points: int = 3
+) -> Table:
+    """Return one row per run, given as `(label, rows)`: its last evaluations, how certain they are, its maximum.
 
-    The ratio to the first is one of positive returns only: of costs, it would be the larger the worse. Interquartile
-    means are shown where any run has seeds enough for their interval.
+    `failed` are the seeds of each run that failed, which are counted and left out. The ratio to the first is one of
+    positive returns only: of costs, it would be the larger the worse. Interquartile means are shown where any run has
+    seeds enough for their interval.
     """
-    last = "last three evaluations" if not runs or runs[0].points == 3 else f"last {runs[0].points} evaluations"
-    columns: list[tuple[str, Callable[[RunSummary], Cell]]] = [
-        ("run", lambda run: Cell(run.label)),
-        ("seeds", _seeds),
-        ("steps", lambda run: _whole(run.steps)),
-        (f"{last}, mean ± std over seeds", lambda run: plus_minus(run.last)),
-        ("95 % t-interval", lambda run: interval(run.last)),
-        ("to the first", lambda run: _ratio(run, runs[0])),
-        ("maximum average return", _maximum),
-    ]
-    if any(run.last.seeds >= FEWEST_FOR_BOOTSTRAP for run in runs):
-        columns.append(("IQM, 95 % bootstrap interval", _middle))
-        columns.append(("above the first, probability", _above_first))
-    if any(run.success for run in runs):
-        columns.append((f"success, {last}", lambda run: _share(run.success)))
-    rows = tuple(Row(tuple(cell(run) for _, cell in columns)) for run in runs)
-    return Table(tuple(heading for heading, _ in columns), rows)
+    failed = failed or [()] * len(runs)
+    sound = [rows[~np.isin(rows["seed"], list(lost))] for (_, rows), lost in zip(runs, failed, strict=True)]
+    scores = [np.array(list(last_evaluations(rows, points).values())) for rows in sound]
+    shares = [_success(rows, points) for rows in sound]
+    has_middles = any(len(own) >= FEWEST_FOR_BOOTSTRAP for own in scores)
+    first, body = over_seeds(scores[0]).mean if scores else math.nan, []
+    for (label, rows), lost, own_rows, own, share in zip(runs, failed, sound, scores, shares, strict=True):
+        over = over_seeds(own)
+        ratio = over.mean / first if first > 0 else math.nan
+        count = Cell(str(over.seeds) + (f" ({len(lost)} failed)" if lost else ""), over.seeds)
+        cells = [Cell(label), count, _whole(int(rows["step"].max(initial=0))), plus_minus(over), interval(over)]
+        cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(own_rows)]
+        cells += [_middle(own), EMPTY if own is scores[0] else _above(own, scores[0])] * has_middles
+        cells += [_share(share)] * any(shares)
+        body.append(Row(tuple(cells)))
+    last = f"last {'three' if points == 3 else points} evaluations"
+    headings = ["run", "seeds", "steps", f"{last}, mean ± std over seeds", "95 % t-interval", "to the first"]
+    headings.append("maximum average return")
+    headings += ["IQM, 95 % bootstrap interval", "above the first, probability"] * has_middles
+    return Table((*headings, *[f"success, {last}"] * any(shares)), tuple(body))
 
 
 def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
@@ -207,30 +227,33 @@ def _form(value: float, spread: float = math.nan) -> str:
     return ".3g" if 0 < abs(value) < SMALL else ".2f"
 
 
-def _seeds(run: RunSummary) -> Cell:
-    return Cell(str(run.last.seeds) + (f" ({run.failed} failed)" if run.failed else ""), run.last.seeds)
+def _maximum(rows: np.ndarray) -> Cell:
+    try:
+        best, step = maximum_average_return(rows)
+    except InputError:  # no evaluation holds every seed
+        return EMPTY
+    return Cell(f"{best:{_form(best)}} at {step:,}", best)
 
 
-def _ratio(run: RunSummary, first: RunSummary) -> Cell:
-    ratio = run.last.mean / first.last.mean if first.last.mean > 0 else math.nan
-    return numeric(ratio, f"{ratio:.2f}")
+def _middle(scores: np.ndarray) -> Cell:
+    middle = interquartile_mean(scores)
+    return _with_interval(middle, stratified_bootstrap_interval(scores, interquartile_mean), _form(middle))
 
 
-def _maximum(run: RunSummary) -> Cell:
-    return EMPTY if run.best_step is None else Cell(f"{run.best:{_form(run.best)}} at {run.best_step:,}", run.best)
-
-
-def _middle(run: RunSummary) -> Cell:
-    return _with_interval(run.middle, run.middle_interval, _form(run.middle))
-
-
-def _above_first(run: RunSummary) -> Cell:
-    return _with_interval(run.above_first, run.above_first_interval, ".2f")
+def _above(scores: np.ndarray, first: np.ndarray) -> Cell:
+    probability = probability_of_improvement(scores, first) if len(scores) and len(first) else math.nan
+    return _with_interval(probability, improvement_interval(scores, first), ".2f")
 
 
 def _with_interval(value: float, bounds: tuple[float, float] | None, form: str) -> Cell:
     between = f" ({bounds[0]:{form}} to {bounds[1]:{form}})" if bounds else ""
     return numeric(value, f"{value:{form}}{between}")
+
+
+def _success(rows: np.ndarray, points: int) -> OverSeeds | None:
+    """Return the share of successful episodes in the last evaluations, None where the task says nothing of success."""
+    found = cases(last_rows(rows, points), {"success": True}) if is_case(rows["success"]) else []
+    return found[0].over_seeds if found else None
 
 
 def _share(success: OverSeeds | None) -> Cell:

@@ -1,1 +1,1 @@
-"""What is claimed: cells of training made into studies, on one machine or many, and their reports."""
+"""What is claimed: studies, their reports, and searches for hyperparameters."""

@@ -1,148 +1,286 @@
-"""The arms of a comparison: the runs of one method on one task under one condition, their seeds merged."""
+"""Runs side by side: the arms that they belong to, what each arm is called, and what its seeds have reached."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import itertools
+import json
+import shlex
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from datetime import datetime
+from statistics import median
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
+from csac.algorithms import ALGORITHMS
+from csac.presets import PRESETS, hyperparameters
+from csac.record.config import RunConfig
+from csac.record.run import RunDirectory, is_run
+from csac.record.sets import RunSet, find_sets
 from csac.record.statistics import evaluation_matrix, maximum_average_return
-from csac.record.summaries import over_seeds
 from csac.record.tables import COLUMNS, structured
+from csac.tasks.perturbations import by_step, perturbations_of
+from csac.tasks.registry import events_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
 
-    from csac.record.manifest import Manifest
-    from csac.record.summaries import OverSeeds
-    from csac.studies.collected import Record
-    from csac.studies.results import Source
     from csac.studies.study import Study
 
-
-class Time(NamedTuple):
-    """How long one run took: `steps` environment steps of each of its seeds."""
-
-    seconds: float
-    steps: int
-    seeds: tuple[int, ...]
-    interrupted: bool | None = None
-    """Whether it was ever stopped and resumed, None where that is not known."""
+FITTED = ("warmup_steps", "replay_size")  # to the length of a run, whatever preset it follows
+NO_SETTING = ("task", "algorithm", "seed", "perturbations", "events", "device", "checkpoint_interval")
+NO_SETTING += ("keep_checkpoints", "task_is_callable", "hyperparameters", "environment_arguments")
 
 
 @dataclass
 class Arm:
-    """Seeds that belong together: what one method has given on one task under one condition, without what failed."""
+    """The runs of one method on one task under one condition, which differ by their seeds."""
 
     label: str
     task: str
-    condition: tuple[str, ...] = ()
-    """What the task was perturbed by."""
-    algorithm: str = ""
-    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    condition: tuple[str, ...]
+    runs: list[RunDirectory] = field(default_factory=list)
+    missing: list[int] = field(default_factory=list)
+    """Seeds that a study wants and that have not begun."""
     published: str | None = None
     """The paper's column that stands beside it."""
-    preset: str | None = None
-    """What its other hyperparameters come from, where that is a preset."""
-    manifests: list[Manifest] = field(default_factory=list)
-    times: list[Time] = field(default_factory=list)
-    """How long each of its runs took, as far as that is known."""
-    evaluations: list[np.ndarray] = field(default_factory=list)
-    tests: list[np.ndarray] = field(default_factory=list)
-    """Rows of fresh episodes of finished policies."""
-    failures: dict[int, str] = field(default_factory=dict)
-    missing: list[int] = field(default_factory=list)
-    """Seeds that are not over."""
-    beginnings: dict[int, int] = field(default_factory=dict)
-    """Of each seed that is the beginning of a longer run, the steps of that."""
+    until: int | None = None
+    """The last step that counts."""
 
     @property
+    def config(self) -> RunConfig:
+        """What the first run computes."""
+        return self.runs[0].config
+
+    @property
+    def failures(self) -> dict[int, str]:
+        """How each seed that failed did."""
+        return {run.seed: run.manifest.failure for run in self.runs if run.manifest.state == "failed"}
+
+    @functools.cached_property
+    def incomplete(self) -> dict[int, int]:
+        """The last evaluation of each seed that is behind the others or has not begun: it is in no number."""
+        ends = {seed: int(rows["step"].max(initial=0)) for seed, rows in self._sound.items()}
+        behind = {seed: step for seed, step in ends.items() if step < max(ends.values()) or not step}
+        return behind | dict.fromkeys(self.missing, 0)
+
+    @functools.cached_property
     def rows(self) -> np.ndarray:
-        """The rows of evaluations.csv of every seed that did not fail."""
-        return _joined(self.evaluations)
+        """The rows of evaluations.csv of the seeds that neither failed nor are incomplete."""
+        return _joined([rows for seed, rows in self._sound.items() if seed not in self.incomplete])
 
     @property
-    def rollouts(self) -> np.ndarray:
-        """The rows of the fresh episodes of every seed that did not fail."""
-        return _joined(self.tests)
+    def marks(self) -> list[tuple[int, str]]:
+        """Where something changes, and what."""
+        return by_step(perturbations_of(self.condition))
+
+    @property
+    def place(self) -> str:
+        """The task, and what changes there."""
+        return ", ".join([self.task, *(f"{text} after step {step:,}" if step else text for step, text in self.marks)])
 
     def best(self) -> tuple[np.ndarray, int]:
-        """Return each seed's return at the step of the maximum average return, and that step; none without one."""
-        rows = self.rows
-        try:
-            _, step = maximum_average_return(rows)
-        except InputError:
+        """Return each seed's return at the step of the maximum average return, and that step."""
+        steps, _, returns = evaluation_matrix(self.rows)
+        if not len(steps):
             return np.zeros(0), 0
-        steps, _, returns = evaluation_matrix(rows)
+        _, step = maximum_average_return(self.rows)
         return returns[:, int(np.flatnonzero(steps == step)[0])], step
 
-    def maximum(self) -> OverSeeds:
-        """Return the maximum average return: its mean is the paper's score, its deviation is over the seeds."""
-        return over_seeds(self.best()[0])
+    @functools.cached_property
+    def _sound(self) -> dict[int, np.ndarray]:
+        tables = {run.seed: run.evaluations for run in self.runs if run.manifest.state != "failed"}
+        return {s: rows if self.until is None else rows[rows["step"] <= self.until] for s, rows in tables.items()}
 
 
-def gather(study: Study, source: Source) -> list[Arm]:
-    """Return every arm of a study with what its cells have given, task by task.
-
-    The beginning of a longer run has no policy of its own to test: where the study tests policies, it is missing.
-    """
+def gather(study: Study, directory: Path) -> list[Arm]:
+    """Return every arm of a study, task by task, with its runs. Raises InputError for those of another study."""
     arms: dict[tuple[str, tuple[str, ...], str], Arm] = {}
-    for method, condition, cell in study.entries():
-        given = (method.algorithm, method.hyperparameters, method.published, method.preset)
-        made = Arm(method.label, cell.task, condition, *given)
-        arm = arms.setdefault((cell.task, condition, method.label), made)
-        record = source.record(cell)
-        if record is None or (record.longer and study.rollouts_each):
-            arm.missing.append(cell.seed)
-        elif record.failure:
-            arm.failures[cell.seed] = record.failure
+    for wanted in study.runs():
+        method, config, _ = wanted
+        key = config.task, config.perturbations, method.label
+        made = Arm(method.label, config.task, config.perturbations, published=method.published)
+        arm = arms.setdefault(key, made)
+        if run := wanted.open(directory):
+            arm.runs.append(run)
         else:
-            _add(arm, record, cell.seed)
-    order = {task: index for index, task in enumerate(study.tasks)}
-    return sorted(arms.values(), key=lambda arm: order[arm.task])
+            arm.missing.append(config.seed)
+    return sorted(arms.values(), key=lambda arm: study.tasks.index(arm.task))
 
 
-def with_rows(arms: Sequence[Arm]) -> list[Arm]:
-    """Return the arms of which there is something to show."""
-    return [arm for arm in arms if len(arm.rows)]
+def read_arms(
+    paths: Sequence[Path],
+    labelled: Sequence[tuple[str, Sequence[Path]]] = (),
+    until: int | None = None,
+    on_damaged: Callable[[InputError], None] | None = None,
+) -> list[Arm]:
+    """Return the arms of the runs at and below these paths: those of a label, or else those alike but for their seeds.
+
+    Raises:
+        InputError: there is no run, or two runs of one label and task have the same seed.
+    """
+    groups: dict[tuple[Any, ...], Arm] = {}
+    seen: set[Path] = set()
+    plain = [("", path) for path in paths]
+    for label, path in [*((label, path) for label, some in labelled for path in some), *plain]:
+        for run in _runs(path, on_damaged):
+            if not label and run.path in seen:
+                continue
+            seen.add(run.path)
+            config = run.config
+            key: tuple[Any, ...] = label or _alike(config), config.task, config.perturbations
+            if key in groups and run.seed in [other.seed for other in groups[key].runs]:
+                if label:
+                    raise InputError(f"{label}: {run.path} is a second run of seed {run.seed}; label them apart")
+                key = (*key, run.path.parent)
+            arm = groups.setdefault(key, Arm(label, config.task, config.perturbations, until=until))
+            arm.runs.append(run)
+    arms = list(groups.values())
+    for arm, label in zip(arms, labels(arms), strict=True):
+        arm.label = label
+    return arms
 
 
-def by_condition(arms: Sequence[Arm]) -> dict[tuple[str, tuple[str, ...]], list[Arm]]:
-    """Return the arms of each task and condition."""
-    groups: dict[tuple[str, tuple[str, ...]], list[Arm]] = {}
+def _runs(path: Path, on_damaged: Callable[[InputError], None] | None) -> list[RunDirectory]:
+    if is_run(path):
+        return [RunDirectory.open(path)]
+    found = [run for runs in find_sets(path, on_damaged) for run in runs.runs]
+    return found or RunSet.open(path).runs  # which says what is there instead
+
+
+def labels(arms: Sequence[Arm]) -> list[str]:
+    """Return what each arm is called: its label, or its algorithm and preset, and how others of that name differ.
+
+    What tells arms apart on one task is told on every task, so that a method has one label.
+    """
+    names = [arm.label or name_of(arm.config) for arm in arms]
+    apart: dict[str, list[str]] = {}
+    for name in names:
+        own = [arm for arm, its in zip(arms, names, strict=True) if its == name and not arm.label]
+        by_place = itertools.groupby(sorted(own, key=lambda arm: arm.place), key=lambda arm: arm.place)
+        told = [item for _, beside in by_place for item in differing([settings(arm.config) for arm in beside])]
+        apart[name] = list(dict.fromkeys(told))
+    full = [
+        ", ".join([name, *(f"{item} {plain(settings(arm.config).get(item))}" for item in apart[name])])
+        for arm, name in zip(arms, names, strict=True)
+    ]
+    keys = [(label, arm.place) for arm, label in zip(arms, full, strict=True)]
+    return [
+        f"{label}, {arm.runs[0].path.parent}" if keys.count((label, arm.place)) > 1 else label
+        for arm, label in zip(arms, full, strict=True)
+    ]
+
+
+def name_of(config: RunConfig) -> str:
+    """Return the algorithm, the preset that a run follows, if any, and what was fitted to its length beside that."""
+    name, own, make = config.algorithm.upper(), config.hyperparameters, ALGORITHMS.get(config.algorithm)
+    for preset in PRESETS:
+        with suppress(InputError):  # of a preset that says nothing of the algorithm
+            given: Any = hyperparameters(preset, config.algorithm, config.task)
+            values: Any = dataclasses.asdict(make(**given)) if make else {}
+            changed = differing([own, values])
+            if values and set(changed) <= set(FITTED):
+                return ", ".join([f"{name} ({preset})", *(f"{item} {plain(own.get(item))}" for item in changed)])
+    return name
+
+
+def settings(config: RunConfig) -> dict[str, Any]:
+    """Return what a run was given that its numbers depend on, beside task, algorithm and perturbations."""
+    own = {name: value for name, value in vars(config).items() if name not in NO_SETTING}
+    arguments = {f"environment: {name}": value for name, value in config.environment_arguments.items()}
+    return {**config.hyperparameters, **own, **arguments}
+
+
+def differing(several: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the settings that are not the same in all of these, one that is missing among them."""
+    names = dict.fromkeys(name for own in several for name in own)
+    return [name for name in names if len({plain(own.get(name)) for own in several}) > 1]
+
+
+def plain(value: Any) -> str:
+    """Return a setting as people write it."""
+    if isinstance(value, tuple | list):
+        return " ".join(map(str, value))
+    if isinstance(value, float):
+        return f"{value:g}"
+    return "none" if value is None else f"{value:,}" if type(value) is int else str(value)
+
+
+def train_command(config: RunConfig, seeds: Sequence[int]) -> str:
+    """Return the `csac train` that trains these seeds of a configuration."""
+    words = ["csac", "train", config.task, "--algorithm", config.algorithm, "--steps", str(config.steps)]
+    words += ["--seeds", str(seeds[-1] - seeds[0] + 1), *(["--first-seed", str(seeds[0])] if seeds[0] else [])]
+    default = RunConfig(task=config.task)
+    for name in ("evaluation_interval", "evaluation_episodes", "device"):
+        words += _option(name, getattr(config, name)) if getattr(config, name) != getattr(default, name) else []
+    words += [word for change in config.perturbations for word in ("--perturb", change)]
+    words += ["--env-kwargs", json.dumps(config.environment_arguments)] * bool(config.environment_arguments)
+    if more := [name for name in config.events if name not in events_of(config.task)]:
+        words += ["--events", ",".join(more)]
+    return shlex.join([*words, *_options(config)])
+
+
+def _options(config: RunConfig) -> list[str]:
+    """Return the options of the hyperparameters: what is not as by default, or as in a preset if that is shorter."""
+    make: Any = ALGORITHMS[config.algorithm]
+    choices = []
+    for preset in (None, *PRESETS):
+        with suppress(InputError):
+            given = hyperparameters(preset, config.algorithm, config.task) if preset else {}
+            values = json.loads(json.dumps(dataclasses.asdict(make(**given))))
+            changed = {name: own for name, own in config.hyperparameters.items() if own != values.get(name)}
+            options = [word for name, value in changed.items() for word in _option(name, value)]
+            choices.append([*(["--preset", preset] if preset else []), *options])
+    return min(choices, key=len)
+
+
+def _option(name: str, value: Any) -> list[str]:
+    """Return one option; None cannot be typed: it is what leaving the option out means."""
+    flag = name.replace("_", "-")
+    if value is None:
+        return []
+    if isinstance(value, bool):
+        return [f"--{flag}" if value else f"--no-{flag}"]
+    return [f"--{flag}", *map(str, value if isinstance(value, list | tuple) else (value,))]
+
+
+def seconds_per_step(run: RunDirectory) -> float | None:
+    """Return how long a step of a run took, by the times of its log's evaluations; its stops do not count."""
+    told = []
+    with suppress(OSError, ValueError):
+        for line in (run.path / "log.txt").read_text(encoding="utf-8").splitlines():
+            moment, word, step, *_ = [*line.split(" "), "", ""]
+            if word == "step" and step.endswith(":"):
+                told.append((datetime.fromisoformat(moment), int(step[:-1])))
+    paces = [
+        (later - before).total_seconds() / (step - start)
+        for (before, start), (later, step) in itertools.pairwise(told)
+        if step > start
+    ]
+    return median(paces) if paces else None
+
+
+def by_place(arms: Iterable[Arm]) -> dict[str, list[Arm]]:
+    """Return the arms of each task and condition, under what these are called."""
+    groups: dict[str, list[Arm]] = {}
     for arm in arms:
-        groups.setdefault((arm.task, arm.condition), []).append(arm)
+        groups.setdefault(arm.place, []).append(arm)
     return groups
 
 
-def variant_of(label: str) -> str:
-    """Return what stands before the first comma of a label: the method, without what was swept."""
-    return label.partition(", ")[0]
-
-
-def tasks_of(arms: Sequence[Arm]) -> dict[str, list[Arm]]:
-    """Return the arms of each task."""
-    return {task: [arm for arm in arms if arm.task == task] for task in dict.fromkeys(arm.task for arm in arms)}
-
-
-def _add(arm: Arm, record: Record, seed: int) -> None:
-    arm.manifests.append(record.manifest)
-    if record.seconds:
-        one = record.manifest
-        arm.times.append(Time(record.seconds, one.config.steps, (one.config.seed,), record.interrupted))
-    arm.evaluations.append(record.evaluations)
-    arm.tests += [] if record.rollouts is None else [record.rollouts]
-    if record.longer:
-        arm.beginnings[seed] = record.longer
+def _alike(config: RunConfig) -> str:
+    return json.dumps([config.algorithm, settings(config)], sort_keys=True)
 
 
 def _joined(tables: Sequence[np.ndarray]) -> np.ndarray:
     """Return the rows of all tables, with the columns that each of them has."""
     if not tables:
         return structured(COLUMNS["evaluations"], [])
-    columns = [table.dtype.names or () for table in tables]
-    names = [name for name in columns[0] if all(name in own for own in columns)]
+    names = [name for name in tables[0].dtype.names or () if all(name in (t.dtype.names or ()) for t in tables)]
     return np.concatenate([repack_fields(table[names]) for table in tables])

@@ -1,4 +1,4 @@
-"""The paper as data: its tables, what its text claims, and what had to be inferred to compare with it.
+"""The paper as data, and one function for each of its claims. Its lengths and measures are inferred: docs/studies.md.
 
 Shang, Yuan, Huang, Cui, Chen, Zhu: Effective Reinforcement Learning Control using Conservative Soft Actor-Critic.
 """
@@ -8,10 +8,31 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+import numpy as np
 
-METHODS = ("CSAC", "SAC", "PPO", "TD3", "SD3")
+from csac.record.statistics import (
+    drawdown,
+    evaluation_matrix,
+    improvement_interval,
+    mean_over_episodes,
+    probability_of_improvement,
+    recovery,
+    steps_to_reach,
+)
+from csac.record.summaries import last_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from csac.studies.arms import Arm
+
+COLUMNS = ("CSAC", "SAC", "PPO", "TD3", "SD3")
+CHEETAH, WALKER, ANT, HOPPER = "HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"
+QUADX, PANDA = "PyFlyt/QuadX-Waypoints-v1", "PandaReach-v3"  # the arm's task was v2, which ran on after a success
+
+STEPS: Mapping[str, int] = MappingProxyType(
+    {**dict.fromkeys((CHEETAH, WALKER, ANT, QUADX, PANDA), 1_000_000), HOPPER: 2_000_000}
+)
 
 
 class Published(NamedTuple):
@@ -22,70 +43,42 @@ class Published(NamedTuple):
 
 
 def _columns(*cells: tuple[float, float]) -> Mapping[str, Published]:
-    return MappingProxyType({name: Published(*cell) for name, cell in zip(METHODS, cells, strict=True)})
+    return MappingProxyType({name: Published(*cell) for name, cell in zip(COLUMNS, cells, strict=True)})
 
 
-# Table "Maximum average returns over four benchmark tasks".
-MAXIMUM_AVERAGE_RETURNS: Mapping[str, Mapping[str, Published]] = MappingProxyType(
+# Tables "Maximum average returns over four benchmark tasks" and "... over two real-robot-based simulation tasks".
+RETURNS: Mapping[str, Mapping[str, Published]] = MappingProxyType(
     {
-        "HalfCheetah-v4": _columns(
+        CHEETAH: _columns(
             (11672.74, 151.21), (11052.89, 422.84), (4181.89, 723.54), (8224.70, 337.13), (7158.19, 2821.74)
         ),
-        "Walker2d-v4": _columns(
+        WALKER: _columns(
             (4106.21, 501.45), (2710.65, 1272.01), (2403.55, 502.86), (3513.25, 295.81), (3404.03, 989.50)
         ),
-        "Ant-v4": _columns(
-            (5538.20, 209.62), (5229.39, 269.52), (1836.47, 233.91), (2368.35, 99.15), (2960.61, 212.54)
-        ),
-        "Hopper-v4": _columns(
-            (3458.22, 59.87), (3037.19, 242.06), (2204.01, 540.71), (3296.80, 356.86), (3515.30, 107.84)
-        ),
+        ANT: _columns((5538.20, 209.62), (5229.39, 269.52), (1836.47, 233.91), (2368.35, 99.15), (2960.61, 212.54)),
+        HOPPER: _columns((3458.22, 59.87), (3037.19, 242.06), (2204.01, 540.71), (3296.80, 356.86), (3515.30, 107.84)),
+        QUADX: _columns((530.28, 29.04), (388.55, 189.51), (267.06, 32.07), (433.56, 56.03), (383.03, 145.51)),
+        PANDA: _columns((-2.04, 0.18), (-2.12, 0.22), (-49.80, 0.04), (-48.57, 0.08), (-48.36, 0.10)),
     }
 )
 
-# Table "Max average returns over two real-robot-based simulation tasks". The arm's task was PandaReach-v2, which ran on
-# after a success with rewards of 0; v3 ends there: the same returns, another bootstrap.
-ROBOT_RETURNS: Mapping[str, Mapping[str, Published]] = MappingProxyType(
-    {
-        "PyFlyt/QuadX-Waypoints-v1": _columns(
-            (530.28, 29.04), (388.55, 189.51), (267.06, 32.07), (433.56, 56.03), (383.03, 145.51)
-        ),
-        "PandaReach-v3": _columns((-2.04, 0.18), (-2.12, 0.22), (-49.80, 0.04), (-48.57, 0.08), (-48.36, 0.10)),
-    }
-)
-
-RETURNS: Mapping[str, Mapping[str, Published]] = MappingProxyType({**MAXIMUM_AVERAGE_RETURNS, **ROBOT_RETURNS})
-
-# Steps of a run on each task: see INFERRED. PPO needs 1.64M on Hopper to reach the lower boundary.
-STEPS: Mapping[str, int] = MappingProxyType({**dict.fromkeys(RETURNS, 1_000_000), "Hopper-v4": 2_000_000})
-
-# Table "Number of interactions required to reach the lower bound of maximum average return", there in 10^4 steps.
+# Table "Number of interactions required to reach the lower bound of maximum average return".
 INTERACTIONS: Mapping[str, Mapping[str, int]] = MappingProxyType(
     {
-        task: MappingProxyType(dict(zip(METHODS, (round(10_000 * cell) for cell in cells), strict=True)))
+        task: MappingProxyType(dict(zip(COLUMNS, cells, strict=True)))
         for task, cells in {
-            "HalfCheetah-v4": (10.5, 11.5, 95, 13.5, 16.5),
-            "Walker2d-v4": (45, 90.5, 98, 81.5, 65.5),
-            "Ant-v4": (22.5, 30, 98, 77, 28),
-            "Hopper-v4": (32.5, 84.5, 164, 67, 22),
+            CHEETAH: (105_000, 115_000, 950_000, 135_000, 165_000),
+            WALKER: (450_000, 905_000, 980_000, 815_000, 655_000),
+            ANT: (225_000, 300_000, 980_000, 770_000, 280_000),
+            HOPPER: (325_000, 845_000, 1_640_000, 670_000, 220_000),
         }.items()
     }
 )
 
-# Section "Ablation study on Walker2d task".
-TAUS = (0.005, 0.05, 0.5, 5.0, 50.0)
-BEST_TAU = 0.5
-
-COLUMNS = (*METHODS, *(f"tau {tau:g}" for tau in TAUS))  # what a method of a study may stand beside
-
-# Section "Evaluation of robustness in HalfCheetah task".
-FRICTION_TASK = "HalfCheetah-v4"
-FRICTION_FACTORS = (1.5, 2.0, 2.5)
-FRICTION_STEP = 300_000
+BEST_TAU = 0.5  # section "Ablation study on Walker2d task"
+FRICTION_STEP = 300_000  # section "Evaluation of robustness in HalfCheetah task"
 
 # Table "Case analysis in QuadX-Waypoints-v1": counts in 1,000 rollouts of each of five trials.
-CASES_TASK = "PyFlyt/QuadX-Waypoints-v1"
-ROLLOUTS = 1_000
 CASES: Mapping[str, Mapping[str, Published]] = MappingProxyType(
     {
         "out_of_bounds": _columns((20.6, 11.24), (48.2, 27.54), (38.4, 17.93), (73.2, 20.5), (56.0, 18.72)),
@@ -94,69 +87,148 @@ CASES: Mapping[str, Mapping[str, Published]] = MappingProxyType(
     }
 )
 
-# Section "Evaluation of effectiveness in robotic arm": success is near 100 % by these steps.
-SUCCESS_TASK = "PandaReach-v3"
-SUCCESS_STEPS: Mapping[str, int] = MappingProxyType({"CSAC": 600_000, "SAC": 800_000})
-
-# Table "Common hyper-parameter settings of compared approaches"; None is the paper's "/".
-HYPERPARAMETERS: Mapping[str, Mapping[str, str | None]] = MappingProxyType(
-    {
-        row: MappingProxyType(dict(zip(METHODS, cells, strict=True)))
-        for row, cells in {
-            "Critic Learning Rate": ("3e-4", "3e-4", "3e-4", "3e-4", "1e-3"),
-            "Actor Learning Rate": ("3e-4", "3e-4", "3e-4", "3e-4", "1e-3"),
-            "Actor and Critic Structure": ("(256,256)", "(256,256)", "(64,64)", "(256,256)", "(256,256)"),
-            "Target Update Rate": ("0.005", "0.005", None, "0.005", "0.005"),
-            "Batch Size": ("256", "256", "32", "256", "256"),
-            "Memory Size": ("1e6", "1e6", None, "1e6", "1e6"),
-            "Warmup Steps": ("1e4", "1e4", None, "1e4", "1e4"),
-            "Discount Factor": ("0.99", "0.99", "0.99", "0.99", "0.99"),
-        }.items()
-    }
-)
+SUCCESS_STEPS: Mapping[str, int] = MappingProxyType({"CSAC": 600_000, "SAC": 800_000})  # near 100 % on PandaReach
+NEARLY_ALL = 0.95  # of an evaluation's episodes: the paper's "nearly 100 %"
 
 
-class Weights(NamedTuple):
-    """CSAC's own hyperparameters."""
+class Claim(NamedTuple):
+    """That one arm is better than another, by a number for each seed of both: more is better."""
 
-    sigma: float
-    tau: float
+    text: str
+    arm: Arm
+    other: Arm
+    ours: np.ndarray
+    others: np.ndarray
+
+    def verdict(self) -> tuple[str, str]:
+        """Return how the claim stands, and why: by the interval of the probability that a seed of ours is better."""
+        probability, interval = (
+            probability_of_improvement(self.ours, self.others),
+            improvement_interval(self.ours, self.others),
+        )
+        told = f"better in {probability:.0%} of the pairs of seeds"
+        if interval is None:
+            return "not yet decidable", f"{told}; fewer than five seeds"
+        low, high = interval
+        verdict = "reproduced" if low > 0.5 else "not reproduced" if high < 0.5 else "not yet decidable"
+        told += f", 95 % interval {low:.0%} to {high:.0%}"
+        if not (_is_whole(self.arm) and _is_whole(self.other)):
+            return "not yet decidable", f"runs shorter than the paper's: {told}"
+        return verdict, told
 
 
-# Section "Experimental settings" and table "Specific hyperparameters of CSAC".
-WEIGHTS: Mapping[str, Weights] = MappingProxyType(
-    {
-        **dict.fromkeys(MAXIMUM_AVERAGE_RETURNS, Weights(0.2, 0.5)),
-        "PyFlyt/QuadX-Waypoints-v1": Weights(0.2, 0.1),
-        "PandaReach-v3": Weights(0.2, 0.5),
-    }
-)
+def claims(arms: Sequence[Arm]) -> list[Claim]:
+    """Return what the paper claims and both sides were measured of: each CSAC against each of the paper's methods."""
+    found = []
+    for arm in arms:
+        beside = [
+            o for o in arms if (o.task, o.condition) == (arm.task, arm.condition) and o is not arm and len(o.rows)
+        ]
+        if arm.config.algorithm == "csac" and len(arm.rows) and arm.task in RETURNS:
+            for other in beside:
+                found += _perturbed(arm, other) if arm.condition else _plain(arm, other, beside)
+    return [claim for claim in found if not (np.isnan(claim.ours).all() or np.isnan(claim.others).all())]
 
 
-class Spaces(NamedTuple):
-    """Sizes of observations and actions."""
-
-    observation: int
-    action: int
+def _is_whole(arm: Arm) -> bool:
+    changes = [step for step, _ in arm.marks]
+    return arm.config.steps >= STEPS[arm.task] and all(step == FRICTION_STEP for step in changes)
 
 
-# Tables "Observation and action spaces". Those of the two robots match neither environment, which have 27 and 4 (QuadX,
-# with two waypoints in sight) and 12 and 3 (Panda).
-SPACES: Mapping[str, Spaces] = MappingProxyType(
-    {
-        "HalfCheetah-v4": Spaces(17, 6),
-        "Walker2d-v4": Spaces(17, 6),
-        "Ant-v4": Spaces(27, 8),
-        "Hopper-v4": Spaces(11, 3),
-        "PyFlyt/QuadX-Waypoints-v1": Spaces(9, 4),
-        "PandaReach-v3": Spaces(17, 6),
-    }
-)
+def _plain(arm: Arm, other: Arm, beside: Sequence[Arm]) -> Iterator[Claim]:
+    if other.config.algorithm == "csac":
+        yield from weight(arm, other)
+    elif other.published:
+        yield from returns(arm, other)
+        yield from stability(arm, other)
+        if "PPO" in [one.published for one in beside]:  # which sets the boundary in the paper
+            yield from efficiency(arm, other, lower_boundary([arm, *beside]))
+        yield from cases(arm, other)
+        yield from success(arm, other)
 
-INFERRED = (
-    "The paper does not state how long it trained; the steps in its table of interactions reach 0.98M on three tasks "
-    "and 1.64M on Hopper, so 1M steps, and 2M on Hopper, are inferred.",
-    '"Maximum average return" is taken as the highest mean over seeds among the evaluation points, and "lower '
-    'boundary" as the lowest of these maxima among the methods compared.',
-    "The paper's robot arm is PandaReach-v2, which ran on after a success; PandaReach-v3 ends there.",
-)
+
+def _perturbed(arm: Arm, other: Arm) -> Iterator[Claim]:
+    if arm.task == CHEETAH and other.published == "SAC":
+        yield from robustness(arm, other)
+
+
+def returns(arm: Arm, other: Arm) -> Iterator[Claim]:
+    """Higher maximum average returns, where the paper's are."""
+    told = RETURNS[arm.task]
+    if told["CSAC"].mean > told[other.published or ""].mean:
+        yield Claim("a higher maximum average return", arm, other, arm.best()[0], other.best()[0])
+
+
+def stability(arm: Arm, other: Arm) -> Iterator[Claim]:
+    """What "more stable than SAC" is taken to be: a smaller largest fall of a learning curve."""
+    if other.published == "SAC":
+        ours, others = ([drawdown(line) for line in evaluation_matrix(one.rows)[2]] for one in (arm, other))
+        yield Claim("a smaller drawdown", arm, other, -np.array(ours), -np.array(others))
+
+
+def weight(arm: Arm, other: Arm) -> Iterator[Claim]:
+    """A higher maximum average return with the weight that the paper finds best than with each other one."""
+    first, second = (one.config.hyperparameters for one in (arm, other))
+    apart = [name for name in first if first[name] != second.get(name)]
+    if apart == ["relative_entropy_weight"] and first[apart[0]] == BEST_TAU:
+        yield Claim("a higher maximum average return", arm, other, arm.best()[0], other.best()[0])
+
+
+def efficiency(arm: Arm, other: Arm, boundary: float) -> Iterator[Claim]:
+    """Fewer interactions to the lower boundary of the maximum average returns, where the paper has so."""
+    told = INTERACTIONS.get(arm.task)
+    if told and told["CSAC"] < told[other.published or ""]:
+        yield Claim(
+            "fewer steps to the lower boundary",
+            arm,
+            other,
+            -interactions(arm, boundary),
+            -interactions(other, boundary),
+        )
+
+
+def cases(arm: Arm, other: Arm) -> Iterator[Claim]:
+    """On the quadrotor, fewer crashes and more complete flights, where the paper has so."""
+    for name, told in CASES.items() if arm.task == QUADX else ():
+        sign = 1 if name == "env_complete" else -1
+        if sign * (told["CSAC"].mean - told[other.published or ""].mean) > 0 and name in (arm.rows.dtype.names or ()):
+            text = f"{'more' if sign > 0 else 'fewer'} episodes with {name}"
+            yield Claim(text, arm, other, sign * _shares(arm, name), sign * _shares(other, name))
+
+
+def success(arm: Arm, other: Arm) -> Iterator[Claim]:
+    """On the arm, success in nearly all episodes sooner than SAC."""
+    if arm.task == PANDA and other.published in SUCCESS_STEPS:
+        ours, others = (-interactions(one, NEARLY_ALL, "success") for one in (arm, other))
+        yield Claim(f"success in {NEARLY_ALL:.0%} of the episodes sooner", arm, other, ours, others)
+
+
+def robustness(arm: Arm, other: Arm) -> Iterator[Claim]:
+    """After more friction, a smaller loss, a sooner return and a higher end than SAC."""
+    ours, others = (list(recovery(one.rows, one.marks[0][0]).values()) for one in (arm, other))
+    for text, name, sign in (
+        ("loses less of its return", "relative_drop", -1),
+        ("regains it sooner", "steps_to_regain", -1),
+        ("ends higher", "final", 1),
+    ):
+        values = [sign * np.array([getattr(one, name) for one in side]) for side in (ours, others)]
+        yield Claim(text, arm, other, *values)
+
+
+def lower_boundary(arms: Sequence[Arm]) -> float:
+    """Return the lowest maximum average return of the paper's methods among these arms, or of all without any."""
+    arms = [arm for arm in arms if len(arm.rows)]
+    return min(float(arm.best()[0].mean()) for arm in [arm for arm in arms if arm.published] or arms)
+
+
+def interactions(arm: Arm, threshold: float, column: str = "return") -> np.ndarray:
+    """Return the steps [seed] to the first evaluation at a threshold; infinite for a seed that does not get there."""
+    rows = arm.rows.copy()
+    rows["return"] = np.nan_to_num(rows[column], nan=0.0)
+    steps, _, values = evaluation_matrix(rows)
+    return np.array([steps_to_reach(steps, line, threshold) for line in values])
+
+
+def _shares(arm: Arm, name: str) -> np.ndarray:
+    rows = last_rows(arm.rows, points=3)
+    return np.array([mean_over_episodes(rows[name][rows["seed"] == seed], True) for seed in np.unique(rows["seed"])])

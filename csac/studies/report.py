@@ -1,116 +1,339 @@
-"""The report of a study: claims and their verdicts, published numbers beside measured ones, figures, provenance."""
+"""Reports: one self-contained HTML file, or Markdown with its pictures beside it, of runs side by side."""
 
 from __future__ import annotations
 
-import json
-import shlex
+import base64
+import math
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from csac.record.plots import NO_LOOKS
-from csac.record.rendering import Cell, Row, Table
-from csac.studies import paper, sections
-from csac.studies.aggregates import over_tasks
-from csac.studies.arms import gather, with_rows
-from csac.studies.cells import complete
-from csac.studies.claims import VERDICTS, comparisons, decide
-from csac.studies.command_words import changed
-from csac.studies.parts import Heading, Paragraph, write
-from csac.studies.sections import Scope, report_looks
-from csac.studies.settings import hyperparameters
-from csac.studies.standing import cells_so_far, wall_times
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from csac.console.tables import duration
+from csac.record import rendering
+from csac.record.files import write_atomically
+from csac.record.plots import encoded, figure_of, looks_of
+from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric
+from csac.record.statistics import (
+    drawdown,
+    evaluation_matrix,
+    improvement_interval,
+    interquartile_mean,
+    is_case,
+    last_evaluations,
+    probability_of_improvement,
+    stratified_bootstrap_interval,
+)
+from csac.record.summaries import last_rows, over_seeds, recoveries
+from csac.record.summary_tables import case_comparison_table, comparison_table, plus_minus, recovery_table
+from csac.studies import paper
+from csac.studies.arms import by_place, differing, plain, seconds_per_step, settings, train_command
+from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from csac.record.plots import Look
+    from matplotlib.figure import Figure
+
     from csac.studies.arms import Arm
-    from csac.studies.parts import Part
-    from csac.studies.results import Source
-    from csac.studies.study import Study
 
-_VERDICTS = (
-    "Reproduced: the 95 % bootstrap interval of the probability that a seed of the first is better than one of the "
-    "second lies above one half; not reproduced: it lies below; else not yet decidable. No correction is made for the "
-    "number of claims."
-)
+MOST_CURVES = 7  # that are told apart in one picture
+POINTS = 3  # evaluations at the end of a run that count as its score
 
-_SECTIONS: Mapping[str, Callable[[Sequence[Arm], Scope], Iterator[Part]]] = {
-    "curves": sections.curves,
-    "returns": sections.returns,
-    "efficiency": sections.efficiency,
-    "robustness": sections.robustness,
-    "cases": sections.cases,
-    "success": sections.success,
+
+class Picture(NamedTuple):
+    """A figure and what it is called."""
+
+    title: str
+    figure: Figure
+
+
+class Commands(NamedTuple):
+    """Lines to type."""
+
+    lines: tuple[str, ...]
+
+
+class Heading(NamedTuple):
+    """The title of what follows."""
+
+    text: str
+
+
+Part = str | Heading | Table | Picture | Commands
+
+
+def report_of(arms: Sequence[Arm], commands: Sequence[str], analyses: Sequence[str]) -> list[Part]:
+    """Return the report of these arms, with these sections among others."""
+    shown = [arm for arm in arms if len(arm.rows)]
+    parts = list(overview(arms))
+    for name, section in SECTIONS.items():
+        if shown and name in analyses:
+            parts += section(shown)
+    if shown:
+        parts += [*over_tasks(shown), *the_papers(shown)]
+    return [*parts, *hyperparameters(arms), *provenance(arms, commands)]
+
+
+def write(path: Path, title: str, parts: Sequence[Part]) -> None:
+    """Write a report as `path`, an .html or an .md file. Raises InputError where it is another or cannot be written."""
+    if path.suffix not in (".html", ".md"):
+        raise InputError(f"a report is an .html or an .md file: name it {path.with_suffix('.html')}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        content = _html(title, parts) if path.suffix == ".html" else _markdown(path, title, parts)
+        write_atomically(path, content.encode())
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+
+
+def _html(title: str, parts: Sequence[Part]) -> str:
+    loader = PackageLoader("csac.studies")
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.filters["table"] = lambda table: Markup(rendering.html(table))
+    environment.filters["picture"] = lambda figure: base64.b64encode(encoded(figure, "svg")).decode()
+    template = environment.get_template("report.html.jinja")
+    return template.render(title=title, parts=[(type(part).__name__, part) for part in parts])
+
+
+def _markdown(path: Path, title: str, parts: Sequence[Part]) -> str:
+    texts = [f"# {title}"]
+    for index, part in enumerate(parts):
+        match part:
+            case Heading(text):
+                texts.append(f"## {text}")
+            case Picture(name, figure):
+                picture = path.with_name(f"{path.stem}-{index}.png")
+                write_atomically(picture, encoded(figure))
+                texts.append(f"![{name}]({picture.name})")
+            case Commands(lines):
+                texts.append("\n".join(["```sh", *lines, "```"]))
+            case str():
+                texts.append(part)
+            case _:
+                texts.append(rendering.markdown(part))
+    return "\n\n".join(texts) + "\n"
+
+
+def overview(arms: Sequence[Arm]) -> Iterator[Part]:
+    """Which runs there are, which of them failed and which are incomplete."""
+    yield Heading("Runs")
+    rows = []
+    for arm in arms:
+        states = Counter(run.state for run in arm.runs) + Counter(missing=len(arm.missing))
+        seeds = ", ".join(map(str, sorted(run.seed for run in arm.runs)))
+        steps = arm.config.steps if arm.runs else 0
+        state = ", ".join(f"{count} {state}" for state, count in states.items())
+        rows.append(Row((Cell(arm.label), Cell(arm.place), Cell(seeds), Cell(f"{steps:,}", steps), Cell(state))))
+    yield Table(("method", "task", "seeds", "steps", "runs"), tuple(rows))
+    for arm in arms:
+        for seed, reason in arm.failures.items():
+            yield f"Failed: {arm.label} on {arm.place}, seed {seed}: {reason}. It is in no number below."
+        if arm.incomplete:
+            told = ", ".join(f"seed {seed} at step {step:,}" for seed, step in arm.incomplete.items())
+            yield f"Incomplete, in no number below: {arm.label} on {arm.place}, {told}."
+
+
+def curves(arms: Sequence[Arm]) -> Iterator[Part]:
+    """Learning curves, task by task."""
+    yield Heading("Learning curves")
+    looks = looks_of(arm.label for arm in arms)
+    for place, own in by_place(arms).items():
+        for start in range(0, len(own), MOST_CURVES):
+            runs = [(arm.label, arm.rows) for arm in own[start : start + MOST_CURVES]]
+            yield Picture(place, figure_of(runs, place, own[0].marks, looks=looks))
+
+
+def returns(arms: Sequence[Arm]) -> Iterator[Part]:
+    """Scores with their intervals, maximum average returns and the paper's, worst seeds and drawdowns."""
+    yield Heading("Returns")
+    for place, own in by_place(arms).items():
+        runs = [(arm.label, arm.rows) for arm in own]
+        yield comparison_table(runs, [list(arm.failures) for arm in own], POINTS)._replace(title=place)
+        yield Table(
+            ("method", "maximum average return", "the paper's", "worst seed", "largest drawdown"),
+            tuple(map(_extremes, own)),
+            note="mean ± standard deviation over seeds",
+        )
+
+
+def _extremes(arm: Arm) -> Row:
+    told = paper.RETURNS.get(arm.task, {}).get(arm.published or "") if not arm.condition else None
+    last = last_evaluations(arm.rows, POINTS)
+    worst = min(last, key=lambda seed: last[seed])
+    return Row(
+        (
+            Cell(arm.label),
+            plus_minus(over_seeds(arm.best()[0])),
+            Cell(f"{told.mean:,.2f} ± {told.std:,.2f}", told.mean) if told else EMPTY,
+            Cell(f"{number(last[worst])} (seed {worst})", last[worst]),
+            plus_minus(over_seeds(map(drawdown, evaluation_matrix(arm.rows)[2]))),
+        )
+    )
+
+
+def efficiency(arms: Sequence[Arm]) -> Iterator[Part]:
+    """Steps to the lowest of the maximum average returns."""
+    yield Heading("Steps to the lower boundary of the maximum average returns")
+    for place, own in by_place(arms).items():
+        if len(own) < 2:
+            continue
+        boundary, rows = paper.lower_boundary(own), []
+        for arm in own:
+            steps = paper.interactions(arm, boundary)
+            middle, reached = float(np.median(steps)), int(np.isfinite(steps).sum())
+            told = paper.INTERACTIONS.get(arm.task, {}).get(arm.published or "", math.nan)
+            cells = [Cell("not reached" if math.isinf(middle) else f"{middle:,.0f}", middle)]
+            cells += [Cell(f"{reached} of {len(steps)}", reached), numeric(told, f"{told:,.0f}")]
+            rows.append(Row((Cell(arm.label), *cells)))
+        headings = ("method", "steps of the median seed", "seeds that get there", "the paper's")
+        yield Table(headings, tuple(rows), f"{place}, return {number(boundary)}")
+
+
+def robustness(arms: Sequence[Arm]) -> Iterator[Part]:
+    """What each perturbation cost, as far as the next."""
+    if any(arm.marks for arm in arms):
+        yield Heading("Perturbations")
+    for own in by_place(arm for arm in arms if arm.marks).values():
+        steps = [-1, *(step for step, _ in own[0].marks), None]
+        for index, (step, text) in enumerate(own[0].marks):
+            found = [recoveries(arm.label, arm.rows, step, steps[index + 2], steps[index] or -1) for arm in own]
+            yield recovery_table(found)._replace(title=f"{own[0].task}, {text} after step {step:,}")
+
+
+def cases(arms: Sequence[Arm]) -> Iterator[Part]:
+    """How often success and events came in the last evaluations."""
+    tables = []
+    for place, own in by_place(arms).items():
+        if table := case_comparison_table([(arm.label, last_rows(arm.rows, POINTS)) for arm in own]):
+            tables.append(table._replace(title=place))
+    if tables:
+        yield Heading("How episodes end, in the last three evaluations")
+        yield from tables
+
+
+def success(arms: Sequence[Arm]) -> Iterator[Part]:
+    """Curves of the share of successful episodes."""
+    telling = [arm for arm in arms if is_case(arm.rows["success"])]
+    looks = looks_of(arm.label for arm in arms)
+    if telling:
+        yield Heading("Success")
+    for place, own in by_place(telling).items():
+        runs = []
+        for arm in own:
+            rows = arm.rows.copy()
+            rows["return"] = np.nan_to_num(rows["success"], nan=0.0)
+            runs.append((arm.label, rows))
+        figure = figure_of(runs, place, own[0].marks, "share of episodes with success", (-0.05, 1.05), looks)
+        yield Picture(f"{place}, success", figure)
+
+
+SECTIONS: Mapping[str, Callable[[Sequence[Arm]], Iterator[Part]]] = {
+    "curves": curves,
+    "returns": returns,
+    "efficiency": efficiency,
+    "robustness": robustness,
+    "success": success,
+    "cases": cases,
 }
 
 
-def write_report(studies: Sequence[Study], source: Source, directory: Path, commands: Sequence[str]) -> Path:
-    """Write `report.html`, the same as `report.md`, and the figures into `directory`; return the page's path.
-
-    `commands` have made it. Raises InputError where it cannot be written.
-    """
-    parts: list[Part] = []
-    looks: Mapping[str, Look] = NO_LOOKS
-    for study in studies:
-        looks = report_looks([method.label for method in study.methods], looks)
-        parts += _parts(study, gather(study, source), commands, looks)
-    path = directory / "report.html"
-    write(path, studies[0].title if len(studies) == 1 else "Studies", parts)
-    return path
+ANALYSES = ("curves", "returns", "robustness", "success", "cases")  # of runs that are no study's
 
 
-def train_command(arm: Arm) -> str:
-    """Return the `csac train` that trains every seed of an arm in one run."""
-    one = arm.manifests[0]
-    seeds = {*arm.missing, *arm.failures, *(manifest.config.seed for manifest in arm.manifests)}
-    words = ["csac", "train", one.config.task, "--algorithm", one.config.algorithm, "--steps", str(one.config.steps)]
-    words += ["--seeds", str(len(seeds)), *(["--first-seed", str(min(seeds))] if min(seeds) else [])]
-    words += ["--evaluation-interval", str(one.config.evaluation_interval)]
-    words += ["--evaluation-episodes", str(one.config.evaluation_episodes)]
-    words += [word for perturbation in one.config.perturbations for word in ("--perturb", perturbation)]
-    words += ["--env-kwargs", json.dumps(one.config.environment_arguments)] * bool(one.config.environment_arguments)
-    words += ["--events", ",".join(one.config.events)] * bool(one.config.events)
-    words += changed(complete(one.config.algorithm, one.config.hyperparameters), complete(one.config.algorithm, {}))
-    return shlex.join(words)
-
-
-def _parts(study: Study, arms: list[Arm], commands: Sequence[str], looks: Mapping[str, Look]) -> Iterator[Part]:
-    scope, shown = Scope(study.name, study.scale, looks), with_rows(arms)
-    yield Heading(study.title, 1)
-    if study.scale < 1:
-        told = f"Every run is shortened to {study.scale:g} of its steps."
-        yield Paragraph("Runs that are shorter than the paper's neither confirm nor refute it.", told)
-    yield from cells_so_far(arms)
-    if shown:
-        for analysis in study.analyses:
-            yield from _SECTIONS[analysis](shown, scope)
-            if analysis == "returns":
-                yield from over_tasks(arms, scope)
-        yield from _claims(study, arms, scope)
-    yield from hyperparameters(study)
-    published = any(method.published for method in study.methods)
-    yield from sections.provenance(arms, paper.INFERRED if published else ())
-    yield from wall_times(arms)
-    runs = [train_command(arm) for arm in arms if arm.manifests]
-    yield from sections.commands(commands, runs, "Each arm by itself, all its seeds in one run:")
-
-
-def _claims(study: Study, arms: Sequence[Arm], scope: Scope) -> Iterator[Part]:
-    """How the paper's claims stand, for each variant of CSAC; those of which a side was not measured are counted."""
-    found = comparisons(study, arms)
-    measured = [one for one in found if len(one.ours) and len(one.others)]
-    if not measured:
+def over_tasks(arms: Sequence[Arm]) -> Iterator[Part]:
+    """The methods over all tasks, where they have the same seeds on several: shares of one method's mean scores."""
+    unchanged = [arm for arm in arms if not arm.condition]
+    tasks = list(dict.fromkeys(arm.task for arm in unchanged))
+    scores = {(arm.label, arm.task): last_evaluations(arm.rows, POINTS) for arm in unchanged}
+    methods = {arm.label: arm.config.algorithm for arm in unchanged}
+    methods = {label: name for label, name in methods.items() if all((label, task) in scores for task in tasks)}
+    common = [set(scores[label, task]) for label in methods for task in tasks]
+    seeds = sorted(set.intersection(*common)) if common else []
+    if len(tasks) < 2 or len(methods) < 2 or not seeds:
         return
-    yield Heading(scope.titled("The paper's claims"))
-    for variant in dict.fromkeys(one.variant for one in measured):
-        decisions = [decide(one) for one in measured if one.variant == variant]
-        counts = Counter(one.verdict for one in decisions)
-        told = [f"{counts[verdict]} {verdict}" for verdict in VERDICTS]
-        rows = [Row((Cell(one.claim), Cell(one.verdict), Cell(one.why))) for one in decisions]
-        yield Paragraph(f"{', '.join(told)}.", f"{variant}, {len(decisions)} claims:")
-        yield Table((f"{variant} has or shows", "verdict", "because"), tuple(rows))
-    if len(found) > len(measured):
-        yield Paragraph(f"Of {len(found) - len(measured)} more nothing was measured, or not both sides.")
-    yield Paragraph(_VERDICTS)
+    first = next((label for label, name in methods.items() if name != "csac"), next(iter(methods)))
+    values = {label: np.array([[scores[label, task][seed] for task in tasks] for seed in seeds]) for label in methods}
+    reference = values[first].mean(axis=0)  # [task]
+    if (reference <= 0).any():
+        return
+    rows = []
+    for label, own in values.items():
+        shares = own / reference
+        interval = stratified_bootstrap_interval(shares, interquartile_mean)
+        above = probability_of_improvement(own, values[first]), improvement_interval(own, values[first])
+        cells = [
+            _with_interval(interquartile_mean(shares), interval),
+            EMPTY if label == first else _with_interval(*above),
+        ]
+        rows.append(Row((Cell(label), *cells, Cell(str(own.size), own.size))))
+    yield Heading("Over all tasks")
+    told = f"{', '.join(tasks)}; seeds {', '.join(map(str, seeds))}; scores as shares of the mean of {first}"
+    headings = ("method", "IQM (95 % bootstrap interval)", f"above {first}, probability (95 %)", "runs")
+    yield Table(headings, tuple(rows), told)
+
+
+def _with_interval(value: float, interval: tuple[float, float] | None) -> Cell:
+    return Cell(f"{value:.2f}" + (f" ({interval[0]:.2f} to {interval[1]:.2f})" if interval else ""), value)
+
+
+def the_papers(arms: Sequence[Arm]) -> Iterator[Part]:
+    """How the paper's claims stand."""
+    if not (found := paper.claims(arms)):
+        return
+    rows = []
+    for claim in found:
+        verdict, why = claim.verdict()
+        texts = claim.arm.place, f"{claim.arm.label}: {claim.text} than {claim.other.label}", verdict, why
+        rows.append(Row(tuple(map(Cell, texts))))
+    yield Heading("The paper's claims")
+    counts = Counter(row.cells[2].text for row in rows)
+    told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
+    yield f"Of {len(rows)}: {told}. Not corrected for their number."
+    yield Table(("task", "claim", "verdict", "because"), tuple(rows))
+
+
+def hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
+    """What differs among the methods, and what is the same in all of them."""
+    methods: dict[str, list[dict[str, str]]] = {}
+    for arm in arms:
+        if arm.runs:
+            told = {name: plain(value) for name, value in settings(arm.config).items()}
+            methods.setdefault(arm.label, []).append(told)
+    if not methods:
+        return
+    every = [own for several in methods.values() for own in several]
+    apart = differing(every)
+    rows = [
+        Row((Cell(name), *(Cell("; ".join(dict.fromkeys(own.get(name, "") for own in m))) for m in methods.values())))
+        for name in apart
+    ]
+    yield Heading("Hyperparameters")
+    if rows:
+        yield Table(("what differs", *methods), tuple(rows))
+    yield "The same in all: " + ", ".join(f"{name} {value}" for name, value in every[0].items() if name not in apart)
+
+
+def provenance(arms: Sequence[Arm], commands: Sequence[str]) -> Iterator[Part]:
+    """Versions, machines and times of the runs, and the commands that make them again."""
+    runs = [run for arm in arms for run in arm.runs]
+    if runs:
+        manifests = [run.manifest for run in runs]
+        paces = [(seconds_per_step(run), run.manifest.steps_done) for run in runs]
+        times = [pace * steps for pace, steps in paces if pace]
+        versions = {f"{name} {version}" for one in manifests for name, version in one.versions.items()}
+        yield Heading("Where the numbers come from")
+        commits = {one.commit or "unknown" for one in manifests}
+        yield f"Versions: {', '.join(sorted(versions))}; commit {', '.join(sorted(commits))}."
+        machines = {one.machine.gpu or one.machine.processor or "unknown" for one in manifests}
+        time = f", {duration(sum(times))} in {len(times)} runs, one after another" if times else ""
+        yield f"Machines: {', '.join(sorted(machines))}{time}."
+    yield Heading("Commands")
+    yield Commands(tuple(commands))
+    trained = [train_command(arm.config, sorted(run.seed for run in arm.runs)) for arm in arms if arm.runs]
+    if trained:
+        yield "Each method by itself:"
+        yield Commands(tuple(dict.fromkeys(trained)))

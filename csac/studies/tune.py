@@ -1,157 +1,262 @@
-"""`csac tune`: trials of a shared study, one after another, each a run that is trained, judged, and perhaps pruned."""
+"""`csac tune`: Optuna chooses hyperparameters, csac trains a set of runs with them, and the worst end early.
+
+Any number of processes may share a directory: the study is a journal in it, and each trial a folder, `trial-<n>`.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import shutil
+import sys
 import warnings
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from csac.checks import check_whole
+from csac.console.tables import Fitted
+from csac.record.config import differences
+from csac.record.locks import is_locked, kept_from_children, take
+from csac.record.rendering import Cell, Row, Table, number
 from csac.record.sets import RunSet
-from csac.record.statistics import evaluation_matrix, last_evaluations
-from csac.studies.cells import restarting_seeds
-from csac.studies.job import Stopped
-from csac.studies.shared_study import POINTS
-from csac.tasks.seeds import TUNING_EVALUATION_SEED
-from csac.training.checkpoint import steps_in
-from csac.training.signals import signals_noted
+from csac.record.statistics import last_evaluations
+from csac.studies.arms import plain
+from csac.studies.search import Search, draw
+from csac.training.options import Options
+from csac.training.signals import Interrupted, stop_requested
+from csac.training.train import train
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping
 
-    from csac.studies.shared_study import Attempt, Result, SharedStudy
-
-MOST_TRIALS = 100_000
-
-
-@dataclass
-class Watcher:
-    """What a search tells whoever watches it; nothing, unless a subclass listens."""
-
-    def begins(self, attempt: Attempt, step: int) -> None:
-        """A trial begins, or goes on from a step."""
-
-    def restarts(self, attempt: Attempt, seeds: Sequence[int]) -> None:
-        """The trial goes on without the episodes that these seeds were in, which its checkpoint could not hold."""
-
-    def advanced(self, step: int, objective: float) -> None:
-        """The trial was evaluated: so much it has of the objective so far."""
-
-    def ended(self, result: Result, study: SharedStudy) -> None:
-        """The trial is over."""
+    import optuna
+    from rich.console import Console
 
 
-def tune(
-    study: SharedStudy,
-    trials: int,
-    watcher: Watcher,
-    command: str | None = None,
-) -> None:
-    """Run trials, one after another, until the study has so many.
+EVALUATION_SEED = 3_000_000  # resets the first evaluation episode of trials: no report uses these episodes
+STARTUP_TRIALS = 5  # that are never pruned, and that must be complete before any is
+SHARE_UNPRUNED = 0.25  # of a trial's steps, at its beginning
+SHOWN = 10  # trials in the table at the end
+
+
+class Trial(NamedTuple):
+    """A trial that this process runs, for as long as it holds the lock."""
+
+    trial: optuna.Trial
+    folder: Path
+    values: dict[str, Any]
+    lock: IO[str]
+
+
+def tune(search: Search, directory: Path, trials: int, command: str | None, console: Console) -> int:
+    """Run trials until the directory has so many, show the best, and return the exit code.
 
     Raises:
-        InputError: fewer than one trial, or a trial that cannot begin.
-        Stopped: SIGINT or SIGTERM; the trial was saved and is in the queue again.
+        InputError: Optuna is missing, or the directory holds another search.
         StorageFailure: the directory can no longer be written.
     """
-    check_whole("trials", trials, 1, MOST_TRIALS)
-    options = {"command": command}
-    with signals_noted() as received:
-        while not received and (attempt := study.next(trials)):
-            with attempt.lock:
-                _run(study, attempt, watcher, options)
-            watcher.ended(next(one for one in study.results() if one.label == attempt.label), study)
-    if received:
-        raise Stopped(received[0])
+    check_whole("trials", trials, 1, 100_000)
+    directory = directory.absolute()
+    study = _open(search, directory)
+    with stop_requested(lambda text: console.print(text)) as request:
+        while not request.is_set() and (trial := _next(study, search, directory, trials)):
+            with trial.lock:
+                _run(study, search, trial, command, console)
+    _conclude(study, search, directory, console)
+    if request.is_set():
+        print(f"csac: stopped; the trial is saved. To go on, type the same line again: {command}", file=sys.stderr)
+        return 128 + request.received[0]
+    return 0 if _complete(study) else 3
 
 
-def _run(study: SharedStudy, attempt: Attempt, watcher: Watcher, options: dict[str, Any]) -> None:
+def _open(search: Search, directory: Path) -> optuna.Study:
+    """Open the study, or begin it; its first trial is the configuration that the search begins with."""
+    try:
+        import optuna
+        from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+    except ImportError:
+        raise InputError("Optuna is not installed: pip install '.[tune]' in a clone of csac") from None
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    journal = directory / "journal.log"
+    if directory.exists() and not journal.exists() and any(directory.iterdir()):
+        raise InputError(f"{directory} is not empty and holds no search: choose another --directory")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write to {directory}: {error.strerror}; choose another directory") from None
+    backend = JournalFileBackend(str(journal), JournalFileOpenLock(str(journal)))
+    unpruned = max(search.algorithm.cadence.first_update, round(SHARE_UNPRUNED * search.steps))
+    with _alone(directory):
+        study = optuna.create_study(
+            storage=optuna.storages.JournalStorage(backend),
+            study_name="csac",
+            direction="maximize",
+            load_if_exists=True,
+            pruner=optuna.pruners.MedianPruner(STARTUP_TRIALS, unpruned, n_min_trials=3),
+        )
+        told = search.told()
+        if found := differences(study.user_attrs.get("search", told), told):
+            raise InputError(f"{directory} holds another search: {'; '.join(found)}. Choose another --directory")
+        if not study.get_trials(deepcopy=False):
+            study.set_user_attr("search", told)
+            own = {name: getattr(search.algorithm, name) for name in search.space}
+            study.enqueue_trial(
+                {n: 1 - v if search.space[n][0] == "below 1" else v for n, v in own.items()}, {"trial": 0}
+            )
+    return study
+
+
+def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> Trial | None:
+    """Return the next trial to run, or None once there are so many.
+
+    A trial that says that it is running, and whose lock nobody holds, goes back to the queue first.
+    """
+    import optuna
+
+    with _alone(directory):
+        known = study.get_trials(deepcopy=False)
+        for lost in known:
+            is_begun = "trial" in lost.user_attrs and is_locked(_folder(directory, lost) / ".lock")
+            if lost.state.name == "RUNNING" and not is_begun:
+                _requeue(study, lost)
+        known = study.get_trials(deepcopy=False)
+        if sum(trial.state.name in ("COMPLETE", "PRUNED", "RUNNING") for trial in known) >= trials:
+            return None
+        study.sampler = optuna.samplers.TPESampler(seed=len(known))  # the same for the same trials before it
+        trial = study.ask()
+        latest = max((other.user_attrs.get("trial", -1) for other in known), default=-1)
+        trial.set_user_attr("trial", trial.user_attrs.get("trial", latest + 1))
+        folder = _folder(directory, trial)
+        folder.mkdir(exist_ok=True)
+        lock = kept_from_children(open(folder / ".lock", "a+"))  # noqa: SIM115  held for as long as the trial runs
+        take(lock, folder)
+        with warnings.catch_warnings(action="ignore"):  # of a beginning outside the space
+            values = {name: draw(trial, name, dimension) for name, dimension in search.space.items()}
+        trial.set_user_attr("values", values)
+        return Trial(trial, folder, values, lock)
+
+
+@contextmanager
+def _alone(directory: Path) -> Iterator[None]:
+    """Keep other processes from choosing a trial meanwhile; what a dead one has left is removed after a while."""
+    from optuna.storages.journal import JournalFileOpenLock
+
+    mutex = JournalFileOpenLock(str(directory / "next"))
+    mutex.acquire()
+    try:
+        yield
+    finally:
+        mutex.release()
+
+
+def _folder(directory: Path, trial: optuna.Trial | optuna.trial.FrozenTrial) -> Path:
+    return directory / f"trial-{trial.user_attrs['trial']}"
+
+
+def _requeue(study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
+    """Put the configuration of a trial that was stopped back into the queue, to go on in its folder."""
+    if "trial" in trial.user_attrs:
+        params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
+        study.enqueue_trial(params, user_attrs={"trial": trial.user_attrs["trial"]})
+    study.tell(trial.number, state=type(trial.state).FAIL)
+
+
+def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None, console: Console) -> None:
     """Train a trial from where it is, and tell the study what came of it."""
-    from csac.training.train import Interrupted, train  # JAX
+    from optuna.trial import TrialState
 
-    question = study.question
-    points = _points_before(attempt.path)
-    watcher.begins(attempt, max(points, default=0))
-    if seeds := restarting_seeds(attempt.path):
-        watcher.restarts(attempt, seeds)
-    for step in points:
-        attempt.trial.report(_objective(points, step), step)
+    label = trial.folder.name
+    console.print(f"{label}: {', '.join(f'{name} {plain(value)}' for name, value in trial.values.items())}")
+    reported: set[int] = set()
     is_pruned = False
 
-    def is_enough(step: int, returns: Mapping[int, float]) -> bool:
+    def is_enough(step: int, _: Mapping[int, float]) -> bool:
         nonlocal is_pruned
-        if step not in points:
-            points[step] = dict(returns)
-            attempt.trial.report(_objective(points, step), step)
-        watcher.advanced(step, _objective(points, step))
-        # Once is enough: groups that are ahead may tell of later evaluations before the run stops.
-        is_pruned = is_pruned or (step < question.steps and attempt.trial.should_prune())
-        return is_pruned or len(returns) < question.seeds  # a seed has failed
+        runs = RunSet.open(trial.folder)
+        for known, score in _scores(runs.evaluations, search.seeds, step).items():
+            if known not in reported:
+                trial.trial.report(score, known)
+                reported.add(known)
+        is_pruned = is_pruned or (step < search.steps and step in reported and trial.trial.should_prune())
+        return is_pruned or bool(runs.failures)
 
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of seeds that fail: told below
-            run = train(
-                question.algorithm_with(attempt.values),
-                question.task,
-                directory=attempt.path,
+            runs = train(
+                search.algorithm_with(trial.values),
+                search.task,
+                directory=trial.folder,
                 resume=True,
                 tensorboard=False,
+                command=command,
                 stop_when=is_enough,
-                environment_arguments=question.environment_arguments,
-                steps=question.steps,
-                seeds=question.seeds,
-                seeds_per_process=question.seeds,
-                first_seed=question.first_seed,
-                evaluation_interval=question.evaluation_interval,
-                evaluation_episodes=question.evaluation_episodes,
-                evaluation_seed=TUNING_EVALUATION_SEED,
-                device=question.device,
-                checkpoint_interval=question.checkpoint_interval,
-                keep_checkpoints=question.keep_checkpoints,
-                **options,
+                environment_arguments=search.environment_arguments,
+                evaluation_seed=EVALUATION_SEED,
+                **{item.name: getattr(search, item.name) for item in dataclasses.fields(Options)},
             )
-    except Interrupted as interruption:
-        study.give_back(attempt)
-        raise Stopped(interruption.signal_number) from None
+    except Interrupted:
+        _requeue(study, study.get_trials(deepcopy=False)[trial.trial.number])
+        return
     except InputError:
-        study.drop(attempt)
+        study.tell(trial.trial, state=TrialState.FAIL)
         raise
-    if failures := run.failures:
-        study.prune(attempt, "; ".join(f"seed {seed}: {reason}" for seed, reason in failures.items()))
-    elif is_pruned:
-        study.prune(attempt)
+    if is_pruned or runs.failures:
+        study.tell(trial.trial, state=TrialState.PRUNED)
+        console.print(f"{label}: {'; '.join(runs.failures.values()) or 'pruned'}", soft_wrap=True)
     else:
-        study.complete(attempt, last_evaluations(run.evaluations, POINTS))
-    # Nobody goes on with it any more, and the replay takes most of the room.
-    for one in run.runs:
-        shutil.rmtree(one.checkpoints, ignore_errors=True)
+        score = float(np.mean(list(last_evaluations(runs.evaluations).values())))
+        study.tell(trial.trial, score)
+        console.print(f"{label}: {number(score)}, best {number(study.best_value)}")
+    for run in runs.runs:  # nobody goes on with it any more, and the replay takes most of the room
+        shutil.rmtree(run.checkpoints, ignore_errors=True)
 
 
-def _points_before(path: Path) -> dict[int, dict[int, float]]:
-    """Return each seed's return at each evaluation up to the checkpoint that a trial goes on from.
-
-    A trial that has no checkpoint yet begins anew. One that has is left as it is: `train` restores a damaged table, of
-    which nothing is known until then, and refuses a manifest that it cannot use.
-    """
-    with suppress(InputError):
-        runs = RunSet.open(path)
-        newest = min(max(steps_in(run.checkpoints), default=0) for run in runs.runs)
-        steps, seeds, returns = evaluation_matrix(runs.evaluations)
-        return {
-            step: dict(zip(seeds.tolist(), column.tolist(), strict=True))
-            for step, column in zip(steps.tolist(), returns.T, strict=True)
-            if step <= newest
-        }
-    return {}
+def _scores(rows: np.ndarray, seeds: int, until: int) -> dict[int, float]:
+    """Return the score as it was at each step until this one at which every seed was evaluated."""
+    steps = [step for step in np.unique(rows["step"]).tolist() if step <= until]
+    steps = [step for step in steps if len(np.unique(rows["seed"][rows["step"] == step])) == seeds]
+    return {step: float(np.mean([*last_evaluations(rows[rows["step"] <= step]).values()])) for step in steps}
 
 
-def _objective(points: Mapping[int, Mapping[int, float]], step: int) -> float:
-    """Return the objective as it was at a step; over the seeds that were alive then."""
-    last = sorted(known for known in points if known <= step)[-POINTS:]
-    return float(np.mean([np.mean([points[known][seed] for known in last]) for seed in points[step]]))
+def _complete(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    return [trial for trial in study.get_trials(deepcopy=False) if trial.state.name == "COMPLETE"]
+
+
+def _conclude(study: optuna.Study, search: Search, directory: Path, console: Console) -> None:
+    """Show the best trials and the command to train the best, and draw Optuna's pictures."""
+    if not (complete := _complete(study)):
+        console.print("no trial is complete")
+        return
+    ranked = sorted(complete, key=lambda trial: -(trial.value or -math.inf))
+    rows = []
+    for trial in ranked[:SHOWN]:
+        score = trial.value or 0.0
+        values = (Cell(plain(trial.user_attrs["values"].get(name))) for name in search.space)
+        rows.append(Row((Cell(_folder(directory, trial).name), Cell(number(score), score), *values)))
+    console.print(Fitted(Table(("trial", "score", *search.space), tuple(rows))))
+    counts = [trial.state.name for trial in study.get_trials(deepcopy=False)]
+    console.print(f"{len(complete)} trials complete, {counts.count('PRUNED')} pruned or failed")
+    _draw(study, directory)
+    line = search.command(ranked[0].user_attrs["values"])
+    console.print(f"best: {line}", soft_wrap=True)
+
+
+def _draw(study: optuna.Study, directory: Path) -> None:
+    """Draw what Optuna draws: the scores over the trials, and how much each hyperparameter matters."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from optuna.visualization import matplotlib as pictures
+
+    with warnings.catch_warnings(action="ignore"):
+        for name, draw in (
+            ("history", pictures.plot_optimization_history),
+            ("importances", pictures.plot_param_importances),
+        ):
+            with suppress(ValueError, RuntimeError):  # of too few trials, or equal ones
+                axes: Any = draw(study)
+                axes.figure.savefig(directory / f"{name}.png", bbox_inches="tight", dpi=150)

@@ -26,13 +26,14 @@ SECONDS_TO_CLOSE = 5.0  # that a process has to close its environments
 
 def supervise(
     programs: Iterable[Program],
-    watcher: Watcher,
+    watcher_of: Callable[[Program], Watcher],
     should_stop: Callable[[], bool],
     workers: int,
     turns: int | None = None,
 ) -> None:
     """Run each program in a process of its own, `workers` at a time, until all are over or stopped.
 
+    `watcher_of` returns who is told about a program.
     A process that dies is replaced once: its runs resume from their newest checkpoint. If it dies again, they fail.
     With `turns`, so many processes train at a time, a few hundred steps each, and the one furthest behind comes next:
     five that share two cores at will make four fifths of the steps.
@@ -61,7 +62,7 @@ def supervise(
                 message = worker.receive()
                 if message is None:
                     del running[worker.connection]
-                    waiting.extend(_replace(worker, watcher, restarted, errors))
+                    waiting.extend(_replace(worker, watcher_of(worker.program), restarted, errors))
                 elif message[0] == "over":
                     over.append(running.pop(worker.connection))
                 elif message[0] == "error":
@@ -69,7 +70,7 @@ def supervise(
                 elif message[0] == "turn":
                     worker.step, worker.has_turn = message[1], False
                 else:
-                    answer = getattr(watcher, message[0])(*message[1:])
+                    answer = getattr(watcher_of(worker.program), message[0])(*message[1:])
                     if message[0] == "evaluated" and worker.program.asks:
                         worker.tell(("answer", bool(answer)))
     finally:
@@ -157,13 +158,18 @@ def _work(connection: Connection, program: Program) -> None:
         connection.send(("error", error))
         connection.send(("over",))
     except Exception as error:
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        for path in program.directories:
-            run = RunDirectory.open(path)
-            run.log(f"{reason}\n{traceback.format_exc()}")
-            run.update_manifest(state="failed", failure=f"step {run.manifest.steps_done}: {reason}")
-            connection.send(("failed", run.seed, run.manifest.steps_done, reason))
+        record_failure(program, watcher, error)
         connection.send(("over",))
+
+
+def record_failure(program: Program, watcher: Watcher, error: Exception) -> None:
+    """Write down that the runs of a program failed by an error that nobody foresaw, and tell it."""
+    reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    for path in program.directories:
+        run = RunDirectory.open(path)
+        run.log(f"{reason}\n{''.join(traceback.format_exception(error))}")
+        run.update_manifest(state="failed", failure=f"step {run.manifest.steps_done}: {reason}")
+        watcher.failed(run.seed, run.manifest.steps_done, reason)
 
 
 class _RemoteWatcher:

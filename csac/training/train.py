@@ -394,7 +394,7 @@ def _run(runs: RunSet, programs: list[Program], watch: _Watch, notes: list[str])
             train_program(programs[0], watch, request.is_set)
         elif programs:
             turns = len(usable_cores()) // programs[0].threads if runs.config.device == "cpu" else None
-            supervise(programs, watch, request.is_set, _workers(), turns)
+            supervise(programs, lambda _: watch, request.is_set, _workers(), turns)
         runs = RunSet(runs.path, [RunDirectory.open(run.path) for run in runs.runs])
         draw_curve(RunSet.open(runs.path), watch.note)
         if reporter:

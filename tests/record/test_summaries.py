@@ -8,12 +8,10 @@ import pytest
 from csac.record.summaries import (
     case_names,
     cases,
-    compare,
     last_rows,
     over_seeds,
     perturbation_recoveries,
     recoveries,
-    run_results,
 )
 from csac.record.summary_tables import (
     case_comparison_table,
@@ -54,61 +52,62 @@ def test_over_seeds_says_no_more_than_there_is():
 
 def test_the_results_of_a_run():
     # Of seeds 0 and 1, at 10: 0 and 8; at 20: 9 and 3; at 30: 2 and 4. Together they are best at 20: 6.
-    results = run_results(rows_of([0.0, 9.0, 2.0], [8.0, 3.0, 4.0], [99.0]), failed={2}, episodes={0: 7})
-    first, second, failed = results.seeds
-    assert first == (0, False, 2.0, pytest.approx(11 / 3), 9.0, 20, 7)
-    assert second == (1, False, 4.0, 5.0, 8.0, 10, 0)
-    assert failed == (2, True, 99.0, 99.0, 99.0, 10, 0)
-    assert (results.last.mean, results.best.mean, results.best_step) == (3.0, 6.0, 20)
-    assert results.last_three.mean == pytest.approx((11 / 3 + 5) / 2)
+    table = results_table(rows_of([0.0, 9.0, 2.0], [8.0, 3.0, 4.0], [99.0]), failed={2}, episodes={0: 7})
+    assert lines(table) == [
+        ["seed", "last return", "last three", "best", "at step", "episodes"],
+        ["0", "2.00", "3.67", "9.00", "20", "7"],
+        ["1", "4.00", "5.00", "8.00", "10", "0"],
+        ["2", "99.00", "99.00", "99.00", "10", "0"],
+        ["mean", "3.00", "4.33", "6.00", "20", ""],
+        ["± std", "1.41", "0.94", "4.24", "", ""],
+    ]
+    assert [row.kind for row in table.rows] == ["plain", "plain", "failed", "summary", "summary"]
 
 
 def test_the_last_of_all_is_where_all_are():
-    assert run_results(rows_of([1.0, 50.0], [3.0])).last.mean == 2.0
+    assert lines(results_table(rows_of([1.0, 50.0], [3.0])))[3][1] == "2.00"
 
 
 @pytest.mark.parametrize("rows", [rows_of([NAN, NAN]), rows_of([1.0])[:0]])
 def test_a_run_without_returns_has_no_results(rows):
-    results = run_results(rows)
-    assert (results.seeds, results.last.seeds, results.best_step) == ((), 0, None)
-    assert results_table(results).rows == ()
+    assert results_table(rows).rows == ()
 
 
-def test_a_run_beside_the_first():
-    first, second = compare([("a", rows_of([1.0, 4.0], [2.0, 6.0])), ("b", rows_of([5.0, 4.0]))], points=1)
-    assert first[:3] == ("a", 20, 0)
-    assert (first.last.mean, first.best, first.best_step, first.success) == (5.0, 5.0, 20, None)
-    assert np.isnan(first.above_first)
-    assert (second.last.mean, second.best, second.best_step) == (4.0, 5.0, 10)
-    assert second.above_first == 0.25  # 4 equals one of 4, 6 and is below the other
+def test_runs_beside_the_first():
+    first, second = lines(
+        comparison_table([("a", rows_of([1.0, 4.0], [2.0, 6.0])), ("b", rows_of([5.0, 4.0]))], points=1)
+    )[1:]
+    assert first == ["a", "2", "20", "5.00 ± 1.41", "2 seeds: no interval", "1.00", "5.00 at 20"]
+    assert second == ["b", "1", "20", "4.00", "1 seed: no interval", "0.80", "5.00 at 10"]
+
+
+def test_five_seeds_are_compared_by_their_probability_of_improvement():
+    """Of 4, 4, 4, 4, 4 and 1, 4, 5, 6, 7: 4 is above 1, equal to 4 and below the rest, (1 + 0.5) / 5."""
+    a, b = rows_of([1.0], [4.0], [5.0], [6.0], [7.0]), rows_of(*[[4.0]] * 5)
+    first, second = lines(comparison_table([("a", a), ("b", b)]))[1:]
+    assert first[-1] == ""
+    assert second[-1].startswith("0.30 (")
+    assert first[-2].startswith("5.00 (")
 
 
 def test_a_failed_seed_is_counted_and_left_out():
-    (one,) = compare([("a", rows_of([1.0, 3.0], [500.0]))], failed={"a": [1]})
-    assert (one.failed, one.last.seeds, one.last.mean, one.best) == (1, 1, 2.0, 3.0)
-    assert lines(comparison_table([one]))[1][:4] == ["a", "1 (1 failed)", "20", "2.00"]
+    table = comparison_table([("a", rows_of([1.0, 3.0], [500.0]))], failed=[[1]])
+    assert lines(table)[1][:4] == ["a", "1 (1 failed)", "20", "2.00"]
 
 
 def test_seeds_that_were_never_evaluated_together_have_no_maximum():
-    rows = rows_of([1.0, 2.0], [3.0])
-    (one,) = compare([("a", rows[1:])])
-    assert (np.isnan(one.best), one.best_step) == (True, None)
-    assert lines(comparison_table([one]))[1][6] == ""
+    assert lines(comparison_table([("a", rows_of([1.0, 2.0], [3.0])[1:])]))[1][6] == ""
 
 
 def test_the_bootstrap_resamples_seeds_and_not_their_evaluations():
     """Each seed's last evaluations are 0 and 100: their mean is 50 in every resample of the seeds."""
-    (one,) = compare([("a", rows_of(*[[0.0, 100.0]] * 6))])
-    assert (one.middle, one.middle_interval) == (50.0, (50.0, 50.0))
+    assert lines(comparison_table([("a", rows_of(*[[0.0, 100.0]] * 6))]))[1][-2] == "50 (50 to 50)"
 
 
 def test_success_is_over_all_of_the_last_evaluations():
     # Of each seed 2 of 4, of the last three 2 of 3; one episode says nothing, which is a no.
     rows = rows_of([1.0] * 4, [1.0] * 4, success=[0, 1, NAN, 1, 0, 0, 1, 1])
-    (one,) = compare([("a", rows)])
-    assert one.success is not None
-    assert one.success[:3] == (2, pytest.approx(2 / 3), 0.0)
-    assert lines(comparison_table([one]))[1][-1] == "67% ± 0%"
+    assert lines(comparison_table([("a", rows)]))[1][-1] == "67% ± 0%"
 
 
 def test_what_a_perturbation_cost_several_runs():

@@ -1,292 +1,157 @@
-import re
-from collections import Counter
+"""Studies as data: what a TOML file may hold, and the runs that come of it."""
+
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from studying import TINY, write
 
-from csac.studies.cells import complete
-from csac.studies.named import NAMED, WHOLE, find
-from csac.studies.study import Method, Study, cells_of, read_study
+from csac.algorithms import ALGORITHMS
+from csac.studies.study import find, named, read_study
 from csac.types import InputError
 
-STUDY = Study(
-    "here",
-    "Here",
-    tasks=("Hopper-v4", "Walker2d-v4"),
-    methods=(Method("SAC", "sac"), Method("CSAC (paper)", "csac", "paper"), Method("PPO", "ppo")),
-    seeds=3,
-    steps_on={"Hopper-v4": 2_000_000},
-    conditions=((), ("friction=2@300000",)),
-)
+RESULTS = Path(__file__).parents[2] / "results"
+METHOD = '[[methods]]\nalgorithm = "sac"\n'
 
 
-def test_a_cell_for_each_task_condition_method_and_seed():
-    cells = cells_of([STUDY])
-    assert len(cells) == 2 * 2 * 3 * 3
-    assert {one.seed for one in cells[:12]} == {0}  # seed by seed
-    assert {(one.task, one.steps) for one in cells} == {("Hopper-v4", 2_000_000), ("Walker2d-v4", 1_000_000)}
-    csac = next(one for one in cells if one.algorithm == "csac")
-    assert csac.hyperparameters["reference_policy"] == "algorithm1"
+def study_of(tmp_path, text):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    return read_study(path)
 
 
-def test_a_shortened_study_says_what_it_shortens():
-    steps = {one.task: one.steps for one in cells_of([STUDY.shortened(0.05)])}
-    assert steps == {"Hopper-v4": 100_000, "Walker2d-v4": 50_000}
-    cells = {(one.task, one.algorithm, one.perturbations): one for one in cells_of([STUDY.shortened(0.05)])}
-    hopper, walker = (cells[task, "sac", ()] for task in ("Hopper-v4", "Walker2d-v4"))
-    # Twenty evaluations at least, and a tenth of the steps as warm-up at most.
-    assert (hopper.evaluation_interval, walker.evaluation_interval) == (5_000, 2_500)
-    assert (hopper.hyperparameters["warmup_steps"], walker.hyperparameters["warmup_steps"]) == (10_000, 5_000)
-    assert ("Walker2d-v4", "sac", ("friction=2@15000",)) in cells
-    assert "warmup_steps" not in cells["Hopper-v4", "ppo", ()].hyperparameters
+def test_a_study_is_the_product_of_its_parts_seed_by_seed(tmp_path):
+    study = study_of(
+        tmp_path,
+        """
+        tasks = ["Hopper-v4", "Ant-v4"]
+        first_seed = 7
+        seeds = 2
+        steps = 1_000
+        steps_on = { "Ant-v4" = 500 }
+        conditions = [[], ["friction=2@100", "mass=1.5"]]
+        [[methods]]
+        label = "SAC, mine"
+        algorithm = "sac"
+        [[methods]]
+        algorithm = "td3"
+        """,
+    )
+    runs = study.runs()
+    assert [run.config.seed for run in runs] == [7] * 8 + [8] * 8
+    assert [run.method.label for run in runs[:2]] == ["SAC, mine", "td3"]
+    assert {(run.config.task, run.config.steps) for run in runs} == {("Hopper-v4", 1_000), ("Ant-v4", 500)}
+    assert str(runs[0].folder) == "SAC-mine/Hopper-v4/seed-7"
+    assert str(runs[-1].folder) == "td3/Ant-v4/mass=1.5+friction=2@100/seed-8"
+    assert runs[-1].name == "td3 on Ant-v4, mass=1.5, friction=2@100, seed 8"
+    assert (study.name, study.title) == ("mine", "mine")
 
 
-def test_the_whole_scale_changes_nothing():
-    assert cells_of([STUDY.shortened(1.0)]) == cells_of([STUDY])
-
-
-def test_narrowed_studies_share_their_cells_with_the_whole_one():
-    whole = {one.key for one in cells_of([STUDY])}
-    part = cells_of([STUDY.narrowed(["Walker2d-v4"], ["sac", "CSAC (paper)"], 2)])
-    assert len(part) == 2 * 2 * 2
-    assert {one.key for one in part} < whole
-    more = cells_of([STUDY.narrowed(seeds=5)])
-    assert whole < {one.key for one in more}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"tasks": ["Hoper-v4"]}, "here has no task 'Hoper-v4'; did you mean Hopper-v4?"),
-        ({"algorithms": ["td3"]}, "here has no algorithm or method 'td3': there is sac, SAC, csac, CSAC (paper), ppo"),
-        ({"seeds": 0}, "seeds must be at least 1, not 0"),
-        ({"seeds": 5_000_000_000}, "the last seed would be 4,999,999,999: seeds are below 4,294,967,296"),
-        (
-            {"seeds": 8_334},
-            "here would have 100,008 cells, and 100,000 is the most: give fewer seeds, tasks, methods or conditions",
-        ),
-    ],
-)
-def test_narrowing_to_what_there_is_not(arguments, message):
-    with pytest.raises(InputError) as raised:
-        STUDY.narrowed(**arguments)
-    assert message in str(raised.value)
-
-
-@pytest.mark.parametrize("scale", [0, -1, 1.5])
-def test_a_scale_is_a_share(scale):
-    with pytest.raises(InputError, match="a share of the steps"):
-        STUDY.shortened(scale)
-
-
-# Studies by name.
-
-
-def test_studies_share_what_they_have_in_common():
-    keys = {name: {one.key for one in cells_of(studies)} for name, studies in NAMED.items()}
-    assert keys["efficiency"] == keys["mujoco"]
-    assert len(keys["ablation"] & keys["mujoco"]) == 2 * 5  # tau 0.5, for both of CSAC's variants
-    assert len(keys["reference"] & keys["mujoco"]) == 3 * 3 * 5  # SAC 0.2, the paper's CSAC and the default
-    assert len(keys["mujoco"]) == 4 * 6 * 5
-    assert len(keys["robustness"]) == 3 * 3 * 5
-
-
-def test_the_page_on_clusters_says_what_all_of_it_costs():
-    steps, cells = Counter[str](), cells_of(WHOLE)
-    for one in cells:
-        steps[one.algorithm.upper()] += one.steps // 10**6
-    page = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text()
-    rows = re.findall(r"^\| (\w+) \| (\d+) \| ([\d.]+) \| (\d+) \|$", page, re.MULTILINE)
-    assert {name: int(million) for name, million, *_ in rows} == steps
-    hours = {name: int(million) * 10 * float(minutes) / 60 for name, million, minutes, _ in rows}
-    assert {name: int(told) for name, *_, told in rows} == {name: round(own) for name, own in hours.items()}
-    assert f"| together, {len(cells)} cells | {sum(steps.values())} | | {sum(hours.values()):,.0f} |" in page
-    for cores in (2, 16):
-        some, fewer = sum(hours.values()) / cores, (sum(hours.values()) - hours["SD3"]) / cores
-        assert f"{cores} cores | {some:.0f} hours | {fewer:.0f} hours |" in page
-
-
-def test_smoke_has_something_of_every_study():
-    assert [study.name for study in NAMED["smoke"]] == [name for name in NAMED if name != "smoke"]
-    assert max(one.steps for one in cells_of(NAMED["smoke"])) <= 2_000
-
-
-def test_the_paper_s_preset_depends_on_the_task():
-    (study,) = NAMED["quadx"]
-    assert study.methods[0].hyperparameters_on(study.tasks[0])["relative_entropy_weight"] == 0.1
-
-
-def test_a_name_that_there_is_not():
-    with pytest.raises(InputError, match="no study is called 'mojoco'; did you mean mujoco"):
-        find("mojoco")
-
-
-# Studies of one's own.
-
-
-def test_a_toml_file_is_a_study(tmp_path):
-    study = read_study(write(tmp_path / "mine.toml"))
-    assert (study.name, study.title, study.seeds) == ("mine", "Tiny", 2)
-    first, second = cells_of([study])
-    assert (first.seed, second.seed, first.steps) == (0, 1, 300)
-    assert first.hyperparameters["actor_hidden_sizes"] == (8, 8)
-
-
-def test_a_file_that_begins_with_a_byte_order_mark_is_read(tmp_path):
-    path = write(tmp_path / "mine.toml", f"\ufeff{TINY}")
-    assert read_study(path).seeds == 2
+def test_what_is_common_counts_where_nothing_else_is_said(tmp_path):
+    text = 'tasks = ["Ant-v4"]\nseeds = 1\n[common.sac]\nbatch_size = 64\nwarmup_steps = 5\n'
+    study = study_of(tmp_path, text + METHOD + METHOD + 'label = "preset"\npreset = "paper"\n')
+    plain, preset = (run.config.hyperparameters for run in study.runs())
+    assert (plain["batch_size"], plain["warmup_steps"]) == (64, 5)
+    assert (preset["batch_size"], preset["warmup_steps"]) == (256, 10_000)
 
 
 def test_a_sweep_is_a_method_for_each_combination(tmp_path):
-    text = (
-        TINY.replace('"sac"', '"csac"') + "[methods.sweep]\nrelative_entropy_weight = [0.5, 5]\nbatch_size = [4, 8]\n"
-    )
-    study = read_study(write(tmp_path / "mine.toml", text))
+    text = METHOD + "sweep = { discount = [0.9, 0.95], batch_size = [32, 64] }"
+    study = study_of(tmp_path, 'tasks = ["Ant-v4"]\n' + text)
     assert [method.label for method in study.methods][:2] == [
-        "SAC, relative_entropy_weight 0.5, batch_size 4",
-        "SAC, relative_entropy_weight 0.5, batch_size 8",
+        "sac, discount 0.9, batch_size 32",
+        "sac, discount 0.9, batch_size 64",
     ]
-    assert len({one.key for one in cells_of([study])}) == 4 * 2
+    assert [run.config.hyperparameters["discount"] for run in study.runs()[:4]] == [0.9, 0.9, 0.95, 0.95]
 
 
-def test_what_methods_have_in_common_gives_way_to_presets_and_to_their_own(tmp_path):
-    text = """
-        tasks = ["Hopper-v4"]
-        common.csac = { relative_entropy_weight = 7, entropy_weight = 3, policy_delay = 5, critic_learning_rate = 1 }
-        [[methods]]
-        algorithm = "csac"
-        preset = "paper"
-        hyperparameters = { entropy_weight = 2 }
-        [[methods]]
-        algorithm = "sac"
-    """
-    csac, sac = read_study(write(tmp_path / "mine.toml", text)).methods
-    told = csac.hyperparameters_on("Hopper-v4")
-    assert (told["entropy_weight"], told["relative_entropy_weight"], told["policy_delay"]) == (2.0, 0.5, 5)
-    assert sac.hyperparameters_on("Hopper-v4")["critic_learning_rate"] == 3e-4
+def test_a_task_has_its_own_events_and_robots_their_preset():
+    (run,) = {run.method.label: run for run in find("quadx").runs()}["CSAC (paper)"], *()
+    assert "collision" in run.config.events
+    assert run.config.hyperparameters["relative_entropy_weight"] == 0.1
+
+
+def test_scale_shortens_steps_changes_and_warm_up():
+    whole, tenth = (replace(find("robustness"), scale=scale).runs()[0] for scale in (1.0, 0.001))
+    assert (whole.config.steps, whole.config.perturbations) == (1_000_000, ("friction=1.5@300000",))
+    assert (tenth.config.steps, tenth.config.perturbations) == (1_000, ("friction=1.5@300",))
+    assert (tenth.config.hyperparameters["warmup_steps"], tenth.config.evaluation_interval) == (100, 50)
+    assert whole.config.evaluation_interval == 5_000
+
+
+def test_a_part_of_a_study():
+    study = find("mujoco").narrowed(["Ant-v4"], ["PPO", "csac"], 2)
+    assert [method.label for method in study.methods] == ["CSAC (paper)", "CSAC (periodic)", "PPO"]
+    assert len(study.runs()) == 6
+    for wrong in ({"tasks": ["Ant-v3"]}, {"methods": ["TD4"]}):
+        with pytest.raises(InputError, match=r"did you mean (Ant-v4|td3)\?"):
+            find("mujoco").narrowed(**wrong)
+
+
+@pytest.mark.parametrize("name", named())
+def test_the_studies_that_csac_brings(name):
+    study = find(name)
+    assert study.runs()
+    assert all(method.algorithm in ALGORITHMS for method in study.methods)
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*/*.toml")), ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_the_studies_of_the_results_can_be_read(path):
+    assert read_study(path).runs()
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("text", "named"),
     [
-        (("tasks =", "taks ="), "a study has no 'taks'; did you mean tasks?"),
-        (('algorithm = "sac"', 'algoritm = "sac"'), "a method has no 'algoritm'; did you mean algorithm?"),
-        (('algorithm = "sac"', ""), "a method needs an algorithm"),
-        (('algorithm = "sac"', 'algorithm = "scc"'), "no algorithm is called 'scc'; did you mean sac?"),
-        (("batch_size = 8", "bach_size = 8"), "sac has no hyperparameter 'bach_size'; did you mean batch_size?"),
-        (("seeds = 2", "common.sac.bach_size = 8"), "sac has no hyperparameter 'bach_size'; did you mean batch_size?"),
-        (("seeds = 2", "common.sac = 8"), "common.sac is a table of hyperparameters, not 8"),
-        (("seeds = 2", 'seeds = "two"'), "seeds is a whole number, not 'two'"),
-        (("seeds = 2", "seeds = 0"), "seeds must be at least 1, not 0"),
-        (("seeds = 2", "first_seed = -1"), "first_seed must be 0 or more, not -1"),
-        (("seeds = 2", "rollouts = -4"), "rollouts must be 0 or more, not -4"),
-        (("seeds = 2", "seeds = "), "is not TOML"),
-        (('tasks = ["Hopper-v4"]', 'tasks = ["Hoper-v4"]'), "no task is called Hoper-v4: did you mean Hopper-v4"),
-        (("seeds = 2", 'steps_on = {"Hopper-v4" = -5}'), "steps_on.Hopper-v4 must be at least 1, not -5"),
-        (('algorithm = "sac"', 'algorithm = "sac"\npublished = "SAC2"'), "the paper has no 'SAC2'; did you mean SAC?"),
-        (('tasks = ["Hopper-v4"]', "tasks = []"), "tasks missing"),
-        (('tasks = ["Hopper-v4"]', 'tasks = "Hopper-v4"'), "tasks is a list of texts, not 'Hopper-v4'"),
-        (("seeds = 2", 'conditions = [["fricton=2@10"]]'), "did you mean friction?"),
-        (("seeds = 2", 'conditions = [["friction=2@300"]]'), "would change nothing: the run ends at step 300"),
-        (("seeds = 2", 'analyses = ["curve"]'), "analyses: there is no 'curve'; did you mean curves?"),
-        (("seeds = 2", 'steps_on = {"Hopper-v5" = 10}'), "the study has no task 'Hopper-v5'; did you mean Hopper-v4?"),
-        (("replay_size = 150", "[[methods]]\nlabel = 'SAC'\nalgorithm = 'sac'"), "two methods are called 'SAC'"),
-        (('tasks = ["Hopper-v4"]', 'tasks = ["Hopper-v4", "Hopper-v4"]'), "tasks has 'Hopper-v4' twice"),
-        (("seeds = 2", "conditions = ['friction=2@10']"), "conditions is a list of lists, such as"),
-        (("seeds = 2", "conditions = [[], []]"), "conditions has [] twice"),
-        (
-            ("seeds = 2", "conditions = [['friction=2@10'], ['friction=2.0@1e1']]"),
-            'conditions has ["friction=2@10"] twice: its runs would count twice',
-        ),
-        (("seeds = 2", "steps_on = {'Hopper-v4' = 5_000_000_000}"), "steps_on.Hopper-v4 must be at most"),
-        (("seeds = 2", "seeds = 2\nfirst_seed = 4294967295"), "the last seed would be 4,294,967,296"),
-        (
-            ("replay_size = 150", "[methods.sweep]\ndiscount = [0, 0.0]"),
-            "the methods 'SAC, discount 0' and 'SAC, discount 0.0' are the same: leave one of them out",
-        ),
-        (('label = "SAC"', 'label = " "'), "' ' is no label: it is a line of text"),
-        (('label = "SAC"', 'label = "SAC\\n2"'), "'SAC\\n2' is no label: it is a line of text"),
-        (("seeds = 2", "seeds = 100_001"), "mine would have 100,001 cells, and 100,000 is the most: give fewer seeds"),
-        (
-            ("replay_size = 150", f"[methods.sweep]\nbatch_size = {[*range(400)]}\nreplay_size = {[*range(400)]}"),
-            "a sweep would be 160,000 methods, and a study has at most 100,000 cells",
-        ),
-        (("evaluation_interval = 100", f"evaluation_interval = {10**23}"), "evaluation_interval must be at most"),
-        (
-            ("evaluation_episodes = 2", "evaluation_episodes = 1_000_001"),
-            "evaluation_episodes must be at most 1,000,000, not 1,000,001",
-        ),
-        (("seeds = 2", "rollouts = 1_000_001"), "rollouts must be at most 1,000,000, not 1,000,001"),
-        (("seeds = 2", f"rollouts = {'9' * 5_000}"), "is not TOML: "),
-        (("seeds = 2", "environment_arguments = {d = 2020-01-01}"), "environment_arguments holds numbers, texts"),
+        ("tasks = [", "TOML"),
+        ('tasks = ["Ant-v4"]', "methods"),
+        (METHOD, "tasks"),
+        ("tasks = []\n" + METHOD, "tasks"),
+        ('tasks = ["Ant-v4"]\nsteps = "many"\n' + METHOD, "steps"),
+        ('tasks = ["Ant-v4"]\nseeds = 0\n' + METHOD, "seeds"),
+        ('tasks = ["Ant-v4"]\nsteps = 0\n' + METHOD, "steps"),
+        ('tasks = ["Ant-v4"]\nfirst_sed = 3\n' + METHOD, "first_seed"),
+        ('tasks = ["Ant-v4"]\nscale = 0.5\n' + METHOD, "scale"),
+        ('tasks = ["Ant-v4"]\nevaluation_episodes = 0\n' + METHOD, "evaluation_episodes"),
+        ('tasks = ["Ant-v4"]\nsteps_on = { "Ant-v5" = 3 }\n' + METHOD, "Ant-v5"),
+        ('tasks = ["Ant-v4"]\nevents = ["a b"]\n' + METHOD, "a b"),
+        ('tasks = ["Ant-v4"]\nanalyses = ["pictures"]\n' + METHOD, "pictures"),
+        ('tasks = ["Ant-v4"]\nconditions = [["frictoin=2@3"]]\n' + METHOD, "frictoin"),
+        ('tasks = ["Ant-v4"]\nsteps = 10\nconditions = [["friction=2@30"]]\n' + METHOD, "friction=2@30"),
+        ('tasks = ["Ant-v4"]\n[[methods]]\nalgorithm = "scas"', "scas"),
+        ('tasks = ["Ant-v4"]\n[[methods]]\nlabel = "x"', "algorithm"),
+        ('tasks = ["Ant-v4"]\n' + METHOD + 'preset = "best"', "best"),
+        ('tasks = ["Ant-v4"]\n' + METHOD + 'published = "DQN"', "DQN"),
+        ('tasks = ["Ant-v4"]\n' + METHOD + "hyperparameters = { gamma = 0.9 }", "gamma"),
+        ('tasks = ["Ant-v4"]\n' + METHOD + "hyperparameters = { discount = 2.0 }", "discount"),
+        ('tasks = ["Ant-v4"]\n' + METHOD + "sweep = { discount = 0.9 }", "sweep.discount"),
+        ('tasks = ["Ant-v4"]\n' + METHOD + METHOD, "sac/Ant-v4"),
+        ('tasks = ["Ant-v4", "Ant-v4"]\n' + METHOD, "sac/Ant-v4"),
     ],
 )
-def test_mistakes_in_a_file_are_told_in_one_line(tmp_path, change, message):
-    path = write(tmp_path / "mine.toml", TINY.replace(*change))
-    with pytest.raises(InputError) as raised:
-        read_study(path)
-    assert str(raised.value).startswith(str(path))
-    assert message in str(raised.value)
-    assert "\n" not in str(raised.value)
+def test_a_mistake_is_one_line_that_names_it(tmp_path, text, named):
+    with pytest.raises(InputError) as told:
+        study_of(tmp_path, text)
+    assert named in str(told.value)
+    assert "mine.toml" in str(told.value)
+    assert "\n" not in str(told.value)
 
 
-EVIDENCE = Path(__file__).parents[2] / "results" / "reference"
+def test_there_is_no_such_study():
+    with pytest.raises(InputError, match="did you mean mujoco"):
+        find("mujocco")
+    with pytest.raises(InputError, match=r"cannot read .*nowhere\.toml"):
+        find("nowhere.toml")
 
 
-def test_the_screen_is_the_named_study_at_100_000_steps_and_one_arm_more():
-    # A tenth of Hopper's are 200,000: what the protocol takes is their first half.
-    (named,) = NAMED["reference"]
-    screen = read_study(EVIDENCE / "screen.toml")
-    named = named.shortened(0.1).narrowed(tasks=screen.tasks, seeds=2)
-    beside = {entry.cell.key: entry.method.label for entry in screen.entries()}
-    for cell in cells_of([named]):
-        del beside[replace(cell, steps=100_000).key]
-    assert set(beside.values()) == {"CSAC, periodic 1000, in the actor only"}
-
-
-def test_the_early_answer_is_made_of_cells_of_the_paper_s_study():
-    (paper,) = NAMED["mujoco"]
-    keys = {one.key for one in cells_of([paper.shortened(0.1)])}
-    assert {one.key for one in cells_of([read_study(EVIDENCE / "tenth.toml")])} < keys
-
-
-PROTOCOLS = [*sorted(EVIDENCE.glob("*.toml")), *sorted((EVIDENCE.parent / "strong").glob("*.toml"))]
-FRESH = {"confirm", "ant", "recovery", "aims", "leaner"}
-LATER = {"longer", "again"}
-
-
-@pytest.mark.parametrize("path", PROTOCOLS, ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_every_study_of_the_protocols_is_understood(path):
-    study, is_reference = read_study(path), path.parent == EVIDENCE
-    first = study.methods[0].hyperparameters_on(study.tasks[0])
-    scale = ("fixed", 0.2) if is_reference else ("automatic", 1.0)
-    assert (study.methods[0].algorithm, first["temperature"], first["entropy_weight"]) == ("sac", *scale)
-    assert (study.evaluation_interval, study.evaluation_episodes) == (5_000, 10)
-    first_seed = 100 * (path.stem in FRESH) + 200 * (path.stem in LATER)
-    count = 5 if first_seed else {"tenth": 5, "screen": 2}.get(path.stem, 3)
-    assert {one.seed for one in cells_of([study])} == set(range(first_seed, first_seed + count))
-
-
-def test_both_protocols_share_the_runs_of_what_they_compare_with():
-    folder = EVIDENCE.parent / "strong"
-    there = {one.key for name in ("confirm", "ant") for one in cells_of([read_study(EVIDENCE / f"{name}.toml")])}
-    for path, labels in (
-        (folder / "confirm.toml", {"SAC, automatic", "CSAC, paper"}),
-        (folder / "aims.toml", {"SAC, automatic"}),
-    ):
-        assert {entry.method.label for entry in read_study(path).entries() if entry.cell.key in there} == labels
-
-
-@pytest.mark.parametrize("path", PROTOCOLS, ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_no_default_decides_what_an_arm_of_the_protocols_is(path):
-    for method in read_study(path).methods:
-        # None, which TOML has not, is minus the number of action dimensions.
-        named = {**method.common, **method.hyperparameters, "target_entropy": None}
-        assert named.keys() == complete(method.algorithm, {}).keys()
-
-
-def test_a_file_that_there_is_not(tmp_path):
-    with pytest.raises(InputError, match=r"cannot read .*: No such file"):
-        find(str(tmp_path / "mine.toml"))
+def test_a_study_imports_no_module_of_a_task(tmp_path):
+    (tmp_path / "mine.toml").write_text('tasks = ["mine:Task-v0", "PyFlyt/QuadX-Waypoints-v1"]\n' + METHOD)
+    (tmp_path / "mine.py").write_text("raise SystemExit(9)")
+    code = (
+        "import sys; from csac.cli import main; code = main(['study', 'show', 'mine.toml']); "
+        "sys.exit(code or any(name in sys.modules for name in ('mine', 'PyFlyt')))"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert answer.returncode == 0, answer.stderr
+    assert "10 waiting" in answer.stdout

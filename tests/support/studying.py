@@ -1,68 +1,68 @@
-"""Tiny studies and their cells."""
+"""Runs as a study leaves them, without training: directories with a manifest and evaluations that are made up."""
 
-from __future__ import annotations
+import re
 
-from pathlib import Path
-from typing import Any
+import numpy as np
 
-from resuming import SMALL
-
-from csac.record.manifest import EvaluationPlan, Manifest
+from csac.record.manifest import Machine
 from csac.record.run import RunDirectory
-from csac.studies.cells import Cell, Store
-from csac.studies.job import Job
+from csac.studies.study import read_study
+from csac.training.config import make_manifest
+
+
+def write_run(path, config, height=1000.0, points=10, state="finished", episodes=2, **columns):
+    """Write a run whose returns rise to about `height`; `columns` are more columns of its evaluations."""
+    run = RunDirectory.create(path, make_manifest(config, (config.seed,)))
+    generator = np.random.default_rng(config.seed)
+    interval = config.steps // 10
+    for point in range(1, points + 1):
+        run.append(
+            "evaluations",
+            [
+                {"seed": config.seed, "step": point * interval, "episode": episode, "length": 10, "success": None}
+                | {"return": height * point / 10 + generator.normal(0, abs(height) / 50), **columns}
+                for episode in range(episodes)
+            ],
+        )
+        run.log(f"step {point * interval}: mean return 1.0")
+    failure = "step 5: reward is not finite" if state == "failed" else ""
+    machine = Machine(processor="a processor", cores=1)
+    changes = {"state": state, "steps_done": points * interval, "process": 1, "failure": failure}
+    run.update_manifest(**changes, machine=machine, versions={"jax": "0.10"}, commit="abc")
+    return run
+
 
 TINY = """
-title = "Tiny"
-tasks = ["Hopper-v4"]
+tasks = ["Pendulum-v1"]
 seeds = 2
-steps = 300
-evaluation_interval = 100
-evaluation_episodes = 2
-
+steps = 1_000
+evaluation_interval = 500
+evaluation_episodes = 1
+[common.sac]
+warmup_steps = 500
+batch_size = 16
+replay_size = 2_000
+actor_hidden_sizes = [8]
+critic_hidden_sizes = [8]
+[common.csac]
+warmup_steps = 500
+batch_size = 16
+replay_size = 2_000
+actor_hidden_sizes = [8]
+critic_hidden_sizes = [8]
 [[methods]]
-label = "SAC"
 algorithm = "sac"
-[methods.hyperparameters]
-actor_hidden_sizes = [8, 8]
-critic_hidden_sizes = [8, 8]
-batch_size = 8
-warmup_steps = 40
-replay_size = 150
+[[methods]]
+algorithm = "csac"
 """
 
 
-def write(path: Path, text: str = TINY) -> Path:
-    path.write_text(text)
-    return path
-
-
-def cell(seed: int = 0, task: str = "Hopper-v4", **changes) -> Cell:
-    given = {"steps": 300, "evaluation_interval": 100, "evaluation_episodes": 2, **changes}
-    algorithm, hyperparameters = given.pop("algorithm", "sac"), given.pop("hyperparameters", {})
-    return Cell.make(task, algorithm, {**SMALL, **hyperparameters}, seed=seed, **given)
-
-
-def jobs(directory: Path, *cells: Cell, **options) -> list[Job]:
-    store = Store(directory)
-    options = {"checkpoint_interval": 120, "tensorboard": False, "keep_checkpoints": True, **options}
-    return [Job(one, store.path(one), **options) for one in cells]
-
-
-def make_run(store: Store, one: Cell, **manifest: Any) -> RunDirectory:
-    """A run as `train` would leave it."""
-    return RunDirectory.create(
-        store.path(one),
-        Manifest(
-            task=one.task,
-            algorithm=one.algorithm,
-            hyperparameters=one.hyperparameters,
-            seeds=(one.seed,),
-            steps=one.steps,
-            evaluation=EvaluationPlan(one.evaluation_interval, one.evaluation_episodes),
-            perturbations=one.perturbations,
-            environment_arguments=one.environment_arguments,
-            events=one.events,
-            **manifest,
-        ),
-    )
+def tiny_study(folder, **changes):
+    """Two small networks on a pendulum, two seeds each."""
+    path = folder / "study" / "tiny.toml"
+    path.parent.mkdir(exist_ok=True)
+    lines = TINY
+    for name, value in changes.items():
+        lines = re.sub(rf"^{name} = .*$", f"{name} = {value!r}".replace("'", '"'), lines, flags=re.MULTILINE)
+    path.write_text(lines)
+    return read_study(path)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.record.config import RunConfig
-from csac.record.run import RunDirectory
 from csac.record.manifest import Manifest
+from csac.record.run import RunDirectory
 from csac.training.loop import Loop, Program
 from csac.training.resume import ResumePoint
 

@@ -47,7 +47,12 @@ def test_a_set_has_a_whole_run_for_each_seed(tmp_path):
     assert runs.seeds == [3, 4]
     assert sorted(path.name for path in runs.path.iterdir()) == ["curve.png", "seed-3", "seed-4"]
     for one in runs.runs:
-        assert {path.name for path in one.path.iterdir()} >= {"manifest.json", "evaluations.csv", "policy", "checkpoint"}
+        assert {path.name for path in one.path.iterdir()} >= {
+            "manifest.json",
+            "evaluations.csv",
+            "policy",
+            "checkpoint",
+        }
         assert json.loads((one.path / "manifest.json").read_text())["config"]["seed"] == one.seed
         assert one.manifest.state == "finished"
         assert set(one.evaluations["seed"]) == {one.seed}

@@ -1,0 +1,170 @@
+"""The runs of a study on a Ray cluster: one task for each, tried again from its checkpoint where a node is lost."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from csac.record.locks import is_locked
+from csac.record.run import LOCK, StorageFailure
+from csac.training.signals import stop_requested
+from csac.training.supervisor import begin_with, record_failure
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from csac.training.loop import Program, Watcher
+
+RETRIES = 5  # of a run whose node or process was lost
+SECONDS_FOR_LOCK = 300.0  # a node that vanished keeps its locks until the file server's lease ends, a minute or two
+SECONDS_BETWEEN_LOOKS = 0.5
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A Ray cluster, and what each run asks of a node. The runs' folder is at the same path on every node."""
+
+    address: str | None = None
+    """HOST:PORT, `auto`, or None for a cluster on this machine made for the purpose."""
+    cores: int = 1
+    gpus: float = 0.0
+    memory: float = 0.0
+    """GiB that a node must have to spare; 0 asks for none in particular."""
+
+    def run(
+        self, programs: Sequence[Program], watcher_of: Callable[[Program], Watcher], should_stop: Callable[[], bool]
+    ) -> None:
+        """Run each program as a task. A task whose node is lost goes on elsewhere, from the newest checkpoint.
+
+        Raises:
+            InputError: Ray is not installed, there is no cluster, or a run cannot begin.
+            StorageFailure: a run directory can no longer be written.
+        """
+        ray = self._connect()
+        try:
+            self._run(ray, programs, watcher_of, should_stop)
+        finally:
+            ray.shutdown()
+
+    def _connect(self) -> Any:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        try:
+            import ray
+        except ImportError:
+            raise InputError("Ray is not installed: pip install '.[cluster]' in a clone of csac") from None
+        options: dict[str, Any] = {"address": self.address} if self.address else {"include_dashboard": False}
+        try:
+            ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise InputError(f"no Ray cluster can be reached at {self.address}: {error!s:.200}") from None
+        return ray
+
+    def _run(
+        self,
+        ray: Any,
+        programs: Sequence[Program],
+        watcher_of: Callable[[Program], Watcher],
+        should_stop: Callable[[], bool],
+    ) -> None:
+        from ray.util.queue import Queue
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+        messages = Queue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
+        task = ray.remote(
+            num_cpus=self.cores,
+            num_gpus=self.gpus or None,
+            memory=int(self.memory * 2**30) or None,
+            max_retries=RETRIES,
+            max_calls=1,  # XLA counts its cores once in a process
+        )(_train)
+        running = {task.remote(program, index, messages): program for index, program in enumerate(programs)}
+        errors: list[Exception] = []
+        is_stopping = False
+        while running:
+            if (should_stop() or errors) and not is_stopping:
+                is_stopping = True
+                for reference in running:
+                    ray.cancel(reference)  # raises SIGINT there, on which the run is saved
+            over, _ = ray.wait(list(running), num_returns=1, timeout=SECONDS_BETWEEN_LOOKS)
+            for index, name, arguments in messages.get_nowait_batch(messages.size()):
+                getattr(watcher_of(programs[index]), name)(*arguments)
+            for reference in over:
+                program = running.pop(reference)
+                try:
+                    ray.get(reference)
+                except ray.exceptions.RayError as error:
+                    _note_loss(program, watcher_of(program), error, is_stopping, errors)
+        if errors:
+            raise errors[0]
+
+
+def _note_loss(
+    program: Program, watcher: Watcher, error: Exception, is_stopping: bool, errors: list[Exception]
+) -> None:
+    """Note why a task ended without a result: a mistake that ends the study, or a run that failed."""
+    cause = getattr(error, "cause", None)
+    if isinstance(cause, InputError | StorageFailure):
+        errors.append(cause)
+    elif not is_stopping:
+        record_failure(program, watcher, error)
+
+
+def _train(program: Program, index: int, messages: Any) -> None:
+    """Train a program on a node."""
+    import ray
+
+    watcher = _QueueWatcher(index, messages)
+    begin_with(program.threads)
+    from csac.training.train import train_program
+
+    for path in program.directories:
+        _wait_until_free(path / LOCK)
+    try:
+        with stop_requested() as request:
+            train_program(program, watcher, request.is_set)
+    except (InputError, StorageFailure):
+        raise
+    except Exception as error:
+        record_failure(program, watcher, error)
+    finally:
+        ray.wait(watcher.sent, num_returns=len(watcher.sent))
+
+
+def _wait_until_free(lock: Any) -> None:
+    """Wait for the lock of a run that was lost with its node; but not for ever, as another process may have it."""
+    end = time.monotonic() + SECONDS_FOR_LOCK
+    while lock.exists() and is_locked(lock) and time.monotonic() < end:
+        time.sleep(1.0)
+
+
+class _QueueWatcher:
+    """Sends what happens to a run to the driver."""
+
+    def __init__(self, index: int, messages: Any) -> None:
+        self.index, self.messages, self.sent = index, messages, list[Any]()
+
+    def _send(self, name: str, *arguments: Any) -> None:
+        # Nobody waits until it was heard: Ray would lend the core of who waits to another run.
+        self.sent = [*self.sent[-100:], self.messages.actor.put.remote((self.index, name, arguments))]
+
+    def turn(self, step: int) -> None:
+        pass
+
+    def progress(self, steps: Mapping[int, int]) -> None:
+        self._send("progress", dict(steps))
+
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
+        self._send("evaluated", step, dict(returns))
+        return False
+
+    def failed(self, seed: int, step: int, reason: str) -> None:
+        self._send("failed", seed, step, reason)
+
+    def note(self, text: str) -> None:
+        self._send("note", text)

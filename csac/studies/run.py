@@ -1,0 +1,174 @@
+"""Running a study: what is not over yet, in processes of this machine or on a Ray cluster."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from contextlib import closing
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from csac.console.tables import duration
+from csac.console.waiting import SECONDS_OF_SILENCE, Speed
+from csac.processes import core_quota, usable_cores
+from csac.record.rendering import number, short
+from csac.record.run import RunDirectory, is_run
+from csac.record.statistics import last_evaluations
+from csac.tasks.environment import Environment
+from csac.tasks.perturbations import perturbations_of
+from csac.training.config import algorithm_of, make_manifest
+from csac.training.loop import Program
+from csac.training.signals import stop_requested
+from csac.training.supervisor import supervise
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from rich.console import Console
+
+    from csac.studies.ray import Cluster
+    from csac.studies.study import StudyRun
+
+
+class How(NamedTuple):
+    """Where and how the runs of a study train."""
+
+    workers: int = 1
+    """Runs that train at once on this machine."""
+    cluster: Cluster | None = None
+    """The Ray cluster that they train on instead."""
+    wandb: bool = False
+    keep_checkpoints: bool = False
+    command: str | None = None
+
+
+def run_study(runs: Sequence[StudyRun], directory: Path, how: How, console: Console) -> int | None:
+    """Train what is not over yet; return the signal that stopped it, if one did. Every run is saved then.
+
+    Raises:
+        InputError: a task that cannot be made, or a run that is there with another configuration.
+    """
+    directory = directory.absolute()
+    waiting = {directory / run.folder: run for run in runs if not run.is_over(directory)}
+    if how.cluster is None:  # whose nodes may have what this machine has not
+        try_tasks(waiting.values())
+    programs = [_program(path, run, how) for path, run in waiting.items()]
+    with stop_requested(lambda text: console.print(text)) as request, closing(Progress(waiting, console)) as progress:
+        if how.cluster:
+            how.cluster.run(programs, progress.of, request.is_set)
+        elif programs:
+            turns = len(usable_cores()) // programs[0].threads
+            supervise(programs, progress.of, request.is_set, how.workers, turns)
+    if not how.keep_checkpoints:
+        for path in waiting:
+            if RunDirectory.open(path).manifest.state == "finished":  # the replay takes most of the room
+                shutil.rmtree(path / "checkpoint", ignore_errors=True)
+    return request.received[0] if request.received else None
+
+
+def try_tasks(runs: Any) -> None:
+    """Make each task once, and change it as it will be, so that a mistake is told before anything is written."""
+    tried: list[tuple[str, dict[str, Any], tuple[str, ...]]] = []
+    for _, config, _ in runs:
+        one = config.task, config.environment_arguments, config.perturbations
+        if one not in tried:
+            tried.append(one)
+            with closing(Environment(config.task, config.environment_arguments)) as environment:
+                for change in perturbations_of(config.perturbations):
+                    environment.perturb({change.kind: change.value})
+
+
+def _program(path: Path, run: StudyRun, how: How) -> Program:
+    """Return what trains a run, after making its directory or giving it its larger number of steps."""
+    cores = how.cluster.cores if how.cluster else len(usable_cores()[: core_quota()])
+    threads = cores if how.cluster else max(1, cores // how.workers)
+    if is_run(path):
+        existing = RunDirectory.open(path)
+        if run.config.steps > existing.config.steps:
+            with existing.locked():
+                existing.update_manifest(config=run.config)
+        if existing.manifest.process is not None:  # its last bits depend on it
+            threads = min(existing.manifest.machine.cores, cores) or threads
+    else:
+        RunDirectory.create(path, make_manifest(run.config, (run.config.seed,)))
+    return Program((path,), algorithm_of(run.config), run.config.task, threads, wandb=how.wandb, command=how.command)
+
+
+class Progress:
+    """Shows how far the runs of a study are: one line that changes on a terminal, and a line for each that ends."""
+
+    def __init__(
+        self, runs: Mapping[Path, StudyRun], console: Console, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.runs, self.console = runs, console
+        self.done = {path: RunDirectory.open(path).manifest.last_checkpoint if is_run(path) else 0 for path in runs}
+        self.total = sum(run.config.steps for run in runs.values())
+        self.over: set[Path] = set()
+        self.speed, self._clock, self._spoke = Speed(clock), clock, clock()
+        self.speed.add(sum(self.done.values()))
+        self._status = console.status("starting") if console.is_interactive and runs else None
+        if self._status:
+            self._status.start()
+
+    def of(self, program: Program) -> RunProgress:
+        """Return who is told about a program."""
+        return RunProgress(self, program.directories[0])
+
+    def advanced(self, path: Path, step: int) -> None:
+        """Take how many steps a run has made."""
+        self.done[path] = step
+        done = sum(self.done.values())
+        self.speed.add(done)
+        pace = self.speed.per_second()
+        left = f", {duration((self.total - done) / pace)} left" if pace else ""
+        told = f"{len(self.over)} of {len(self.runs)} runs over, {short(done)} of {short(self.total)} steps{left}"
+        if self._status:
+            self._status.update(told)
+        elif self._clock() - self._spoke >= SECONDS_OF_SILENCE:
+            self.say(told)
+        if step >= self.runs[path].config.steps and path not in self.over:
+            self.ended(path, "finished")
+
+    def ended(self, path: Path, outcome: str) -> None:
+        """Take that a run is over."""
+        self.over.add(path)
+        returns = last_evaluations(RunDirectory.open(path).evaluations, points=1)
+        last = f", last return {number(next(iter(returns.values())))}" if returns else ""
+        self.say(f"{len(self.over)} of {len(self.runs)}: {self.runs[path].name}: {outcome}{last}")
+
+    def say(self, text: str) -> None:
+        """Show a line."""
+        self.console.print(text, soft_wrap=True)
+        self._spoke = self._clock()
+
+    def close(self) -> None:
+        """Give the terminal back as it was."""
+        if self._status:
+            self._status.stop()
+
+
+class RunProgress(NamedTuple):
+    """Takes what happens to one run of a study."""
+
+    study: Progress
+    path: Path
+
+    def turn(self, step: int) -> None:
+        """Nothing to do: the supervisor gives turns."""
+
+    def progress(self, steps: Mapping[int, int]) -> None:
+        """Take how many steps the run has made."""
+        for step in steps.values():
+            self.study.advanced(self.path, step)
+
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
+        """Take an evaluation, which nobody stops at."""
+        return False
+
+    def failed(self, seed: int, step: int, reason: str) -> None:
+        """Take that the run failed."""
+        self.study.ended(self.path, f"failed at step {step:,}: {reason}")
+
+    def note(self, text: str) -> None:
+        """Show a line about the run."""
+        self.study.say(f"{self.study.runs[self.path].name}: {text}")

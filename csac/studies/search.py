@@ -1,0 +1,160 @@
+"""What `csac tune` searches: of each algorithm some hyperparameters, how far, and when they do something."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from csac.checks import did_you_mean
+from csac.record.config import RunConfig, as_json
+from csac.studies.arms import train_command
+from csac.training.options import Options
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    import optuna
+
+    from csac.types import Algorithm
+
+DIGITS = 3  # of a number that is tried
+REPORT_SEEDS = 5  # of the command that trains the best configuration
+
+Dimension = tuple[Literal["log", "linear", "below 1", "one of"], *tuple[Any, ...]]  # a scale, and its ends or values
+Space = dict[str, Dimension]
+
+_RATE: Dimension = ("log", 3e-5, 3e-3)
+_DISCOUNT: Dimension = ("below 1", 0.95, 0.999)
+_ENTROPY: Space = {"entropy_weight": ("log", 0.01, 1.0), "weight_learning_rate": _RATE}
+_NOISE: Space = {"exploration_noise": ("log", 0.03, 0.5), "target_noise": ("log", 0.05, 0.5)}
+_OFF_POLICY: Space = {
+    "actor_learning_rate": _RATE,
+    "critic_learning_rate": _RATE,
+    "discount": _DISCOUNT,
+    "target_rate": ("log", 0.001, 0.05),
+    "batch_size": ("one of", 64, 128, 256, 512),
+}
+_REFERENCE: Space = {"reference_period": ("log", 100, 10_000), "reference_rate": ("log", 0.005, 0.5)}
+_ROLLOUT: Space = {"rollout_steps": ("one of", 512, 1024, 2048, 4096), "minibatches": ("one of", 8, 16, 32, 64)}
+_CLIPPED: Space = {
+    "clip_range": ("linear", 0.1, 0.4),
+    "entropy_weight": ("linear", 0.0, 0.02),
+    "epochs": ("linear", 3, 20),
+}
+
+# Networks and updates per step are not searched: more of either costs time, which a search by steps does not see.
+SPACES: Mapping[str, Space] = {
+    "csac": {**_ENTROPY, "relative_entropy_weight": ("log", 0.005, 50.0), **_REFERENCE, **_OFF_POLICY},
+    "sac": {**_ENTROPY, **_OFF_POLICY},
+    "td3": {"policy_delay": ("linear", 1, 4), **_NOISE, **_OFF_POLICY},
+    "sd3": {"inverse_temperature": ("log", 0.001, 0.5), **_NOISE, **_OFF_POLICY},
+    "ppo": {
+        "learning_rate": _RATE,
+        "discount": _DISCOUNT,
+        "trace_decay": ("below 1", 0.8, 0.99),
+        **_CLIPPED,
+        **_ROLLOUT,
+    },
+}
+
+
+def draw(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
+    """Have a trial choose a value; "below 1", the distance to 1 is on a logarithmic scale."""
+    scale, *ends = dimension
+    if scale == "one of":
+        return trial.suggest_categorical(name, ends)
+    if isinstance(ends[0], int):
+        return trial.suggest_int(name, *ends, log=scale == "log")
+    if scale == "below 1":
+        return round(1 - _rounded(trial.suggest_float(name, _rounded(1 - ends[1]), _rounded(1 - ends[0]), log=True)), 9)
+    return _rounded(trial.suggest_float(name, *ends, log=scale == "log"))
+
+
+def _is_tau_idle(algorithm: Any) -> bool:
+    """Whether reference and actor are the same function, and the exact relative entropy zero."""
+    is_fresh = algorithm.reference_policy == "periodic" and algorithm.reference_period == 1
+    return is_fresh and algorithm.relative_entropy_estimator == "closed_form"
+
+
+# When a hyperparameter does something; those that are not here always do.
+_WORKS: Mapping[str, Callable[[Any], bool]] = {
+    "relative_entropy_weight": lambda algorithm: not _is_tau_idle(algorithm),
+    "reference_period": lambda algorithm: algorithm.reference_policy == "periodic" and algorithm.reference_period > 1,
+    "reference_rate": lambda algorithm: algorithm.reference_policy == "average",
+    "target_rate": lambda algorithm: getattr(algorithm, "critic_normalisation", "none") == "none",
+    "weight_learning_rate": lambda algorithm: "auto" in dataclasses.asdict(algorithm).values(),
+}
+
+
+def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: Sequence[str] = ()) -> Space:
+    """Return what is searched: what works and is not `given`, or what is `wanted` of it. `auto` is learnt.
+
+    Raises:
+        InputError: something is wanted that is not searched, is given or does nothing here; or nothing is left.
+    """
+    values: dict[str, Any] = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
+    space = {name: one for name, one in SPACES[algorithm.name].items() if name in values}
+    free = {
+        name: dimension
+        for name, dimension in space.items()
+        if name not in given and values[name] != "auto" and _WORKS.get(name, lambda _: True)(algorithm)
+    }
+    for name in wanted or ():
+        if name not in space:
+            hint = did_you_mean(name, space) or f"there is {', '.join(space)}"
+            raise InputError(f"{name!r} is not searched for {algorithm.name}: {hint}")
+        if name not in free:
+            raise InputError(f"{name} cannot be searched: it is given, learnt, or does nothing with the other options")
+    found = {name: dimension for name, dimension in free.items() if wanted is None or name in wanted}
+    if not found:
+        raise InputError("there is nothing to search: every hyperparameter of the search space is given")
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search(Options):
+    """What is tuned, and how a trial is judged: what all processes that share a directory agree on."""
+
+    task: str
+    algorithm: Algorithm
+    """Where the search begins; what is not searched stays so."""
+    space: Space
+    environment_arguments: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.steps < self.algorithm.cadence.first_update:
+            first = self.algorithm.cadence.first_update
+            raise InputError(f"no updates: steps ({self.steps:,}) < {first:,}, where the first one comes")
+
+    def algorithm_with(self, values: Mapping[str, Any]) -> Any:
+        """Return what a trial trains. Raises InputError for values that do not go with what is given."""
+        return dataclasses.replace(self.algorithm, **values)  # pyright: ignore[reportArgumentType]
+
+    def told(self) -> dict[str, Any]:
+        """Return it as JSON has it."""
+        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(Options) if item.name != "device"}
+        values = dataclasses.asdict(self.algorithm)  # pyright: ignore[reportArgumentType]
+        searched = {name: f"searched, {' '.join(map(str, dimension))}" for name, dimension in self.space.items()}
+        fixed = {"task": self.task, "algorithm": self.algorithm.name, "arguments": self.environment_arguments}
+        return as_json("the search", {**own, **fixed, "hyperparameters": {**values, **searched}})
+
+    def command(self, values: Mapping[str, Any]) -> str:
+        """Return the line that trains a configuration with seeds that the search has not used."""
+        first = 0 if self.first_seed >= REPORT_SEEDS else self.first_seed + self.seeds
+        config = RunConfig(
+            task=self.task,
+            algorithm=self.algorithm.name,
+            hyperparameters=dataclasses.asdict(self.algorithm_with(values)),
+            steps=self.steps,
+            evaluation_interval=self.evaluation_interval,
+            evaluation_episodes=self.evaluation_episodes,
+            environment_arguments=self.environment_arguments,
+        )
+        return train_command(config, range(first, first + REPORT_SEEDS))
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
