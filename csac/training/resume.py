@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from csac.record.config import RunConfig
+    from csac.training.config import TrainOptions
 
 # What may differ when a run goes on; with any other value it would be another run.
 _MAY_DIFFER = ("steps", "device", "checkpoint_interval", "keep_checkpoints")
@@ -164,6 +165,16 @@ def machine_changes(before: Manifest, current: Manifest) -> list[str]:
     for package in sorted(before.versions.keys() | current.versions.keys()):
         pairs[f"version of {package}"] = (before.versions.get(package), current.versions.get(package))
     return [f"the {name} was {old} and is {new}" for name, (old, new) in pairs.items() if old != new]
+
+
+def as_begun(run: RunDirectory, options: TrainOptions) -> TrainOptions:
+    """Return the options of runs that have begun with others' checkpoints, which may be gone or have trained on."""
+    config, origin, given = run.config, run.manifest.forked_from, options.get("perturbations")
+    planned: Any = config.perturbations
+    if given is not None and origin:
+        planned = continued(perturbations_of(planned), perturbations_of(given), origin.step)
+    events = config.events if options.get("events") is None else options.get("events")
+    return {**options, "perturbations": planned, "events": events}
 
 
 class Source(NamedTuple):

@@ -26,7 +26,7 @@ from csac.training.devices import choose_device, preallocates
 from csac.training.footprint import memory_needed
 from csac.training.loop import Loop, Program
 from csac.training.provenance import provenance
-from csac.training.resume import Source, continuation, refuse_differences, roll_back
+from csac.training.resume import Source, as_begun, continuation, refuse_differences, roll_back
 from csac.training.signals import Interrupted, stop_requested, storage_failures
 from csac.training.supervisor import begin_with, supervise
 from csac.types import InputError
@@ -116,7 +116,11 @@ def train(
     choose_device(options.get("device", "cpu"))
     place = None if directory is None else Path(os.path.abspath(directory))  # a task may change where we are
     wanted = labels(seeds, first_seed)
-    source = Source.find(start_from, wanted) if start_from is not None else None
+    source = None
+    if start_from is not None and resume and place and all(is_run(place / f"seed-{seed}") for seed in wanted):
+        options = as_begun(RunDirectory.open(place / f"seed-{wanted[0]}"), options)
+    elif start_from is not None:
+        source = Source.find(start_from, wanted)
     configs, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
     place = place or new_set_directory(configs[0].task, algorithm.name)
     existing = _existing(place, configs, resume, algorithm.cadence.has_schedule)
@@ -124,6 +128,9 @@ def train(
     how = _How(algorithm, task, evaluation_processes, tensorboard, wandb, command, stop_when is not None)
     programs = how.programs([[place / f"seed-{seed}" for seed in group] for group in groups], existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
+    for config in configs:
+        if source:
+            source.refuse_misfit(config, algorithm.cadence.has_schedule)
     for config in configs:
         group = next(group for group in groups if config.seed in group)
         _create_or_extend(place, config, group, existing.get(config.seed), source)
@@ -230,9 +237,8 @@ def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_sched
                 raise InputError(f"{path} already holds a run: resume it, or choose another directory")
             existing[config.seed] = run = RunDirectory.open(path)
             refuse_differences(run, config, has_schedule)
-    strangers = (
-        [p for p in place.iterdir() if not p.name.startswith((".", "seed-", "curve.png"))] if place.is_dir() else []
-    )
+    known = (".", "seed-", "curve.png")
+    strangers = [] if existing or not place.is_dir() else [p for p in place.iterdir() if not p.name.startswith(known)]
     if strangers or (place.exists() and not place.is_dir()):
         raise InputError(f"{place} is not empty and holds no set of runs: choose a new or an empty directory")
     return existing
