@@ -1,4 +1,4 @@
-"""What papers and other libraries call our options, and what of theirs has none here. Data, and one look-up."""
+"""What papers and other libraries call our options, and what options were called formerly."""
 
 from __future__ import annotations
 
@@ -9,90 +9,68 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-_RATES = ("--actor-learning-rate and --critic-learning-rate", "--learning-rate")
-_ENVIRONMENTS = "each seed has one environment, and --seeds says how many"
-_TASK = "the task has no flag: csac train Pendulum-v1"
-_SIZES = ("--actor-hidden-sizes and --critic-hidden-sizes", "--hidden-sizes")
+_RATES = "--actor-learning-rate and --critic-learning-rate"
+_SIZES = "--actor-hidden-sizes and --critic-hidden-sizes"
+_SEEDS = "--seeds: each has an environment of its own"
 
-# Of the words for an option, those count whose options the command has. Some are another algorithm's own.
-_CALLED_OTHERWISE = MappingProxyType(
+NAMES = MappingProxyType(
     {
-        "--tau": ("--relative-entropy-weight", "--target-rate"),
-        "--rho": ("--target-rate",),
-        "--sigma": ("--entropy-weight",),
-        "--alpha": ("--entropy-weight",),
-        "--ent-coef": ("--temperature", "--entropy-weight"),
-        "--gamma": ("--discount",),
-        "--polyak": ("--target-rate",),
-        "--learning-starts": ("--warmup-steps",),
-        "--start-steps": ("--warmup-steps",),
-        "--buffer-size": ("--replay-size",),
-        "--train-freq": ("--update-interval",),
-        "--gradient-steps": ("--updates-per-step",),
-        "--policy-frequency": ("--policy-delay",),
-        "--n-steps": ("--rollout-steps",),
-        "--total-timesteps": ("--steps",),
-        "--seed": ("--first-seed",),
-        "--eval-freq": ("--evaluation-interval",),
-        "--n-eval-episodes": ("--evaluation-episodes",),
-        "--track": ("--wandb",),
-        "--wandb-project": ("--wandb",),
-        "--exp-name": ("--directory",),
-        "--cuda": ("--device gpu",),
-        "--gpu": ("--device gpu",),
-        "--autotune": ("--temperature automatic",),
-        "--out": ("--video",),
-        "--deterministic": ("the default, without --stochastic,",),
-        "--env-kwargs": ("--environment-arguments",),  # in Python
+        "--tau": "--relative-entropy-weight (the paper's tau) or --target-rate (Polyak's)",
+        "--rho": "--target-rate",
+        "--polyak": "--target-rate",
+        "--sigma": "--entropy-weight",
+        "--alpha": "--entropy-weight",
+        "--ent-coef": "--entropy-weight",
+        "--temperature": "--entropy-weight (a number, or auto)",
+        "--autotune": "--entropy-weight auto",
+        "--temperature-learning-rate": "--weight-learning-rate",
+        "--gamma": "--discount",
         "--lr": _RATES,
-        "--policy-lr": ("--actor-learning-rate",),
-        "--actor-lr": ("--actor-learning-rate",),
-        "--critic-lr": ("--critic-learning-rate",),
-        "--q-lr": ("--critic-learning-rate",),
         "--learning-rate": _RATES,
-        "--actor-learning-rate": _RATES,
-        "--critic-learning-rate": _RATES,
+        "--policy-lr": "--actor-learning-rate",
+        "--q-lr": "--critic-learning-rate",
         "--net-arch": _SIZES,
         "--hidden-sizes": _SIZES,
-        "--actor-hidden-sizes": _SIZES,
-        "--critic-hidden-sizes": _SIZES,
-        "--batch-size": ("--minibatches (their number)",),
+        "--buffer-size": "--replay-size",
+        "--learning-starts": "--warmup-steps",
+        "--train-freq": "--update-interval",
+        "--gradient-steps": "--updates-per-step",
+        "--policy-frequency": "--policy-delay",
+        "--n-steps": "--rollout-steps",
+        "--total-timesteps": "--steps",
+        "--seed": "--first-seed",
+        "--n-envs": _SEEDS,
+        "--num-envs": _SEEDS,
+        "--eval-freq": "--evaluation-interval",
+        "--n-eval-episodes": "--evaluation-episodes",
+        "--env-kwargs": "--environment-arguments",  # in Python
+        "--groups": "--seeds-per-process",
+        "--cuda": "--device gpu",
+        "--track": "--wandb",
+        "--out": "--video",
     }
 )
-_NEEDLESS = MappingProxyType(
+
+_FORMERLY = MappingProxyType(
     {
-        "--n-envs": _ENVIRONMENTS,
-        "--num-envs": _ENVIRONMENTS,
-        "--environments": _ENVIRONMENTS,
-        "--verbose": "none is needed",
-        "--env": _TASK,
-        "--env-id": _TASK,
-        "--task": _TASK,
+        ("reference_policy", "previous"): 'reference_policy="average", reference_rate=1',
+        ("reference_policy", "algorithm1"): 'reference_policy="periodic", reference_period=1',
     }
 )
 
 
 def called_here(option: str, known: Collection[str]) -> str:
     """Return what the `known` options have for one of another name, as "it is --discount here", or nothing."""
-    words = [word for word in _CALLED_OTHERWISE.get(option, ()) if {*re.findall(r"--[a-z-]+", word)} <= {*known}]
-    if words:
-        return f"it is {' or '.join(words)} here"
-    return _NEEDLESS.get(option, "") if "--seeds" in known else ""
+    told = NAMES.get(option, "")
+    return f"it is {told} here" if {*re.findall(r"--[a-z-]+", told)} & {*known} else ""
 
 
 def called_in_python(name: str, known: Collection[str]) -> str:
     """Return what the `known` arguments have for one of another name, as "it is discount here", or nothing."""
     flag, *flags = ("--" + word.replace("_", "-") for word in (name, *known))
-    told = re.sub(r"(--[a-z-]+) (automatic|gpu)", r'\1="\2"', called_here(flag, flags))
-    return re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), told)
+    return re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), called_here(flag, flags))
 
 
-def written_in_python(name: str, value: object, known: Collection[str]) -> str:
-    """Return how a value is given here that other libraries give otherwise, or nothing."""
-    if "temperature" not in known:
-        return ""
-    if name == "entropy_weight" and str(value).startswith("auto"):
-        return 'it adapts with temperature="automatic"'
-    if name == "temperature" and type(value) in (int, float):
-        return f'write temperature="fixed", entropy_weight={value}'
-    return ""
+def written_in_python(name: str, value: object) -> str:
+    """Return how a value of former versions is written now, or nothing."""
+    return f"write {_FORMERLY[name, value]}" if isinstance(value, str) and (name, value) in _FORMERLY else ""

@@ -16,6 +16,10 @@ class InputError(ValueError):
     """A user's mistake, told in one line that says what is wrong and what to do."""
 
 
+class Failure(RuntimeError):
+    """What ends a command though nobody made a mistake: an environment or a disk failed. The message is one line."""
+
+
 class Spec(NamedTuple):
     """The flat sizes of a task: what a network needs to know of it."""
 

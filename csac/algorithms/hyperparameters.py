@@ -56,7 +56,7 @@ def check_hyperparameters(algorithm: Any, incompatible: Iterable[tuple[Mapping[s
     for field in dataclasses.fields(algorithm):
         value = _plain(getattr(algorithm, field.name))
         if words := _what_it_must_be(value, hints[field.name]):
-            hint = written_in_python(field.name, value, hints)
+            hint = written_in_python(field.name, value)
             raise InputError(f"{field.name} must be {words}, not {value!r}{hint and f': {hint}'}")
         object.__setattr__(algorithm, field.name, float(value) if _is_float(value, hints[field.name]) else value)
     for values, why in incompatible:

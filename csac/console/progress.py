@@ -1,4 +1,4 @@
-"""What a run shows while it trains and when it is over: a live display on a terminal, plain lines elsewhere."""
+"""What a set of runs shows while it trains and when it is over: a live display on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from csac.console.tables import duration, events_table, make_console, program, recovery_tables, results_table
+from csac.console.tables import duration, make_console, program, result_tables
 from csac.console.waiting import SECONDS_OF_SILENCE, Speed
 from csac.record.rendering import number, short
-from csac.record.statistics import evaluation_matrix
 from csac.tasks.registry import can_be_drawn
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rich.console import Console, RenderableType
 
+    from csac.record.run import RunDirectory
     from csac.record.sets import RunSet
 
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -33,8 +32,20 @@ CURVE_WIDTH = 24
 MOST_SEEDS_SHOWN = 12  # of more, only the mean and the range are shown
 
 
+class _Seed:
+    """How far one run is: its step, and the mean return of each evaluation by its step."""
+
+    def __init__(self, run: RunDirectory) -> None:
+        self.begin = self.step = run.manifest.steps_done
+        self.failure = ""
+        rows = run.evaluations
+        self.returns = {
+            int(step): float(rows["return"][rows["step"] == step].mean()) for step in np.unique(rows["step"])
+        }
+
+
 class Reporter:
-    """Shows the progress of one run.
+    """Shows the progress of a set of runs.
 
     Args:
         console: where to; by default a console on standard output that outlives its reader.
@@ -43,76 +54,59 @@ class Reporter:
 
     def __init__(self, console: Console | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self.console = console or make_console()
-        self._clock = clock
+        self._clock, self._speed = clock, Speed(clock)
         self._live: Live | None = None
-        self._steps = 0
-        self._directory = ""
-        self._done: dict[int, int] = {}
-        self._begin = 0
-        self._curves: dict[int, list[float]] = {}
-        self._failed: dict[int, str] = {}
-        self._waiting: dict[int, dict[int, float]] = {}  # evaluations that some seeds have not passed yet
-        self._just_told: set[int] = set()  # failed seeds of which the last lines tell
-        self._evaluated_at = 0
-        self._speed = Speed(clock)
+        self._seeds: dict[int, _Seed] = {}
+        self._steps = self._shown = 0  # steps of a run; the newest evaluation that a line has told of
         self._began = self._spoke = clock()
 
     def start(self, runs: RunSet, notes: Sequence[str] = ()) -> None:
-        """Say what is trained and where it goes, and from where each seed goes on."""
-        config, seeds = runs.config, runs.seeds
-        self._steps, self._directory = config.steps, str(runs.path)
-        self._done = {run.seed: run.manifest.steps_done for run in runs.runs}
-        self._begin = min(self._done.values())
-        self._curves = {seed: [] for seed in seeds}
-        steps, known, returns = evaluation_matrix(runs.evaluations)
-        self._evaluated_at = int(steps.max(initial=0))
-        for seed, line in zip(known.tolist(), returns, strict=True):
-            self._curves[seed] = line[~np.isnan(line)].tolist()
+        """Say what is trained and where it goes, and where each seed goes on."""
+        config = runs.config
+        self._steps, self._seeds = config.steps, {run.seed: _Seed(run) for run in runs.runs}
+        self._shown = self._passed()
         self._began = self._spoke = self._clock()
-        self._print(
-            Text.assemble(
-                (f"{config.algorithm} on {config.task}", "bold"), f", {_seeds(seeds)}, {config.steps:,} steps each"
-            )
-        )
-        self._print(Text(self._directory, "dim"))
-        for note in notes:
-            self._print(Text(note, "dim"))
+        title = Text.assemble((f"{config.algorithm} on {config.task}", "bold"))
+        self._print(title.append(f", {_labels(runs.seeds)}, {config.steps:,} steps each"))
+        begun = {seed: one.begin for seed, one in self._seeds.items() if one.begin}
+        if begun:
+            notes = [f"resuming {_together('at step', begun, len(self._seeds))}", *notes]
+        for line in (str(runs.path), *notes):
+            self._print(Text(line, "dim"))
         if self.console.is_interactive:
             self._print(Text())
             self._live = Live(get_renderable=self._display, console=self.console, refresh_per_second=2, transient=True)
             self._live.start()
 
-    def progress(self, steps_by_seed: Mapping[int, int]) -> None:
-        """Note how far each seed is."""
-        self._done.update(steps_by_seed)
-        self._speed.add(sum(self._done.values()))
+    def progress(self, steps: Mapping[int, int]) -> None:
+        """Note how far some seeds are."""
+        for seed, step in steps.items():
+            self._seeds[seed].step = max(step, self._seeds[seed].step) if step > self._seeds[seed].begin else step
+        self._speed.add(sum(one.step for one in self._seeds.values()))
         if not self._live and self._clock() - self._spoke >= SECONDS_OF_SILENCE:
-            step = min(self._living().values(), default=0)
-            self._say(f"step {step:,} of {self._steps:,}{self._pace() or self._why_slow()}")
+            self._print(Text(f"step {self._range()} of {self._steps:,}{self._pace()}{self._news()}"))
 
     def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
-        """Show the mean return of each seed's evaluation episodes at `step`."""
-        self._evaluated_at = step
+        """Take the mean returns of some seeds' evaluations at `step`; a line tells of it once no seed is behind."""
         for seed, value in returns.items():
-            self._curves[seed].append(value)
-            self._done[seed] = max(step, self._done[seed])  # it may be told of before the step is
-        waiting = self._waiting.setdefault(step, {})
-        waiting.update(returns)
-        if not self._live and waiting.keys() >= self._living().keys():  # one line once all seeds have passed it
-            mean = float(np.mean(list(waiting.values())))
-            text = f"step {step:,} of {self._steps:,}: mean return {number(mean)}{_spread(waiting)}"
-            self._say(text + self._pace())
-        if waiting.keys() >= self._living().keys():
-            del self._waiting[step]
+            one = self._seeds[seed]
+            one.returns[step], one.step = value, max(step, one.step)
+        passed = self._passed()
+        if not self._live and passed > self._shown:
+            self._shown = passed
+            living = {seed: one.returns[passed] for seed, one in self._living().items() if passed in one.returns}
+            mean = float(np.mean(list(living.values())))
+            self._print(
+                Text(f"step {passed:,} of {self._steps:,}: mean return {number(mean)}{_spread(living)}{self._pace()}")
+            )
 
     def failed(self, seed: int, step: int, reason: str) -> None:
         """Show that a seed has stopped; the others go on."""
-        self._failed[seed] = f"failed at step {step:,}: {reason}"
-        self._print(Text(f"seed {seed} {self._failed[seed]}", "red"))
-        self._just_told.add(seed)
+        self._seeds[seed].failure = f"seed {seed} failed at step {step:,}: {reason}"
+        self._print(Text(self._seeds[seed].failure, "red"))
 
     def note(self, text: str) -> None:
-        """Show one line about the run as a whole."""
+        """Show one line about the runs as a whole."""
         self._print(Text(text, "dim"))
 
     def finish(self, runs: RunSet) -> None:
@@ -120,19 +114,14 @@ class Reporter:
         self.close()
         self._print(Text())
         self._print(Text(_outcome(runs, duration(self._clock() - self._began)), "bold"))
-        evaluations = runs.evaluations
-        if len(evaluations):
-            self._print(results_table(runs))
-            if (events := events_table(runs.sound_evaluations)) is not None:
-                self._print(events)
-            for table in recovery_tables(runs):
-                self._print(table)
-        else:
-            self._print(Text("no evaluations yet"))
+        has_curve = bool(len(runs.evaluations))
+        for table in result_tables(runs) if has_curve else [Text("no evaluations yet")]:
+            self._print(table)
         for seed, reason in runs.failures.items():
-            if seed not in self._just_told:
+            if seed not in self._seeds or not self._seeds[seed].failure:
                 self._print(Text(f"seed {seed} failed at {reason}", "red"))
-        self._print_next(runs, bool(len(evaluations)))
+        for label, line in _next_lines(runs, has_curve):
+            self._print(Text.assemble((f"{label:<9}", "dim"), line))
 
     def close(self) -> None:
         """Give the terminal back as it was. May be called at any time, and again."""
@@ -140,111 +129,116 @@ class Reporter:
             self._live.stop()
             self._live = None
 
-    def _print_next(self, runs: RunSet, has_curve: bool) -> None:
-        directory, csac, config = shlex.quote(str(runs.path)), program(), runs.config
-        film, failed = shlex.quote(str(runs.path / "play.mp4")), runs.failures
-        logs = [run.path / "log.txt" for run in runs.runs if run.seed in failed]
-        lines = [("why", f"the traceback is in {log}") for log in logs if _has_traceback(log)]
-        lines += [("curve", str(runs.curve))] if has_curve else []
-        has_policy = any(run.policy_file().exists() for run in runs.runs if run.seed not in failed)
-        if has_policy and config.task_is_callable:  # which no command line can name
-            task = config.task if config.task.isidentifier() else "your_task"
-            lines.append(("test it", f"in Python: evaluate(load({str(runs.path)!r}), {task})"))
-        elif has_policy:
-            lines.append(("test it", f"{csac} evaluate {directory}"))
-            lines += [("watch it", f"{csac} play {directory} --video {film}")] * can_be_drawn(config.task)
-        for label, line in lines:
-            self._print(Text.assemble((f"{label:<9}", "dim"), line))
-
     def _print(self, renderable: RenderableType) -> None:
         # A path or a command that is cut into lines could not be copied.
         self.console.print(renderable, soft_wrap=isinstance(renderable, Text))
         self._spoke = self._clock()
 
-    def _say(self, text: str) -> None:
-        self._just_told.clear()
-        self._print(Text(text))
+    def _living(self) -> dict[int, _Seed]:
+        return {seed: one for seed, one in self._seeds.items() if not one.failure}
 
-    def _living(self) -> dict[int, int]:
-        return {seed: step for seed, step in self._done.items() if seed not in self._failed}
+    def _passed(self) -> int:
+        """Return the newest evaluation step that no living seed is behind, 0 before the first."""
+        newest = [max(one.returns, default=0) for one in self._living().values()]
+        return min(newest, default=0)
+
+    def _range(self) -> str:
+        steps = [one.step for one in (self._living() or self._seeds).values()]
+        return f"{min(steps):,}" + (f" to {max(steps):,}" if max(steps) > min(steps) else "")
+
+    def _news(self) -> str:
+        """Return the last return of each seed that is ahead of the newest evaluation told of."""
+        ahead = {
+            seed: max(one.returns) for seed, one in self._living().items() if max(one.returns, default=0) > self._shown
+        }
+        told = [f"seed {seed} {number(self._seeds[seed].returns[step])} at {step:,}" for seed, step in ahead.items()]
+        return f"; last returns: {', '.join(told)}" if told and len(told) <= MOST_SEEDS_SHOWN else ""
 
     def _pace(self) -> str:
-        """Return how fast it goes and how long it will take, as soon as both are known."""
-        speed = self._speed.per_second()
-        if not speed:
-            return ""
-        unit = "steps/s" if len(self._done) == 1 else "seed-steps/s"
-        left = sum(self._steps - step for step in self._living().values()) / speed
-        return f", {speed:,.0f} {unit}" + (f", {duration(left)} left" if left else "")
-
-    def _why_slow(self) -> str:
-        """Return what goes on while no step is made: before the first one, and after the last."""
-        living = self._living()
-        if living and all(step <= self._begin for step in living.values()):
+        """Return how fast it goes and how long it will take, or what goes on while no step is made."""
+        living = self._living().values()
+        if living and all(one.step <= one.begin for one in living):
             return f", compiling for {duration(self._clock() - self._began)}"
-        return ", finishing" if living and all(step >= self._steps for step in living.values()) else ""
+        left = sum(self._steps - one.step for one in living)
+        if living and not left:
+            return ", finishing"
+        speed = self._speed.per_second()
+        unit = "steps/s" if len(self._seeds) == 1 else "seed-steps/s"
+        return f", {speed:,.0f} {unit}, {duration(left / speed)} left" if speed else ""
 
     def _display(self) -> RenderableType:
-        return Group(self._bar(), Text(), self._returns()) if any(self._curves.values()) else self._bar()
-
-    def _bar(self) -> RenderableType:
-        living = self._living() or self._done
-        done, total = sum(living.values()), self._steps * len(living)
-        step = f"step {short(min(living.values()))} of {short(self._steps)}"
-        text = f"{100 * done // total} %, {step}{self._why_slow() or self._pace()}"
+        """Show a bar over all, and a line for each seed: its step, its returns so far as a curve, and the last one."""
+        living = (self._living() or self._seeds).values()
+        done, total = sum(one.step for one in living), self._steps * len(living)
+        step = short(min(one.step for one in living))
+        text = f"{100 * done // total} %, step {step} of {short(self._steps)}{self._pace()}"
         width = min(CURVE_WIDTH, max(self.console.width - len(text) - 2, 4))
-        grid = Table.grid(padding=(0, 2))
-        grid.add_row(ProgressBar(total=total, completed=done, width=width), Text(text))
-        return grid
+        bar = Table.grid(padding=(0, 2))
+        bar.add_row(ProgressBar(total=total, completed=done, width=width), Text(text))
+        if not any(one.returns for one in self._seeds.values()):
+            return bar
+        return Group(bar, Text(), self._curves())
 
-    def _returns(self) -> RenderableType:
-        """One line per seed, its returns so far as a curve, then the mean over the seeds that are still training."""
-        shown = {seed: curve for seed, curve in self._curves.items() if curve or seed in self._failed}
-        known = [value for curve in shown.values() for value in curve if math.isfinite(value)]
+    def _curves(self) -> Table:
+        curves = {seed: list(one.returns.values()) for seed, one in self._seeds.items()}
+        known = [value for curve in curves.values() for value in curve if math.isfinite(value)]
         low, high = min(known, default=0.0), max(known, default=0.0)
         table = Table.grid(padding=(0, 2))
+        table.add_column(justify="right", style="dim")
         table.add_column(justify="right", style="dim")
         table.add_column(style="cyan", no_wrap=True)
         table.add_column(justify="right")
         table.add_column(style="dim", no_wrap=True)
 
-        def add(label: str, curve: list[float], note: str = "", style: str = "") -> None:
-            picture = "" if self.console.options.ascii_only else sparkline(curve, low, high, CURVE_WIDTH)
-            latest = number(curve[-1], largest=max(abs(low), abs(high))) if curve else ""
-            table.add_row(Text(label), Text(picture), Text(latest), Text(note), style=style)
+        def add(label: str, step: str, curve: Iterable[float], note: str = "", style: str = "") -> None:
+            values = list(curve)
+            picture = "" if self.console.options.ascii_only else sparkline(values, low, high, CURVE_WIDTH)
+            latest = number(values[-1], largest=max(abs(low), abs(high))) if values else ""
+            table.add_row(Text(label), Text(step), Text(picture), Text(latest), Text(note), style=style)
 
-        if len(shown) <= MOST_SEEDS_SHOWN:
-            for seed, curve in shown.items():
-                note, style = ("stopped", "red") if seed in self._failed else ("", "")
-                add(f"seed {seed}", list(curve), note, style)
-        living = [curve for seed, curve in shown.items() if curve and seed not in self._failed]
+        if len(curves) <= MOST_SEEDS_SHOWN:
+            for seed, one in self._seeds.items():
+                add(f"seed {seed}", short(one.step), curves[seed], *(("stopped", "red") if one.failure else ()))
+        living = [curves[seed] for seed in self._living() if curves[seed]]
         if len(living) > 1:
-            shortest = min(len(curve) for curve in living)
+            shortest = min(map(len, living))
             values = np.array([curve[:shortest] for curve in living])
-            note = (
-                ""
-                if len(shown) <= MOST_SEEDS_SHOWN
-                else f"{number(values[:, -1].min())} to {number(values[:, -1].max())}"
-            )
-            add("mean", list(values.mean(axis=0)), note, "bold")
-        return Group(Text(f"return at step {self._evaluated_at:,}", "dim"), table)
+            ends = f"{number(values[:, -1].min())} to {number(values[:, -1].max())}"
+            add("mean", "", values.mean(axis=0), ends if len(curves) > MOST_SEEDS_SHOWN else "", "bold")
+        return table
 
 
 def sparkline(values: Sequence[float] | np.ndarray, low: float, high: float, width: int) -> str:
     """Draw values between `low` and `high` in at most `width` characters, each the mean of its share; NaN is blank."""
     array = np.asarray(values, dtype=np.float64)
     parts = np.array_split(array, min(width, len(array))) if len(array) else []
-    span = high - low
-    drawn = ""
+    span, drawn = high - low, ""
     for part in parts:
         level = (part.mean() - low) / span if span > 0 else 0.5
         drawn += BLOCKS[min(max(int(level * len(BLOCKS)), 0), len(BLOCKS) - 1)] if math.isfinite(level) else " "
     return drawn
 
 
-def _has_traceback(log: Path) -> bool:
-    """Whether a log says more of a failure than its line: where a number is not finite, nothing was raised."""
-    return log.exists() and "\nTraceback (most recent" in log.read_text(encoding="utf-8", errors="replace")
+def _next_lines(runs: RunSet, has_curve: bool) -> list[tuple[str, str]]:
+    """Return where to look and what to type next, each with its label."""
+    directory, config = shlex.quote(str(runs.path)), runs.config
+    logs = [run.path / "log.txt" for run in runs.runs if run.seed in runs.failures]
+    lines = [
+        ("why", f"the traceback is in {log}")
+        for log in logs
+        if "\nTraceback (most recent" in log.read_text("utf-8", "replace")
+    ]
+    lines += [("curve", str(runs.curve))] if has_curve else []
+    if not any(run.policy_file().exists() for run in runs.runs if run.seed not in runs.failures):
+        return lines
+    if config.task_is_callable:  # which no command line can name
+        task = config.task if config.task.isidentifier() else "your_task"
+        return [*lines, ("test it", f"in Python: evaluate(load({str(runs.path)!r}), {task})")]
+    lines.append(("test it", f"{program()} evaluate {directory}"))
+    if can_be_drawn(config.task) and (has_curve or len(runs.runs) == 1):
+        film = shlex.quote(str(runs.path / "play.mp4"))
+        lines.append(("watch it", f"{program()} play {directory} --video {film}"))
+    return lines
 
 
 def _outcome(runs: RunSet, time_taken: str) -> str:
@@ -256,8 +250,17 @@ def _outcome(runs: RunSet, time_taken: str) -> str:
     return f"finished {steps} steps in {time_taken}" + (f", but {failed} of {seeds} seeds failed" if failed else "")
 
 
-def _seeds(seeds: Sequence[int]) -> str:
-    return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}"
+def _labels(seeds: Sequence[int]) -> str:
+    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
+        return f"seeds {seeds[0]} to {seeds[-1]}"
+    return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
+
+
+def _together(word: str, steps: Mapping[int, int], seeds: int) -> str:
+    """Return where seeds are, in one number where all are at one step."""
+    if len(steps) == seeds and len({*steps.values()}) == 1:
+        return f"{word} {next(iter(steps.values())):,}"
+    return ", ".join(f"seed {seed} {word} {step:,}" for seed, step in steps.items())
 
 
 def _spread(returns: Mapping[int, float]) -> str:

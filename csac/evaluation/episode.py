@@ -9,6 +9,7 @@ import numpy as np
 
 from csac.deploy.policy import noise_generator
 from csac.tasks.failures import EnvironmentFailure
+from csac.types import Failure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from csac.tasks.environment import Environment
 
 
-class EvaluationFailure(RuntimeError):
+class EvaluationFailure(Failure):
     """An evaluation environment raised, or gave what is not finite. The message names the episode and is one line."""
 
 

@@ -14,7 +14,7 @@ from csac.record import manifest as manifests
 from csac.record.files import create_atomically, write_atomically
 from csac.record.locks import is_locked, kept_from_children, take
 from csac.record.tables import COLUMNS, append_rows, read_rows, structured
-from csac.types import InputError
+from csac.types import Failure, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -33,8 +33,8 @@ LOG = "log.txt"
 MANIFEST = "manifest.json"
 
 
-class StorageFailure(RuntimeError):
-    """A run directory can no longer be written. The message says why, in one line."""
+class StorageFailure(Failure):
+    """A run directory can no longer be written. The message says why."""
 
 
 class RunDirectory:

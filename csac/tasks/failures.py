@@ -7,11 +7,13 @@ import sysconfig
 from pathlib import Path
 from traceback import walk_tb
 
+from csac.types import Failure
+
 _CSAC = f"{Path(__file__).parents[1]}{os.sep}"
 _LIBRARIES = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"), "<frozen")
 
 
-class EnvironmentFailure(RuntimeError):
+class EnvironmentFailure(Failure):
     """An environment raised, or gave what is not a finite number of the right shape. The message is one line."""
 
 

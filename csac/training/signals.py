@@ -123,5 +123,7 @@ def storage_failures(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in _CANNOT_WRITE and str(error.filename or path).startswith(str(path)):
-            raise StorageFailure(f"{path} cannot be written: {error.strerror}") from error
+            raise StorageFailure(
+                f"{path} cannot be written: {error.strerror}; once that is mended, it can be resumed"
+            ) from error
         raise

@@ -1,0 +1,124 @@
+"""The front door: each sub-command parses its arguments and calls one function."""
+
+from __future__ import annotations
+
+import errno
+import faulthandler
+import io
+import os
+import signal
+import sys
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from csac.types import Failure, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+HELP = """\
+usage: csac COMMAND ...
+
+Train controllers for continuous-control tasks with Conservative Soft Actor-Critic.
+
+  csac train TASK      train controllers for a Gymnasium task, several seeds at once
+  csac resume DIR      resume runs that were stopped or killed
+  csac evaluate DIR    test the policies of runs on fresh episodes
+  csac play DIR        watch a policy, or record a video
+  csac export DIR      export a policy as NumPy, ONNX or C, and verify it
+  csac latency PATH    measure how long an exported policy takes per action
+  csac runs [DIR]      list the runs below a directory
+  csac report DIR...   compare runs: a page of curves, tables and commands
+  csac study COMMAND   run the paper's experiments, or your own
+  csac tune TASK       search for good hyperparameters
+
+  csac COMMAND --help  explain a command and its options
+  csac --version       print the version
+
+To begin: csac train HalfCheetah-v4 --seeds 2 --steps 60_000
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `csac` with `arguments`, by default the command line's, and return its exit code.
+
+    0 done, 1 a failing environment or disk (internal errors are raised), 2 wrong arguments or input, 3 finished but a
+    seed failed, 130 SIGINT, 143 SIGTERM.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    _prepare_streams()
+    try:
+        code = _run(words)
+    finally:
+        failure = _flush()
+    return complain(_unwritten(failure), 1) if failure and not code else code
+
+
+def complain(message: object, code: int) -> int:
+    """Write one line to stderr and return the exit code."""
+    print(f"csac: {' '.join(str(message).split())}", file=sys.stderr)
+    return code
+
+
+def interrupted(error: KeyboardInterrupt) -> int:
+    """Return the exit code of the signal."""
+    return 128 + (signal.SIGTERM if signal.SIGTERM in error.args else signal.SIGINT)
+
+
+def _run(words: list[str]) -> int:
+    try:
+        return _dispatch(words)
+    except (InputError, Failure) as error:
+        return complain(error, 2 if isinstance(error, InputError) else 1)
+    except KeyboardInterrupt as error:
+        return interrupted(error)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        return complain(_unwritten(error), 1)
+
+
+def _dispatch(words: list[str]) -> int:
+    if words[:1] == ["help"]:
+        words = [*words[1:], "--help"]
+    if not words or words[0] in ("-h", "--help"):
+        with suppress(BrokenPipeError):
+            print(HELP.rstrip())
+        return 0
+    if words[0] in ("--version", "-V", "version"):
+        from csac import __version__
+
+        print(f"csac {__version__}")
+        return 0
+    from csac.cli.commands import run  # tyro and NumPy come with it
+
+    return run(words[0], words[1:])
+
+
+def _unwritten(error: OSError) -> str:
+    return f"not all of the output could be written: {error.strerror}"
+
+
+def _prepare_streams() -> None:
+    """Lead streams that were closed to nowhere: the next file to be opened would get what libraries print there."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
+    with suppress(OSError, ValueError):  # where a caller's stderr is no file
+        if not faulthandler.is_enabled():
+            faulthandler.enable()  # a simulator's native code may crash this process
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def _flush() -> OSError | None:
+    """Write what waits, or return why that fails; where nobody reads it any more (`csac runs | head`), that is none."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return None if isinstance(error, BrokenPipeError) else error
+    return None

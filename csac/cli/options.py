@@ -1,0 +1,308 @@
+"""What may be typed after each sub-command: dataclasses, of which tyro makes the options and their help."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, Suppress, UseAppendAction, arg
+from tyro.constructors import PrimitiveConstructorSpec
+
+from csac.checks import did_you_mean
+from csac.cli.parsing import JSON, options_of, parse, value_of
+from csac.presets import PRESETS, hyperparameters
+from csac.record.config import EVALUATION_SEED, RunConfig
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from csac.record.sets import RunSet
+
+Flag = FlagCreatePairsOff[bool]
+Runs = Annotated[Positional[Path], arg(metavar="DIR", help="A set of runs, or one run of it.")]
+Checkpoint = Annotated[Literal["last", "best"], arg(help="Each seed's last policy, or the one of its best evaluation.")]
+Constant = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    arg(metavar="KIND=VALUE", help="Change the task, for example friction=2; the kinds are those of csac train."),
+]
+Trust = Annotated[
+    Flag,
+    arg(help="Allow the task to import its module although you have never named it on this machine; read it first."),
+]
+Names = Annotated[
+    tuple[str, ...],
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME,...",
+        instance_from_str=lambda words: tuple(word.strip() for word in words[0].split(",")),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda value: [",".join(value)],
+    ),
+]
+PERTURB = (
+    "Change the task after STEP environment steps, for example friction=1.5@300000. Kinds: factors on friction, "
+    "gravity, mass or gain of a MuJoCo task; standard deviations of observation_noise or action_noise. With --from, "
+    "none drops what that run had planned."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Training(RunConfig):
+    """What `csac train` and `csac tune` have in common, beside the hyperparameters of the algorithm."""
+
+    task: Annotated[Positional[str], arg(metavar="TASK")]
+    """A Gymnasium id such as HalfCheetah-v4, or module:Id for an environment that a module registers."""
+    preset: str | None = None
+    """paper: the paper's hyperparameters. strong: critics that learn faster (CSAC, SAC). Options given here win."""
+    seeds: int = 1
+    """Number of independent seeds."""
+    first_seed: int = 0
+    """The first seed; the others are numbered from it."""
+    environment_arguments: Annotated[dict[str, Any], JSON, arg(name="env-kwargs")] = field(default_factory=dict)
+    """Keyword arguments for the environment, as a JSON object."""
+    hyperparameters: Suppress[dict[str, Any]] = field(default_factory=dict)
+    seed: Suppress[int] = 0
+    evaluation_seed: Suppress[int] = EVALUATION_SEED
+    task_is_callable: Suppress[bool] = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(_Training):
+    """Train controllers for a task: independent seeds, each evaluated at regular intervals.
+
+    Exit codes: 0 done, 1 the directory can no longer be written, 2 wrong arguments, 3 a seed failed, 130 or 143
+    stopped by a signal (the runs are saved).
+    """
+
+    directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/TASK/ALGORITHM/DATE-TIME)")] = None
+    """The folder of the runs, seed-K each; it must be new or empty."""
+    resume: Flag = False
+    """Resume the runs in --directory that are there, and start the others."""
+    start_from: Annotated[str | None, arg(name="from", metavar="DIR[@STEP]", help_behavior_hint="(default: none)")] = (
+        None
+    )
+    """Start from copies of other runs' checkpoints; what is learnt and how it is evaluated stay, unless given here."""
+    perturbations: Annotated[
+        UseAppendAction[tuple[str, ...]], arg(name="perturb", metavar="KIND=VALUE[@STEP]", help=PERTURB)
+    ] = ()
+    events: Annotated[Names, arg(help_behavior_hint="(default: the task's own)")] = ()
+    """More names to record from the info of an evaluation episode's last step: each becomes a column and a curve."""
+    seeds_per_process: Annotated[int | None, arg(help_behavior_hint="(default: 1 on a CPU, a few on a GPU)")] = None
+    """Seeds that train in one program."""
+    evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
+    """Processes per program that evaluate while it trains on; 0 evaluates in between. The results are the same."""
+    wandb: Flag = False
+    """Also log to Weights & Biases: one run per seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
+
+    def options(self) -> dict[str, Any]:
+        """Return what `train` takes as keyword arguments."""
+        own = ("seeds", "first_seed", "directory", "resume", "start_from", "seeds_per_process", "evaluation_processes")
+        names = {item.name for item in dataclasses.fields(RunConfig)} | {*own, "wandb"}
+        names -= {"task", "algorithm", "hyperparameters", "seed", "task_is_callable"}
+        if "none" in self.perturbations and len(self.perturbations) > 1:
+            raise InputError("--perturb none leaves everything out: give it alone")
+        perturbations = () if "none" in self.perturbations else self.perturbations or None  # None: as planned there
+        options = {name: getattr(self, name) for name in names}
+        return {**options, "perturbations": perturbations, "events": self.events or None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tune(_Training):
+    """Search for good hyperparameters with Optuna: short trials chosen by TPE, hopeless ones pruned.
+
+    A trial's score is the mean over its seeds of their last three evaluations, on episodes that no other run and no
+    report uses. Hyperparameters given below are fixed; the rest of the search space is searched (docs/tuning.md). Any
+    number of processes and machines that run the same command share the trials; after Ctrl-C or a crash the same
+    command continues.
+
+    Exit codes: 0 done, 1 the directory can no longer be written, 2 wrong arguments, 3 no trial is complete, 130 or 143
+    stopped by a signal.
+    """
+
+    trials: int = 50
+    """Number of trials in total, including those of other processes and earlier calls."""
+    search: Annotated[Names, arg(help_behavior_hint="(default: the whole search space)")] = ()
+    """Search only these hyperparameters."""
+    steps: int = 100_000
+    """Environment steps per seed of each trial, warm-up included."""
+    seeds: int = 2
+    """Number of independent seeds in each trial, the same for all trials."""
+    first_seed: int = 1_000
+    """The first seed; the others are numbered from it. Report results on other seeds."""
+    directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/tune/TASK/ALGORITHM)")] = None
+    """The directory of the search: new, empty, or of the same search."""
+    perturbations: Suppress[tuple[str, ...]] = ()
+    events: Suppress[tuple[str, ...]] = ()
+
+    def home(self) -> Path:
+        """Return the directory of the search."""
+        return self.directory or Path("runs", "tune", self.task.replace("/", "-").replace(":", "-"), self.algorithm)
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Resume runs from their newest checkpoints, as if they had never stopped."""
+
+    runs: Runs
+    steps: Annotated[int | None, arg(help_behavior_hint="(default: as the runs were started)")] = None
+    """Total environment steps per seed, counted from the beginning; more than before extends the runs."""
+    trust_task: Trust = False
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Test the policies of runs on fresh episodes that neither training nor its evaluations have used."""
+
+    runs: Runs
+    seed: Annotated[int | None, arg(help_behavior_hint="(default: every seed)")] = None
+    """The seed to test."""
+    checkpoint: Checkpoint = "last"
+    episodes: int = 10
+    """Episodes per seed, the same for each."""
+    processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
+    """Processes that share the episodes; the results do not depend on it."""
+    stochastic: Flag = False
+    """Sample actions from the policy instead of taking the deterministic one."""
+    perturb: Constant = ()
+    csv: Annotated[Path | None, arg(metavar="FILE.csv", help_behavior_hint="(default: none)")] = None
+    """Also write one row per episode to this file, as in evaluations.csv."""
+    trust_task: Trust = False
+
+
+@dataclass(frozen=True)
+class Play:
+    """Watch a policy in a window, or record a video of it."""
+
+    runs: Runs
+    seed: Annotated[int | None, arg(help_behavior_hint="(default: the one with the best last evaluations)")] = None
+    """The seed to watch."""
+    checkpoint: Checkpoint = "last"
+    episodes: int = 1
+    """Number of episodes."""
+    video: Annotated[Path | None, arg(metavar="OUT.mp4", help_behavior_hint="(default: a window)")] = None
+    """Record to this file instead of opening a window; no display is needed."""
+    perturb: Constant = ()
+    trust_task: Trust = False
+
+
+@dataclass(frozen=True)
+class Export:
+    """Export a policy that maps the raw observation to the environment's action, and verify it.
+
+    The artefact is a folder with the policy and contract.json, which describes its inputs and outputs.
+    """
+
+    runs: Runs
+    seed: Annotated[int | None, arg(help_behavior_hint="(default: the one with the best last evaluations)")] = None
+    """The seed whose policy leaves."""
+    checkpoint: Checkpoint = "last"
+    format: Literal["numpy", "onnx", "c"] = "numpy"
+    """numpy: needs only NumPy, with a loader beside it. onnx: a graph. c: one C99 header."""
+    out: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="(default: DIR/export/FORMAT)")] = None
+    """The artefact's folder."""
+    fallback: Annotated[str | None, arg(metavar="zero|middle|last|X,...", help_behavior_hint="(default: no guard)")] = (
+        None
+    )
+    """Guard against NaN and infinity: the action to take then."""
+    rate_limit: Annotated[float | None, arg(help_behavior_hint="(default: no limit)")] = None
+    """Largest change of an action from one step to the next, as a share of its range; then the fallback is the last
+    action, unless another is given."""
+    episodes: int = 10
+    """Episodes to verify with, the same as those of csac evaluate; 0 if the task cannot be made on this machine."""
+    card: Flag = False
+    """Also write a model card, README.md."""
+    trust_task: Trust = False
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Measure how long artefacts take per action, call by call: as fast as possible and at a fixed rate.
+
+    A C artefact is timed inside a compiled program, the others around their call in Python.
+    """
+
+    artefacts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ARTEFACT...", help_behavior_hint="(required)")]
+    """Folders written by csac export."""
+    calls: int = 100_000
+    """Number of calls made one after the other."""
+    rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: the task's, or 100)")] = None
+    """Calls per second of the measurement at a fixed rate."""
+    seconds: float = 10.0
+    """Length of the measurement at a fixed rate; 0 skips it."""
+
+
+@dataclass(frozen=True)
+class List:
+    """List the runs below a directory."""
+
+    directory: Annotated[Positional[Path], arg(metavar="[DIR]")] = Path("runs")
+    """Where to look."""
+
+
+def parse_training(base: type[Any], words: list[str], program: str) -> Any:
+    """Return a parsed `Train` or `Tune`, whose defaults are those of the preset, or of the runs to begin with."""
+    first = "" if not words or words[0].startswith("-") else words[0]
+    options = parse(_with_algorithm(base, words, first), words, program, _elsewhere)
+    if options.preset and options.task != first:  # what a preset gives can depend on the task
+        options = parse(_with_algorithm(base, words, options.task), words, program, _elsewhere)
+    return options
+
+
+def learner_of(options: Any) -> Any:
+    """Return the algorithm with its hyperparameters, as `parse_training` has parsed them."""
+    return getattr(options, options.algorithm)
+
+
+def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
+    """Return `Train` or `Tune` with the hyperparameters of the chosen algorithm beside its own options."""
+    from csac.algorithms import ALGORITHMS
+    from csac.training.config import algorithm_of
+
+    source, preset = _source(words), value_of(words, "--preset")
+    name = value_of(words, "--algorithm", source.config.algorithm if source else "csac")
+    if name not in ALGORITHMS:
+        hint = did_you_mean(name, ALGORITHMS) or f"choose {' or '.join(ALGORITHMS)}"
+        raise InputError(f"no algorithm is called {name!r}: {hint}")
+    defaults: dict[str, Any] = {"algorithm": name, "preset": preset}
+    learner = ALGORITHMS[name](**(hyperparameters(preset, name, task) if preset else {}))
+    if source:
+        kept = ("steps", "evaluation_interval", "evaluation_episodes", "evaluation_seed")
+        defaults |= {item: getattr(source.config, item) for item in kept}
+        defaults |= {"seeds": len(source.seeds), "first_seed": source.seeds[0]}
+        defaults["environment_arguments"] = source.config.environment_arguments
+        if source.config.algorithm == name and not preset:
+            learner = algorithm_of(source.config)
+    hint = arg(help_behavior_hint=f"(default: {preset or 'none'})")
+    hints: dict[str, Any] = get_type_hints(base, include_extras=True)
+    hints |= {"algorithm": Literal[tuple(ALGORITHMS)], "preset": Annotated[Literal[PRESETS] | None, hint]}  # pyright: ignore[reportInvalidTypeForm]
+    fields = [(item, hints[item], _defaulting(value)) for item, value in defaults.items()]
+    fields.append((name, OmitArgPrefixes[type(learner)], field(default=learner)))
+    return dataclasses.make_dataclass(
+        base.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace={"__doc__": base.__doc__}
+    )
+
+
+def _defaulting(value: Any) -> Any:
+    return field(default_factory=lambda: value) if isinstance(value, dict) else field(default=value)
+
+
+def _source(words: list[str]) -> RunSet | None:
+    """Return the runs that `--from` begins with, or those that it has begun. Raises InputError where there are none."""
+    where, directory = value_of(words, "--from"), value_of(words, "--directory")
+    if where is None:
+        return None
+    from csac.record.sets import RunSet
+
+    if "--resume" in words and directory and Path(directory).exists():
+        return RunSet.open(directory)
+    name, at, _ = where.rpartition("@")
+    return RunSet.open(name if at and not Path(where).exists() else where)
+
+
+def _elsewhere(option: str) -> str:
+    """Return which algorithms have an option that the chosen one does not have, or nothing."""
+    from csac.algorithms import ALGORITHMS
+
+    names = [name for name, kind in ALGORITHMS.items() if option in options_of(kind)]
+    return f"--algorithm {' or '.join(names)} has it" if names else ""

@@ -1,0 +1,132 @@
+"""From the words of a command to its dataclass: tyro, whose complaint becomes one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+import re
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any, TypeVar
+from unittest.mock import patch
+
+import tyro
+from tyro.conf import DisallowNone
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from csac.synonyms import called_here
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Command = TypeVar("Command")
+
+
+class HelpShown(Exception):
+    """A command's help was asked for, and is printed."""
+
+
+def parse(
+    command: type[Command], words: list[str], program: str, elsewhere: Callable[[str], str] = lambda option: ""
+) -> Command:
+    """Return the parsed words; print the help and raise HelpShown where it is asked for.
+
+    `elsewhere(option)` says where an option belongs that this command does not have, or nothing.
+
+    Raises:
+        InputError: tyro's complaint in one line.
+    """
+    rules: Any = {"prog": program, "args": words, "registry": _numbers(), "config": (DisallowNone,)}
+    if {"-h", "--help"} & {*words}:
+        with suppress(BrokenPipeError, SystemExit):
+            tyro.cli(command, **rules)
+        raise HelpShown
+    complaint = io.StringIO()
+    try:
+        # A wide terminal, so that tyro does not break the words that it quotes.
+        with patch.dict(os.environ, COLUMNS="10000"), redirect_stderr(complaint), redirect_stdout(io.StringIO()):
+            return tyro.cli(command, **rules)
+    except SystemExit:
+        raise InputError(f"{_one_line(complaint.getvalue(), command, elsewhere)} ({program} --help)") from None
+
+
+def value_of(words: list[str], option: str, default: Any = None) -> Any:
+    """Return the value of an option that decides which other options there are."""
+    value = default
+    for word, following in zip_longest(words, words[1:]):
+        if word == option and following is not None:
+            value = following
+        elif word.startswith(f"{option}="):
+            value = word.partition("=")[2]
+    return value
+
+
+def json_object(text: str) -> dict[str, Any]:
+    """Return the object in a text. Raises ValueError."""
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise ValueError(f"it takes a JSON object such as '{{\"name\": 1.5}}', not {text}")
+    return value
+
+
+JSON = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="JSON",
+    instance_from_str=lambda words: json_object(words[0]),
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=lambda value: [json.dumps(value)],
+)
+
+
+def _numbers() -> ConstructorRegistry:
+    """Return how numbers are read: 1_000_000 and 1e6 are whole numbers too."""
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        if info.type not in (int, float):
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="N" if info.type is int else "X",
+            instance_from_str=lambda words: _whole(words[0]) if info.type is int else float(words[0]),
+            is_instance=lambda value: isinstance(value, int | info.type),
+            str_from_instance=lambda value: [f"{value:_}" if info.type is int else str(value)],
+        )
+
+    return registry
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        if not float(text).is_integer():
+            raise
+        return int(float(text))
+
+
+def options_of(kind: type[Any]) -> set[str]:
+    """Return the options that tyro makes of a dataclass; those of a dataclass within have no prefix."""
+    options = set()
+    for item in dataclasses.fields(kind):
+        within = dataclasses.is_dataclass(item.default)
+        options |= options_of(type(item.default)) if within else {f"--{item.name.replace('_', '-')}"}
+    return options
+
+
+def _one_line(complaint: str, command: type[Any], elsewhere: Callable[[str], str]) -> str:
+    """Return what tyro complains of. It writes a title, what is wrong and what was perhaps meant, rules between."""
+    _, what, more, *_ = [*re.split(r"^ *-{5,} *$", complaint, flags=re.MULTILINE), "", ""]
+    what = " ".join(what.split())
+    unknown = re.match(r"Unrecognized options: (.+?)(, |$)", what)
+    if not unknown:
+        return re.sub(r"^Missing from [^:]*: (\S+).*", r"\1 is missing", re.sub(r"^Error parsing [A-Z]\w*: ", "", what))
+    option = unknown[1].partition("=")[0].replace("_", "-") if unknown[1].startswith("-") else unknown[1]
+    meant = re.findall(r"^ *(--[a-z-]+)", more, re.MULTILINE)[:2]
+    hint = elsewhere(option) or called_here(option, options_of(command))
+    hint = hint or (f"did you mean {' or '.join(meant)}?" if meant else "")
+    return f"there is no {option} here" + (f": {hint}" if hint else "")
