@@ -127,6 +127,6 @@ def _one_line(complaint: str, command: type[Any], elsewhere: Callable[[str], str
         return re.sub(r"^Missing from [^:]*: (\S+).*", r"\1 is missing", re.sub(r"^Error parsing [A-Z]\w*: ", "", what))
     option = unknown[1].partition("=")[0].replace("_", "-") if unknown[1].startswith("-") else unknown[1]
     meant = re.findall(r"^ *(--[a-z-]+)", more, re.MULTILINE)[:2]
-    hint = elsewhere(option) or called_here(option, options_of(command))
+    hint = called_here(option, options_of(command)) or elsewhere(option)
     hint = hint or (f"did you mean {' or '.join(meant)}?" if meant else "")
     return f"there is no {option} here" + (f": {hint}" if hint else "")

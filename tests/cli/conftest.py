@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from typed import NOTHING, SUPPORT, csac
+from shown import make_set
+from typed import SUPPORT, calls_of, csac
 
 import csac.training.train as training
-from csac.record.run import RunDirectory
 
 
 @pytest.fixture(autouse=True)
@@ -21,13 +20,7 @@ def _here(tmp_path, monkeypatch):
 @pytest.fixture
 def train_call(monkeypatch):
     """What `csac train` calls `train` with, instead of training."""
-    calls = []
-
-    def train(algorithm, task, **options):
-        calls.append({"algorithm": algorithm, "task": task, **options})
-        return RunDirectory(Path("run"), replace(NOTHING, state="finished"))
-
-    monkeypatch.setattr(training, "train", train)
+    calls = calls_of(monkeypatch, training, "train", make_set(Path("nothing"), [[1.0]]))
 
     def call(line):
         assert csac(f"train {line}") == 0

@@ -1,11 +1,12 @@
-"""What a console has shown, and a run to show."""
+"""What a console has shown, and runs to show."""
 
 import io
 
+from manifests import manifest
 from rich.console import Console
 
-from csac.record.manifest import Manifest, State
 from csac.record.run import RunDirectory
+from csac.record.sets import RunSet
 
 
 class Clock:
@@ -24,34 +25,17 @@ def text_of(renderable):
     return [" ".join(line.split()) for line in file.getvalue().splitlines() if line.strip(" ─")]
 
 
-def shown_on(console):
-    return console.file.getvalue()
-
-
 def lines(console):
-    return shown_on(console).splitlines()
+    return console.file.getvalue().splitlines()
 
 
-def make_run(path, returns, failures=(), state: State = "finished"):
-    """A run whose evaluations at 10, 20, ... have one episode each, with `returns` [seed][point], and two episodes."""
-    steps_done = 10 * max(len(line) for line in returns)
-    run = RunDirectory.create(
-        path,
-        Manifest(
-            task="Hopper-v4",
-            algorithm="csac",
-            seeds=tuple(range(len(returns))),
-            steps=1000,
-            steps_done=steps_done,
-            state=state,
-            failures=dict.fromkeys(failures, "step 20: reward is nan"),
-        ),
-    )
-    rows = [
-        {"seed": seed, "step": 10 * (point + 1), "episode": 0, "return": value, "length": 7, "success": None}
-        for seed, line in enumerate(returns)
-        for point, value in enumerate(line)
-    ]
-    run.append("evaluations", rows)
-    run.append("episodes", [{"seed": 0, "step": step, "return": 1.0, "length": 5} for step in (5, 10)])
-    return run
+def make_set(path, returns, failures=(), **values):
+    """Runs whose evaluations at 10, 20, ... have one episode each, with `returns` [seed][point], and two episodes."""
+    for seed, line in enumerate(returns):
+        failed = {"state": "failed", "failure": "step 20: reward is nan"} if seed in failures else {}
+        given = {"algorithm": "csac", "steps": 1000, "steps_done": 10 * len(line), **values, **failed}
+        run = RunDirectory.create(path / f"seed-{seed}", manifest(seed=seed, **given))
+        points = [{"seed": seed, "step": 10 * (point + 1), "return": value} for point, value in enumerate(line)]
+        run.append("evaluations", [{**point, "episode": 0, "length": 7, "success": None} for point in points])
+        run.append("episodes", [{"seed": seed, "step": step, "return": 1.0, "length": 5} for step in (5, 10)])
+    return RunSet.open(path)

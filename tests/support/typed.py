@@ -8,15 +8,13 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+from shown import make_set
 
 from csac.cli import main
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.record.manifest import Manifest
-from csac.record.run import RunDirectory
 from csac.types import Layer, PolicyNetwork, PolicyParameters
 
-NOTHING = Manifest(task="t", algorithm="csac", seeds=(0,), steps=1)
 SUPPORT = Path(__file__).parent
 COMMANDS = ("train", "resume", "evaluate", "play", "export", "latency", "runs", "report", "study", "tune")
 TINY = "--batch-size 8 --actor-hidden-sizes 8 --critic-hidden-sizes 8"
@@ -60,6 +58,7 @@ def calls_of(monkeypatch, module, name, result=()):
 
     def called(*given, **named):
         arguments = signature.bind(*given, **named).arguments
+        arguments |= arguments.pop("options", {})
         calls.append({name: value for name, value in arguments.items() if name not in ("reporter", "on_progress")})
         return result
 
@@ -67,33 +66,25 @@ def calls_of(monkeypatch, module, name, result=()):
     return calls
 
 
-def make_run(path, task, observation_size, low, high, seeds=(0, 1)):
-    """A finished run with a random linear policy for each seed."""
-    path = Path(path)
-    run = RunDirectory.create(
-        path, Manifest(task=task, algorithm="csac", seeds=tuple(seeds), steps=100, steps_done=100)
-    )
+def make_runs(path, task="Pictures-v0", size=3, low=(-2.0,), high=(2.0,), **values):
+    """Two finished runs, each with a random linear policy; the second has the better return."""
+    runs = make_set(Path(path), [[0.0], [1.0]], task=task, steps_done=100, **{"steps": 100, **values})
     contract = Contract(
         task=task,
         algorithm="csac",
         activation="relu",
         head="tanh_gaussian",
-        observation_parts=((None, (observation_size,)),),
+        observation_parts=((None, (size,)),),
         action_shape=(len(low),),
         action_low=np.array(low, np.float32),
         action_high=np.array(high, np.float32),
     )
-    (path / "policy").mkdir()
-    contract.save(path / "policy" / "contract.json")
     generator = np.random.default_rng(0)
-    for seed in seeds:
-        weight = generator.normal(size=(observation_size, 2 * len(low))).astype(np.float32)
+    for run in runs.runs:
+        weight = generator.normal(size=(size, 2 * len(low))).astype(np.float32)
         network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * len(low), np.float32)),),)))
-        Policy(network, contract).save_layers(path / "policy" / f"seed_{seed}.safetensors")
-        rows = {"seed": seed, "step": 100, "episode": 0, "return": float(seed), "length": 5, "success": None}
-        run.append("evaluations", [rows])
-    run.update_manifest(state="finished")
-    return run
+        Policy(network, contract, step=100).save_in(run.policies, ("last", "best"))
+    return runs
 
 
 def words(text):
