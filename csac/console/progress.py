@@ -21,6 +21,7 @@ from csac.tasks.registry import can_be_drawn
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
 
     from rich.console import Console, RenderableType
 
@@ -223,11 +224,7 @@ def _next_lines(runs: RunSet, has_curve: bool) -> list[tuple[str, str]]:
     """Return where to look and what to type next, each with its label."""
     directory, config = shlex.quote(str(runs.path)), runs.config
     logs = [run.path / "log.txt" for run in runs.runs if run.seed in runs.failures]
-    lines = [
-        ("why", f"the traceback is in {log}")
-        for log in logs
-        if "\nTraceback (most recent" in log.read_text("utf-8", "replace")
-    ]
+    lines = [("why", f"the traceback is in {log}") for log in logs if _has_traceback(log)]
     lines += [("curve", str(runs.curve))] if has_curve else []
     if not any(run.policy_file().exists() for run in runs.runs if run.seed not in runs.failures):
         return lines
@@ -239,6 +236,11 @@ def _next_lines(runs: RunSet, has_curve: bool) -> list[tuple[str, str]]:
         film = shlex.quote(str(runs.path / "play.mp4"))
         lines.append(("watch it", f"{program()} play {directory} --video {film}"))
     return lines
+
+
+def _has_traceback(log: Path) -> bool:
+    """Whether a log says more of a failure than its line: where a number is not finite, nothing was raised."""
+    return log.exists() and "\nTraceback (most recent" in log.read_text("utf-8", "replace")
 
 
 def _outcome(runs: RunSet, time_taken: str) -> str:
