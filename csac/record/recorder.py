@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.record.run import TABLES
-from csac.record.statistics import best_returns
+from csac.record.statistics import best_returns, is_case
 from csac.record.wandb import WandbLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from csac.record.run import RunDirectory, Table
+
+_NUMBERS = ("seed", "step", "episode", "return", "length")  # of evaluations, which are no events
 
 
 class Recorder:
@@ -40,7 +42,8 @@ class Recorder:
 
             episodes = run.rows("episodes")
             before = [dict(zip(episodes.dtype.names or (), row, strict=True)) for row in episodes.tolist()[-100:]]
-            self._log = TensorBoardLog(run.tensorboard, begin, before)
+            cases = [name for name in known.dtype.names or () if name not in _NUMBERS and is_case(known[name])]
+            self._log = TensorBoardLog(run.tensorboard, begin, before, cases)
         if wandb:
             self._wandb = self._guarded(lambda: WandbLog(run, wandb))
 

@@ -16,7 +16,7 @@ from csac.record.statistics import is_case, mean_over_episodes
 from csac.record.tables import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from csac.record.run import Table
@@ -30,21 +30,23 @@ FLUSH_SECONDS = 30
 class TensorBoardLog:
     """Writes the curves of a run that goes on from step `begin`, after the training episodes `before`.
 
+    `cases` are the events that evaluations have told of: where one happens or does not, silence is a no.
+
     `rollout/*` are means over the last 100 training episodes, `eval/*` over the episodes of one evaluation, `train/*`
     the metrics, `time/fps` environment steps per second since the log was opened. Not tensorboardX's own writer: its
     thread dies of a full disk, and whoever adds to its queue then waits for ever.
     """
 
-    def __init__(self, folder: Path, begin: int = 0, before: Sequence[Row] = ()) -> None:
+    def __init__(self, folder: Path, begin: int = 0, before: Sequence[Row] = (), cases: Iterable[str] = ()) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        has_earlier = any(folder.glob("events.*"))
-        self._writer: EventsWriter | None = EventsWriter(str(folder / "events"))
+        earlier = len([*folder.glob("events.*")])  # which a file of the same second would overwrite
+        self._writer: EventsWriter | None = EventsWriter(str(folder / "events"), f".{earlier}")
         self._begin, self._began = begin, time.monotonic()
         self._flushed = self._began
         recent = [(row["return"], row["length"]) for row in before]
         self._recent: deque[tuple[float, int]] = deque(recent, maxlen=EPISODES_AVERAGED)
-        self._cases: set[str] = set()  # events that happen or do not: where nobody speaks of one, it did not
-        if begin or has_earlier:  # TensorBoard drops what was written after the step that the run goes on from
+        self._cases = set(cases)
+        if begin or earlier:  # TensorBoard drops what was written after the step that the run goes on from
             self._add(Event(step=begin + 1, session_log=SessionLog(status=SessionLog.START)))
 
     def write(self, table: Table, rows: Sequence[Row]) -> dict[int, dict[str, float]]:

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
     from csac.record.run import RunDirectory
 
-DEFAULT_PROJECT = "csac"
 _SETTINGS = {"silent": True, "console": "off", "init_timeout": 30.0, "finish_timeout": 30.0}
 
 
@@ -33,27 +32,29 @@ class WandbLog:
     """Logs to the W&B run of a run, in files beside it (`wandb sync` sends them) where there is no key."""
 
     def __init__(self, run: RunDirectory, project: bool | str) -> None:
-        wandb = import_wandb()
-        config, key = run.config, f"{run.path} {run.manifest.created}"
-        name = project if isinstance(project, str) else os.environ.get("WANDB_PROJECT") or DEFAULT_PROJECT
-        online = os.environ.get("WANDB_MODE", "online") == "online" and bool(wandb.api.api_key)
+        wandb, mode = import_wandb(), os.environ.get("WANDB_MODE", "online")
+        mode = "offline" if mode == "online" and not wandb.api.api_key else mode
+        known = run.path / "wandb" / "project.txt"  # for a run that goes on
+        before = known.read_text() if known.exists() else os.environ.get("WANDB_PROJECT", "csac")
         self._run = wandb.init(
-            project=name,
+            project=project if isinstance(project, str) else before,
             group="/".join(run.path.parts[-3:-1]),
             name=f"{run.path.parent.name} {run.path.name}",
-            id=hashlib.sha256(key.encode()).hexdigest()[:16],
-            resume="allow" if online else None,
-            mode=None if online else os.environ.get("WANDB_MODE", "offline").replace("online", "offline"),
-            config=dataclasses.asdict(config),
+            id=hashlib.sha256(f"{run.path} {run.manifest.created}".encode()).hexdigest()[:16],
+            resume="allow" if mode == "online" else None,
+            mode=mode,
+            config=dataclasses.asdict(run.config),
             dir=str(run.path),
             reinit="create_new",
             settings=wandb.Settings(**_SETTINGS),
         )
+        known.write_text(self._run.project)
+        self._run.define_metric("*", step_metric="global_step")  # W&B's own would refuse an evaluation that ends late
 
     def write(self, points: Mapping[int, Mapping[str, float]]) -> None:
         """Log the values of each step."""
         for step, values in points.items():
-            self._run.log({**values, "global_step": step}, step=step)
+            self._run.log({**values, "global_step": step})
 
     def close(self) -> None:
         """Finish the W&B run."""
