@@ -4,11 +4,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from manifests import manifest
 from policies import contract, random_policy
 
 import csac
 from csac.algorithms import ALGORITHMS
-from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 
 DRAWN = """
@@ -41,14 +41,9 @@ gymnasium.register("Drawn-v0", entry_point=Drawn)
 def tiny_run(tmp_path):
     """A folder with a finished run, a policy that has learnt nothing, and its task, which can be drawn."""
     (tmp_path / "drawn.py").write_text(DRAWN)
-    manifest = Manifest(task="drawn:Drawn-v0", algorithm="sac", seeds=(0,), steps=9, state="finished", steps_done=9)
-    run = RunDirectory.create(tmp_path / "run", manifest)
-    rows = {"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 5, "success": None}
-    run.append("evaluations", [rows])
-    agreement = contract()
-    (run.path / "policy").mkdir()
-    agreement.save(run.path / "policy" / "contract.json")
-    random_policy(agreement).save_layers(run.path / "policy" / "seed_0.safetensors")
+    run = RunDirectory.create(tmp_path / "run", manifest(task="drawn:Drawn-v0", steps=9))
+    run.append("evaluations", [{"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 5, "success": None}])
+    random_policy(contract()).save_in(run.policies, ("last",))
     return tmp_path
 
 
@@ -82,7 +77,6 @@ def test_the_light_names_stay_light():
         ["evaluate", "run", "--trust-task", "--episodes", "40", "--processes", "2", "--csv", "episodes.csv"],
         ["evaluate", "run", "--trust-task", "--stochastic", "--perturb", "action_noise=0.1"],
         ["play", "run", "--trust-task", "--video", "film.mp4"],
-        ["report", "run", "--curve", "curve.png"],
     ],
     ids=" ".join,
 )
@@ -114,7 +108,7 @@ def test_the_help_of_train_imports_no_task_and_no_picture():
 
 
 def test_what_only_the_end_of_a_run_needs_is_not_imported_at_its_start():
-    code = "import csac.training.train, csac.console.progress, csac.training.scheduler"
+    code = "import csac.training.train, csac.console.progress, csac.training.supervisor"
 
     assert not {"matplotlib", "scipy", "tensorboardX", "imageio_ffmpeg"} & modules_after(code)
 

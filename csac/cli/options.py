@@ -257,7 +257,6 @@ def learner_of(options: Any) -> Any:
 def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
     """Return `Train` or `Tune` with the hyperparameters of the chosen algorithm beside its own options."""
     from csac.algorithms import ALGORITHMS
-    from csac.training.config import algorithm_of
 
     source, preset = _source(words), value_of(words, "--preset")
     name = value_of(words, "--algorithm", source.config.algorithm if source else "csac")
@@ -272,6 +271,8 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
         defaults |= {"seeds": len(source.seeds), "first_seed": source.seeds[0]}
         defaults["environment_arguments"] = source.config.environment_arguments
         if source.config.algorithm == name and not preset:
+            from csac.training.config import algorithm_of  # Gymnasium comes with it
+
             learner = algorithm_of(source.config)
     hint = arg(help_behavior_hint=f"(default: {preset or 'none'})")
     hints: dict[str, Any] = get_type_hints(base, include_extras=True)
