@@ -54,7 +54,7 @@ def _train(options: Any, command: str) -> int:
 def _resume(options: Resume, command: str) -> int:
     from csac.training.train import resume
 
-    return _trained(resume, options.runs, steps=options.steps, trust_task=options.trust_task, command=command)
+    return _trained(resume, **vars(options), command=command)
 
 
 def _leaving_at_once() -> Any:
@@ -82,50 +82,37 @@ def _trained(training: Callable[..., RunSet], *given: Any, **options: Any) -> in
 def _evaluate(options: Evaluate, _: str) -> int:
     from csac.console import tables
     from csac.console.waiting import progress_shown
-    from csac.deploy.choosing import step_of_policy
+    from csac.deploy.choosing import load
     from csac.evaluation.play import evaluate_run, perturbation_notes
     from csac.record.sets import RunSet
     from csac.record.tables import COLUMNS, check_new, write_rows
 
-    console, notes = tables.make_console(), perturbation_notes(options.runs, options.perturb)
-    if options.csv:
-        check_new(options.csv)
+    given, console = dict(vars(options)), tables.make_console()
+    file, deterministic = given.pop("csv"), not given.pop("stochastic")
+    notes = perturbation_notes(options.directory, options.perturbations)
+    if file:
+        check_new(file)
     with progress_shown(console, "evaluating", "episodes") as on_progress:
-        results = dict(
-            evaluate_run(
-                options.runs,
-                options.seed,
-                options.episodes,
-                not options.stochastic,
-                options.perturb,
-                options.processes,
-                on_progress,
-                options.trust_task,
-                options.checkpoint,
-            )
-        )
-    runs = RunSet.open(options.runs)
-    sound = {seed: episodes for seed, episodes in results.items() if seed not in runs.failures}
+        results = dict(evaluate_run(**given, deterministic=deterministic, on_progress=on_progress))
     tables.print_lines(console, notes)
+    runs = RunSet.open(options.directory)
     for table in tables.evaluation_tables(results, runs.failures):
         console.print(table)
-    failed = [f"seed {seed} failed at {runs.failures[seed]}" for seed in results.keys() & runs.failures.keys()]
-    silent = tables.silent_events(results)
-    untested = [] if options.seed is not None else [str(seed) for seed in runs.seeds if seed not in results]
-    tables.print_lines(
-        console,
-        [f"note: {text}; it is in no mean, and in no file of rows" for text in failed]
-        + [f"note: no episode's last info holds a number called {name!r}" for name in silent]
-        + [f"note: without such a policy yet: seed {', '.join(untested)}"] * bool(untested)
-        + _unlearnt(runs),
-    )
-    if options.csv:
-        steps = {seed: step_of_policy(runs.run(seed), options.checkpoint) for seed in sound}
-        rows = [episode.row(seed, steps[seed]) for seed, episodes in sound.items() for episode in episodes]
+    failed = {seed: reason for seed, reason in runs.failures.items() if seed in results}
+    notes = [f"seed {seed} failed at {reason}; it is in no mean, and in no file" for seed, reason in failed.items()]
+    notes += [f"no episode's last info holds a number called {name!r}" for name in tables.silent_events(results)]
+    untested = [str(seed) for seed in runs.seeds if seed not in results and options.seed is None]
+    notes += [f"without such a policy yet: seed {', '.join(untested)}"] * bool(untested)
+    tables.print_lines(console, [f"note: {text}" for text in notes + _unlearnt(runs)])
+    if file:
+        rows = []
+        for run in (run for run in runs.runs if run.seed in results and run.seed not in failed):
+            step = load(run.path, which=options.which).step or run.manifest.steps_done
+            rows += [episode.row(run.seed, step) for episode in results[run.seed]]
         if not rows:
-            return complain(f"{options.csv} is not written: every seed that was tested had failed in training", 1)
-        write_rows(options.csv, COLUMNS["evaluations"], rows)
-        tables.print_lines(console, [str(options.csv)])
+            return complain(f"{file} is not written: every seed that was tested had failed in training", 1)
+        write_rows(file, COLUMNS["evaluations"], rows)
+        tables.print_lines(console, [str(file)])
     return 0
 
 
@@ -136,18 +123,9 @@ def _play(options: Play, _: str) -> int:
     from csac.record.rendering import number
 
     console = make_console()
-    print_lines(console, perturbation_notes(options.runs, options.perturb))
+    print_lines(console, perturbation_notes(options.directory, options.perturbations))
     with progress_shown(console, "playing", "steps at most") as on_progress:
-        for episode in play(
-            options.runs,
-            options.seed,
-            options.episodes,
-            options.video,
-            options.perturb,
-            on_progress,
-            options.trust_task,
-            options.checkpoint,
-        ):
+        for episode in play(**vars(options), on_progress=on_progress):
             told = f"return {number(episode.episode_return)} in {episode.length:,} steps"
             print_lines(console, [f"episode {episode.episode}: {told}"])
     print_lines(console, [str(options.video)] * bool(options.video))
@@ -162,20 +140,10 @@ def _export(options: Export, _: str) -> int:
 
     console = make_console()
     with console.status("exporting") if console.is_interactive else nullcontext():
-        exported = export_run(
-            options.runs,
-            options.format,
-            options.seed,
-            options.checkpoint,
-            options.out,
-            options.fallback,
-            options.rate_limit,
-            options.episodes,
-            options.card,
-            trust_task=options.trust_task,
-        )
+        exported = export_run(**vars(options))
     print_lines(console, [str(exported.place), *export_lines(exported.fields["verification"])])
-    print_lines(console, [f"note: {text}" for text in exported.notes] + _unlearnt(RunSet.open(options.runs)))
+    notes = exported.notes + _unlearnt(RunSet.open(options.directory))
+    print_lines(console, [f"note: {text}" for text in notes])
     return 0
 
 
@@ -185,7 +153,7 @@ def _unlearnt(runs: RunSet) -> list[str]:
     warmup = manifest.config.hyperparameters.get("warmup_steps", 0)
     if manifest.steps_done >= warmup or manifest.forked_from:
         return []
-    return [f"note: this policy has never learnt: {manifest.steps_done:,} of {warmup:,} warm-up steps are done"]
+    return [f"this policy has never learnt: {manifest.steps_done:,} of {warmup:,} warm-up steps are done"]
 
 
 def _latency(options: Latency, _: str) -> int:

@@ -1,4 +1,7 @@
-"""What may be typed after each sub-command: dataclasses, of which tyro makes the options and their help."""
+"""What may be typed after each sub-command: dataclasses, of which tyro makes the options and their help.
+
+Fields are called as the arguments of the functions that they are for.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +24,16 @@ if TYPE_CHECKING:
 
 Flag = FlagCreatePairsOff[bool]
 Runs = Annotated[Positional[Path], arg(metavar="DIR", help="A set of runs, or one run of it.")]
-Checkpoint = Annotated[Literal["last", "best"], arg(help="Each seed's last policy, or the one of its best evaluation.")]
+Which = Annotated[
+    Literal["last", "best"], arg(name="checkpoint", help="Each seed's last policy, or that of its best evaluation.")
+]
 Constant = Annotated[
     UseAppendAction[tuple[str, ...]],
-    arg(metavar="KIND=VALUE", help="Change the task, for example friction=2; the kinds are those of csac train."),
+    arg(
+        name="perturb",
+        metavar="KIND=VALUE",
+        help="Change the task, for example friction=2; the kinds are those of csac train.",
+    ),
 ]
 Trust = Annotated[
     Flag,
@@ -97,14 +106,12 @@ class Train(_Training):
 
     def options(self) -> dict[str, Any]:
         """Return what `train` takes as keyword arguments."""
-        own = ("seeds", "first_seed", "directory", "resume", "start_from", "seeds_per_process", "evaluation_processes")
-        names = {item.name for item in dataclasses.fields(RunConfig)} | {*own, "wandb"}
-        names -= {"task", "algorithm", "hyperparameters", "seed", "task_is_callable"}
         if "none" in self.perturbations and len(self.perturbations) > 1:
             raise InputError("--perturb none leaves everything out: give it alone")
-        perturbations = () if "none" in self.perturbations else self.perturbations or None  # None: as planned there
-        options = {name: getattr(self, name) for name in names}
-        return {**options, "perturbations": perturbations, "events": self.events or None}
+        planned = () if "none" in self.perturbations else self.perturbations or None  # None: as the source has it
+        others = ("task", "algorithm", self.algorithm, "preset", "hyperparameters", "seed", "task_is_callable")
+        given = {name: value for name, value in vars(self).items() if name not in others}
+        return {**given, "perturbations": planned, "events": self.events or None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +151,7 @@ class Tune(_Training):
 class Resume:
     """Resume runs from their newest checkpoints, as if they had never stopped."""
 
-    runs: Runs
+    directory: Runs
     steps: Annotated[int | None, arg(help_behavior_hint="(default: as the runs were started)")] = None
     """Total environment steps per seed, counted from the beginning; more than before extends the runs."""
     trust_task: Trust = False
@@ -154,17 +161,17 @@ class Resume:
 class Evaluate:
     """Test the policies of runs on fresh episodes that neither training nor its evaluations have used."""
 
-    runs: Runs
+    directory: Runs
     seed: Annotated[int | None, arg(help_behavior_hint="(default: every seed)")] = None
     """The seed to test."""
-    checkpoint: Checkpoint = "last"
+    which: Which = "last"
     episodes: int = 10
     """Episodes per seed, the same for each."""
     processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
     """Processes that share the episodes; the results do not depend on it."""
     stochastic: Flag = False
     """Sample actions from the policy instead of taking the deterministic one."""
-    perturb: Constant = ()
+    perturbations: Constant = ()
     csv: Annotated[Path | None, arg(metavar="FILE.csv", help_behavior_hint="(default: none)")] = None
     """Also write one row per episode to this file, as in evaluations.csv."""
     trust_task: Trust = False
@@ -174,15 +181,15 @@ class Evaluate:
 class Play:
     """Watch a policy in a window, or record a video of it."""
 
-    runs: Runs
+    directory: Runs
     seed: Annotated[int | None, arg(help_behavior_hint="(default: the one with the best last evaluations)")] = None
     """The seed to watch."""
-    checkpoint: Checkpoint = "last"
+    which: Which = "last"
     episodes: int = 1
     """Number of episodes."""
     video: Annotated[Path | None, arg(metavar="OUT.mp4", help_behavior_hint="(default: a window)")] = None
     """Record to this file instead of opening a window; no display is needed."""
-    perturb: Constant = ()
+    perturbations: Constant = ()
     trust_task: Trust = False
 
 
@@ -193,13 +200,15 @@ class Export:
     The artefact is a folder with the policy and contract.json, which describes its inputs and outputs.
     """
 
-    runs: Runs
+    directory: Runs
     seed: Annotated[int | None, arg(help_behavior_hint="(default: the one with the best last evaluations)")] = None
     """The seed whose policy leaves."""
-    checkpoint: Checkpoint = "last"
+    which: Which = "last"
     format: Literal["numpy", "onnx", "c"] = "numpy"
     """numpy: needs only NumPy, with a loader beside it. onnx: a graph. c: one C99 header."""
-    out: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="(default: DIR/export/FORMAT)")] = None
+    place: Annotated[
+        Path | None, arg(name="out", metavar="PATH", help_behavior_hint="(default: DIR/export/FORMAT)")
+    ] = None
     """The artefact's folder."""
     fallback: Annotated[str | None, arg(metavar="zero|middle|last|X,...", help_behavior_hint="(default: no guard)")] = (
         None

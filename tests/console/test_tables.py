@@ -46,7 +46,8 @@ def test_failed_seeds_are_shown_and_in_no_mean(tmp_path):
 def test_evaluations_are_summed_up_by_seed():
     told = {0: [(1.0, 10, 1.0), (3.0, 20, None)], 5: [(6.0, 10, 1.0), (6.0, 10, 1.0)], 6: [(9.0, 5, 0.0)] * 2}
     episodes = {
-        s: [EvaluationEpisode(n, *e, {"fell": None}) for n, e in enumerate(several)] for s, several in told.items()
+        s: [EvaluationEpisode(n, e[0], e[1], e[2], {"fell": None}) for n, e in enumerate(several)]
+        for s, several in told.items()
     }
     table, cases = map(text_of, evaluation_tables(episodes, {6: "step 5: a reward is NaN"}))
     assert table == [
