@@ -161,12 +161,13 @@ def _latency(options: Latency, _: str) -> int:
         raise InputError("give the folder of an artefact (csac export writes one)")
     from csac.console.exports import latency_table
     from csac.console.tables import make_console, print_lines
+    from csac.deploy.artefact import open_artefact
     from csac.deploy.latency import measure
 
     console, measured = make_console(), {}
-    for path in options.artefacts:
-        print_lines(console, [f"measuring {path}"])  # once: what moves on a terminal takes time from a core
-        measured[str(path)] = measure(path, options.calls, options.rate, options.seconds)
+    for name, artefact in {str(path): open_artefact(path, optimise=True) for path in options.artefacts}.items():
+        print_lines(console, [f"measuring {name}"])  # once: what moves on a terminal takes time from a core
+        measured[name] = measure(artefact, options.calls, options.rate, options.seconds)
     console.print(latency_table(measured))
     return 0
 

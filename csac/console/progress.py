@@ -69,9 +69,6 @@ class Reporter:
         self._began = self._spoke = self._clock()
         title = Text.assemble((f"{config.algorithm} on {config.task}", "bold"))
         self._print(title.append(f", {_labels(runs.seeds)}, {config.steps:,} steps each"))
-        begun = {seed: one.begin for seed, one in self._seeds.items() if one.begin}
-        if begun:
-            notes = [f"resuming {_together('at step', begun, len(self._seeds))}", *notes]
         for line in (str(runs.path), *notes):
             self._print(Text(line, "dim"))
         if self.console.is_interactive:
@@ -256,13 +253,6 @@ def _labels(seeds: Sequence[int]) -> str:
     if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
         return f"seeds {seeds[0]} to {seeds[-1]}"
     return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
-
-
-def _together(word: str, steps: Mapping[int, int], seeds: int) -> str:
-    """Return where seeds are, in one number where all are at one step."""
-    if len(steps) == seeds and len({*steps.values()}) == 1:
-        return f"{word} {next(iter(steps.values())):,}"
-    return ", ".join(f"seed {seed} {word} {step:,}" for seed, step in steps.items())
 
 
 def _spread(returns: Mapping[int, float]) -> str:

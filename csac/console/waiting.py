@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from csac.console.tables import duration
@@ -48,8 +48,8 @@ class Speed:
 @contextmanager
 def progress_shown(
     console: Console, doing: str, unit: str, clock: Callable[[], float] = time.monotonic
-) -> Iterator[Callable[[int, int | None], None]]:
-    """Show that something is being done; yield what is to be called with how much is done, and of how much if known.
+) -> Iterator[Callable[[int, int], None]]:
+    """Show that something is being done; yield what is to be called with how much is done, and of how much.
 
     On a terminal it is one line that changes, with the time that the rest will take; elsewhere a line now and then.
     """
@@ -57,30 +57,17 @@ def progress_shown(
     speed.add(0)
     status = console.status(doing) if console.is_interactive else None
 
-    def show(done: int, total: int | None = None) -> None:
+    def show(done: int, total: int) -> None:
         nonlocal spoke
         speed.add(done)
-        text = f"{doing}: {_amount(done, total)} {unit}{_pace(speed.per_second(), done, total, unit)}"
+        pace = speed.per_second()
+        left = f", {duration((total - done) / pace)} left" if pace and done < total else ""
+        text = f"{doing}: {done:,} of {total:,} {unit}{left}"
         if status:
             status.update(text)
         elif clock() - spoke >= SECONDS_OF_SILENCE:
             console.print(text, soft_wrap=True)
             spoke = clock()
 
-    if status is None:
+    with status or nullcontext():
         yield show
-        return
-    with status:
-        yield show
-
-
-def _amount(done: int, total: int | None) -> str:
-    return f"{done:,}" if total is None else f"{done:,} of {total:,}"
-
-
-def _pace(speed: float | None, done: int, total: int | None, unit: str) -> str:
-    if not speed:
-        return ""
-    if total is None:
-        return f", {speed:,.0f} {unit}/s"
-    return f", {duration((total - done) / speed)} left" if done < total else ""

@@ -33,14 +33,6 @@ def test_elsewhere_than_on_a_terminal_a_line_comes_now_and_then(plain, clock):
     ]
 
 
-def test_how_much_there_is_need_not_be_known(plain, clock):
-    with progress_shown(plain, "playing", "steps", clock) as show:
-        for done in range(0, 1201, 30):
-            show(done, None)
-            clock.now += 1
-    assert lines(plain) == ["playing: 900 steps, 30 steps/s"]
-
-
 def test_on_a_terminal_it_is_one_line_that_goes_away(terminal, clock):
     with progress_shown(terminal, "evaluating", "episodes", clock) as show:
         clock.now += 1
