@@ -21,7 +21,6 @@ VENV := .venv$(addprefix -,$(OTHER))
 
 SETUP := $(VENV)/.installed
 PEERS := .venv-peers/.installed
-PARL := .venv-parl/.installed
 CUDA := .venv/.cuda
 
 define require_python
@@ -63,9 +62,9 @@ docs: $(SETUP)  ## Make the site, with the reference from the docstrings: site/i
 	$(VENV)/bin/sphinx-build -q --fail-on-warning --keep-going --jobs auto -c docs/site -d site/.doctrees . site
 	@echo "The site is ready: site/index.html"
 
-peers: $(PEERS) $(PARL)  ## Install what to measure against: into .venv-peers, and PARL into .venv-parl
+peers: $(PEERS)  ## Install SB3 and SBX, to measure against, into .venv-peers
 
-bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS)) $(if $(PARL_PYTHON),,$(PARL))  ## Measure speed beside the peers: make bench ARGS=--quick
+bench: $(SETUP) $(if $(PEERS_PYTHON),,$(PEERS))  ## Measure speed beside the peers: make bench ARGS=--quick
 	.venv/bin/python -m benchmarks peers --write $(ARGS)
 
 limit: $(SETUP)  ## Measure how near training comes to the machine's limit: make limit ARGS='--repetitions 1'
@@ -104,14 +103,6 @@ $(PEERS): benchmarks/requirements-peers.txt
 	@test -x .venv-peers/bin/python || $(PYTHON) -m venv .venv-peers
 	@.venv-peers/bin/python -m pip install --quiet --requirement $<
 	@touch $@
-
-# PARL's own list of dependencies cannot be installed: benchmarks/requirements-parl.txt is complete, and says why.
-$(PARL): benchmarks/requirements-parl.txt
-	$(require_python)
-	@echo "Installing PARL into .venv-parl"
-	@test -x .venv-parl/bin/python || $(PYTHON) -m venv .venv-parl
-	@if .venv-parl/bin/python -m pip install --quiet --no-deps --requirement $<; then touch $@; \
-		else echo "PARL cannot be installed here; the benchmark leaves it out"; fi
 
 .tools/bin/uv:
 	$(require_python)

@@ -7,10 +7,10 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from benchmarks.parts import Options, Part, shown
-from benchmarks.suites import checkpoint, gpu, growth, latency, limit, peers
-from benchmarks.suites import time as times
-from csac.processes import usable_cores
+from benchmarks import checkpoint, gpu, growth, limit, peers, policy, start, stepping
+from benchmarks import set as seeds
+from benchmarks.measuring import usable_cores
+from benchmarks.part import Options, Part, shown
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -18,38 +18,39 @@ if TYPE_CHECKING:
 
 SUITES = {
     "peers": peers,
+    "set": seeds,
+    "start": start,
     "limit": limit,
     "growth": growth,
-    "time": times,
-    "checkpoint": checkpoint,
-    "latency": latency,
     "gpu": gpu,
+    "checkpoint": checkpoint,
+    "policy": policy,
+    "stepping": stepping,
 }
 PARTS: list[Part] = [part for suite in SUITES.values() for part in suite.PARTS]
 
 
 def named(name: str) -> list[Part]:
-    """Return the parts that a name stands for: those of a suite, or the one part of that name.
+    """Return the parts of a suite, or the one part of that name.
 
     Raises:
         InputError: there is none.
     """
     parts = SUITES[name].PARTS if name in SUITES else [part for part in PARTS if part.name == name]
     if not parts:
-        raise InputError(f"there is nothing called {name!r} to measure: choose among {', '.join(_names())}, render")
+        raise InputError(f"no benchmark is called {name!r}: choose among {', '.join(_names())}, render")
     return list(parts)
 
 
 def measure(part: Part, options: Options, write: bool) -> bool:
     """Measure one part, print its table and, if asked for, write it; return whether anything was measured."""
     began = time.monotonic()
-    is_written = write and not (options.quick or options.only)
-    rows = part.run(options, part.unfinished() if is_written else None)
+    rows = part.run(options)
     if not rows:
         return False
     notes = part.all_notes(rows, options)
     print(f"\n{shown(part.table(rows), notes)}\n{(time.monotonic() - began) / 60:.1f} minutes", flush=True)
-    if is_written:
+    if write and not (options.quick or options.only):
         part.write(rows, notes)
         part.publish()
     elif write:
@@ -60,7 +61,7 @@ def measure(part: Part, options: Options, write: bool) -> bool:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Read the command line and do what it says; return the exit code."""
     given = _parser().parse_args(arguments)
-    options = Options(given.only, given.repetitions, given.seconds, given.quick, given.device)
+    options = Options(given.only, given.repetitions, given.quick, given.device)
     try:
         if given.name == "render":
             for part in PARTS:
@@ -68,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         parts = named(given.name)
         if not sys.platform.startswith("linux") or len(usable_cores()) < 2:
-            raise InputError("the benchmarks need Linux and two processors: run them on such a machine")
+            raise InputError("the benchmarks need Linux and two cores")
         measured = [measure(part, options, given.write) for part in parts]
         if not any(measured):
             raise InputError(f"nothing in {given.name} can be measured here whose name contains {given.only!r}")
@@ -83,22 +84,19 @@ def _names() -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    width = max(map(len, _names()))
     lines = []
     for name, suite in SUITES.items():
-        lines.append(f"  {name:{width}}  {(suite.__doc__ or '').splitlines()[0]}")
-        lines += [f"  {part.name:{width}}    {part.about}" for part in suite.PARTS if len(suite.PARTS) > 1]
-    lines.append(f"  {'render':{width}}  Put all tables into their pages again, from the rows in benchmarks/results.")
+        lines.append(f"  {name:16}  {(suite.__doc__ or '').splitlines()[0]}")
+        lines += [f"  {part.name:16}    {part.about}" for part in suite.PARTS if len(suite.PARTS) > 1]
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
         description="Measure how fast csac is. NAME is one of:\n\n" + "\n".join(lines),
         epilog="Measure on a quiet machine: other programs cost more than most differences here.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("name", metavar="NAME")
+    parser.add_argument("name", metavar="NAME", help="or `render`: all tables again, from benchmarks/results")
     parser.add_argument("--only", default="", metavar="TEXT", help="measure only what has this in its name, and print")
-    parser.add_argument("--repetitions", type=int, help="of what is measured more than once, in turns")
-    parser.add_argument("--seconds", type=float, help="how long one measurement lasts, where it is a matter of time")
+    parser.add_argument("--repetitions", type=int, help="how often each case is measured, in turns")
     parser.add_argument("--quick", action="store_true", help="see that it runs; the numbers mean nothing")
     parser.add_argument("--device", choices=("gpu", "cpu"), default="gpu", help="of the suite gpu")
     parser.add_argument("--write", action="store_true", help="write the rows to benchmarks/results, and the pages")

@@ -1,174 +1,225 @@
-"""How everything here is measured: in whole processes that are bound to their processors before they start."""
+"""How everything here is measured: in processes of their own, which are bound to their cores before they start."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
-import re
-import resource
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import psutil
 
-from benchmarks.operations import DOMINANT, Product
-from csac.processes import usable_cores
+from benchmarks import stamps
+from benchmarks.products import DOMINANT, Product
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
 ROOT = Path(__file__).resolve().parents[1]
-TASK = "HalfCheetah-v4"
-REPORT_STEPS = 250  # csac tells its progress every so many steps
+TASK = stamps.BASE
+NEVER = 1_000_000  # steps of a training that is stopped long before; they size the replay
 ROLLOUT_STEPS = 2048  # of PPO, whose first update is at this step
 
 
-class Window(NamedTuple):
-    """When steps are counted. All steps are environment steps of one seed."""
-
-    warmup: int = REPORT_STEPS  # the first update is at this step
-    settled: int = 500  # the window begins at this one,
-    seconds: float = 5.0  # lasts at least so long
-    steps: int = 1  # and has at least so many
-    evaluation_interval: int = 0  # 0 for no evaluation
-    evaluation_episodes: int = 10
-
-
-class Process(NamedTuple):
-    """A process to start, and the processors that it may use."""
+class Launch(NamedTuple):
+    """A command, and the cores that it may use."""
 
     command: Sequence[str]
     cores: Sequence[int]
 
 
-def worker(module: str, **arguments: Any) -> list[str]:
-    """Return the command that calls `measure` of a module of `benchmarks.workers`."""
-    call = [sys.executable, "-m", "benchmarks.worker", module, json.dumps(arguments)]
-    return ["env", f"PYTHONPATH={ROOT}", *call]
+class Window(NamedTuple):
+    """When steps are counted. Steps are environment steps of one seed."""
+
+    seconds: float = 5.0  # it lasts at least so long
+    warmup: int = 250  # the first update is at this step
+    settled: int = 500  # it begins when every seed has made so many
+    every: int = 50  # steps between two looks at the clock
 
 
-def training(
-    algorithm: str,
-    window: Window,
-    seeds: int = 1,
-    interval: int = 1,
-    device: str = "cpu",
-    task: str = TASK,
-    preset: str = "paper",
-    groups: int | None = None,
-) -> list[str]:
-    """Return the command that trains until the window is over; `interval` updates are made in one dispatch.
-
-    The seeds are split over so many processes, `groups`; None for as many as csac chooses.
-    """
-    return worker(
-        "training",
-        algorithm=algorithm,
-        task=task,
-        preset=preset,
-        seeds=seeds,
-        groups=groups,
-        interval=interval,
-        device=device,
-        launched=time.monotonic(),
-        **window._asdict(),
-    )
+def usable_cores() -> list[int]:
+    """Return the cores that this process may use."""
+    return sorted(os.sched_getaffinity(0))
 
 
-def surroundings(device: str) -> dict[str, str]:
-    """Return the environment variables of a process that computes on this device, cpu or gpu."""
+def surroundings(device: str = "cpu", **variables: str) -> dict[str, str]:
+    """Return the environment variables of a process that computes on `cpu` or `gpu`."""
     hidden = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""} if device == "cpu" else {}
-    return {**os.environ, **hidden}
+    return {**os.environ, **hidden, "PYTHONPATH": str(ROOT), **variables}
 
 
-def run_one(command: Sequence[str], cores: int | None = None, device: str = "cpu") -> dict[str, Any]:
-    """Run one process, by default on all processors, and return what it prints."""
-    return run([Process(command, usable_cores()[:cores])], surroundings(device))[0]
+class ProcessFailure(RuntimeError):
+    """A measured process ended without an answer; the message is what it printed."""
 
 
-def run(processes: Sequence[Process], environment: Mapping[str, str], together: bool = False) -> list[dict[str, Any]]:
-    """Run processes side by side in a folder that is removed afterwards, and return the JSON that each prints.
+@contextmanager
+def started(launches: Sequence[Launch], environment: dict[str, str]) -> Iterator[tuple[Path, list[subprocess.Popen]]]:
+    """Start commands side by side in a temporary folder; at the end each is killed with all that it has started."""
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder, processes = Path(name), []
+        errors = stack.enter_context((folder / "errors").open("w"))
+        for number, (command, cores) in enumerate(launches):
+            output = stack.enter_context((folder / f"output-{number}").open("w"))
+            bound = ["taskset", "--cpu-list", ",".join(map(str, cores)), *command]  # first: XLA looks for cores once
+            options: dict[str, Any] = {"cwd": folder, "env": environment, "start_new_session": True}
+            processes.append(subprocess.Popen(bound, stdout=output, stderr=errors, **options))
+            stack.callback(_kill, processes[-1])
+        yield folder, processes
 
-    Args:
-        processes: what to run, and where.
-        environment: their environment variables.
-        together: they print `ready` and wait for each other before their windows begin.
+
+def _kill(process: subprocess.Popen) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def failure(folder: Path, process: subprocess.Popen) -> ProcessFailure:
+    """Return the error that says what a process of `started` has printed."""
+    return ProcessFailure(f"{process.args} failed\n{(folder / 'errors').read_text()[-3000:]}")
+
+
+# A function of this package, or a script that prints JSON.
+
+
+def answers(launches: Sequence[Launch], device: str = "cpu") -> list[dict[str, Any]]:
+    """Run commands side by side, and return the last line that each prints, which is JSON.
 
     Raises:
-        RuntimeError: one of them ended without an answer; it says what that one printed.
+        ProcessFailure: one of them failed.
     """
-    with ExitStack() as stack:
-        folder = stack.enter_context(tempfile.TemporaryDirectory())
-        errors = stack.enter_context(tempfile.TemporaryFile("w+"))
-        # What torch.compile made for another measurement is not found: every start is a cold one.
-        environment = {**environment, "TORCHINDUCTOR_CACHE_DIR": folder}
-        started = [stack.enter_context(_start(process, environment, folder, errors)) for process in processes]
-        try:
-            if together:
-                _begin_together(started, errors)
-            return [json.loads(_line(process, "{", errors)) for process in started]
-        except BaseException:
-            for process in started:
-                process.kill()
-            raise
+    with started(launches, surroundings(device)) as (folder, processes):
+        for process in processes:
+            if process.wait():
+                raise failure(folder, process)
+        outputs = (folder / f"output-{number}" for number in range(len(processes)))
+        return [json.loads(output.read_text().splitlines()[-1]) for output in outputs]
 
 
-def _start(process: Process, environment: Mapping[str, str], folder: str, errors: IO[str]) -> subprocess.Popen[str]:
-    # The cores come first, for XLA and others look only once which they have.
-    bound = ["taskset", "--cpu-list", ",".join(map(str, process.cores)), *process.command]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(bound, stdin=pipe, stdout=pipe, stderr=errors, text=True, cwd=folder, env=environment)
+def call(function: str, cores: int | None = None, device: str = "cpu", **arguments: Any) -> dict[str, Any]:
+    """Call a `module:function` of this package in a process of its own, by default on all cores."""
+    return answers([Launch(call_command(function, **arguments), usable_cores()[:cores])], device)[0]
 
 
-def _begin_together(processes: Sequence[subprocess.Popen[str]], errors: IO[str]) -> None:
-    """Let the windows of all processes begin at once, so that each has its neighbour for the whole of its own."""
-    for process in processes:
-        _line(process, "ready", errors)
-    for process in processes:
-        assert process.stdin
-        process.stdin.write("go\n")
-        process.stdin.flush()
+def call_command(function: str, **arguments: Any) -> list[str]:
+    """Return the command that calls a `module:function` of this package and prints what it returns."""
+    return [sys.executable, "-m", "benchmarks.call", function, json.dumps(arguments)]
 
 
-def _line(process: subprocess.Popen[str], prefix: str, errors: IO[str]) -> str:
-    """Wait for the line that begins with `prefix`; other libraries print as well."""
-    assert process.stdout
-    for line in process.stdout:
-        if line.startswith(prefix):
-            return line
-    process.wait()
-    errors.seek(0)
-    raise RuntimeError(f"a measurement failed: {process.args}\n{errors.read()[-3000:]}")
+def time_command(command: Sequence[str], cores: int | None = None, **variables: str) -> float:
+    """Return the seconds from launch to exit. Raises ProcessFailure as `answers`."""
+    began = time.monotonic()
+    with started([Launch(command, usable_cores()[:cores])], surroundings(**variables)) as (folder, (process,)):
+        if process.wait():
+            raise failure(folder, process)
+        return time.monotonic() - began
 
 
-def watch_load() -> Callable[[], float]:
-    """Begin to watch; the function returned tells how many processors other programs kept busy since then."""
-
-    def others() -> float:
-        """Return the seconds of all processors, the hypervisor's included, but not of this process's children."""
-        times, own = psutil.cpu_times(), resource.getrusage(resource.RUSAGE_CHILDREN)
-        busy = times.user + times.nice + times.system + times.irq + times.softirq + times.steal
-        return busy - own.ru_utime - own.ru_stime
-
-    began, before = time.monotonic(), others()
-    return lambda: max(0.0, (others() - before) / (time.monotonic() - began))
+# Training, timed by its task.
 
 
-def product_rates(size: Product, groups: Sequence[Sequence[int]], seconds: float) -> list[float]:
-    """Return operations per second of a product in each of several processes, side by side on these processors."""
-    processes = [Process(worker("products", size=size, seconds=seconds), cores) for cores in groups]
-    return [answer["rate"] for answer in run(processes, surroundings("cpu"))]
+def csac_command(
+    algorithm: str, *options: str, preset: str = "paper", seeds: int = 1, device: str = "cpu"
+) -> list[str]:
+    """Return `csac train` at a preset's settings, without evaluation, and with a short warm-up."""
+    given = {"algorithm": algorithm, "preset": preset, "seeds": seeds, "device": device, "directory": "run"}
+    given |= {"steps": NEVER, "evaluation-interval": NEVER} | ({} if algorithm == "ppo" else {"warmup-steps": 250})
+    words = [word for name, value in given.items() for word in (f"--{name}", str(value))]
+    return [sys.executable, "-m", "csac", "train", stamps.TASK, *words, *options]
+
+
+def time_training(
+    launches: Sequence[Launch], window: Window, seeds: int = 1, device: str = "cpu", **variables: str
+) -> dict[str, float]:
+    """Train with these commands side by side until the window is over, and return what was measured.
+
+    Its `steps_per_second` are of all seeds together; `start_seconds` go from launch to the first update of every seed;
+    `peak_mib` is the resident memory of all processes, where what they share counts for each; `other_load` is how many
+    cores the rest of the machine, its hypervisor included, kept busy meanwhile.
+
+    Raises:
+        ProcessFailure: a command ended before its window did.
+    """
+    with tempfile.TemporaryDirectory() as written:
+        told = {stamps.FOLDER: written, stamps.EVERY: str(window.every), "XDG_STATE_HOME": written, **variables}
+        launched, busy = time.monotonic(), busy_seconds()
+        with started(launches, surroundings(device, **told)) as (folder, processes):
+            while (speed := speed_of(read_stamps(Path(written)), window, seeds, launched)) is None:
+                if ended := [process for process in processes if process.poll() is not None]:
+                    raise failure(folder, ended[0])
+                time.sleep(0.2)
+            family = [member for process in processes for member in _family(process.pid)]
+            others = busy_seconds() - busy - sum(map(_cpu_seconds, family))
+            load = max(0.0, others / (time.monotonic() - launched))
+            own = {path.name.partition("-")[0] for path in Path(written).glob("*-*")}
+            return {**speed, "processes": len(own), "peak_mib": sum(map(_peak_mib, family)), "other_load": load}
+
+
+def read_stamps(folder: Path) -> list[np.ndarray]:
+    """Return the [stamp, (steps, seconds)] of each environment that has written any."""
+    texts = (path.read_text() for path in sorted(folder.glob("*-*")))
+    whole = (text[: text.rfind("\n") + 1] for text in texts)  # a line may be half written
+    return [np.loadtxt(text.splitlines(), ndmin=2) for text in whole if text]
+
+
+def speed_of(written: list[np.ndarray], window: Window, seeds: int, launched: float) -> dict[str, float] | None:
+    """Return the speed in the window, or None where it is not over yet; between two stamps progress is even."""
+    own = [stamp for stamp in written if stamp[-1, 0] > window.settled]
+    if len(own) < seeds:
+        return None
+    begin = max(stamp[np.searchsorted(stamp[:, 0], window.settled), 1] for stamp in own)
+    end = min(stamp[-1, 1] for stamp in own)
+    if end - begin < window.seconds:
+        return None
+    steps = sum(float(np.diff(np.interp([begin, end], stamp[:, 1], stamp[:, 0]))[0]) for stamp in own)
+    first = max(stamp[np.searchsorted(stamp[:, 0], window.warmup), 1] for stamp in own)
+    speed = {"steps_per_second": steps / (end - begin), "steps": steps, "seconds": end - begin}
+    return {**speed, "start_seconds": first - launched}
+
+
+def busy_seconds() -> float:
+    """Return the seconds that all cores of the machine were busy, or taken by its hypervisor."""
+    times = psutil.cpu_times()
+    return times.user + times.nice + times.system + times.irq + times.softirq + times.steal
+
+
+def _family(process: int) -> list[psutil.Process]:
+    parent = psutil.Process(process)
+    return [parent, *parent.children(recursive=True)]
+
+
+def _cpu_seconds(process: psutil.Process) -> float:
+    with suppress(psutil.NoSuchProcess):
+        times = process.cpu_times()
+        return times.user + times.system + times.children_user + times.children_system
+    return 0.0
+
+
+def _peak_mib(process: psutil.Process) -> float:
+    with suppress(OSError, StopIteration), open(f"/proc/{process.pid}/status") as file:
+        return next(int(line.split()[1]) for line in file if line.startswith("VmHWM:")) / 1024
+    return 0.0
+
+
+# The machine.
+
+
+def product_rates(product: Product, groups: Sequence[Sequence[int]], seconds: float) -> list[float]:
+    """Return operations per second of a product in several processes, side by side on these cores."""
+    command = call_command("benchmarks.products:measure", size=product, seconds=seconds)
+    return [answer["rate"] for answer in answers([Launch(command, cores) for cores in groups])]
 
 
 def one_core_rate(seconds: float) -> float:
-    """Return 10⁹ operations per second of the dominant product on the first processor."""
+    """Return 10⁹ operations per second of the dominant product on the first core."""
     return product_rates(DOMINANT, [usable_cores()[:1]], seconds)[0] / 1e9
 
 
@@ -176,25 +227,18 @@ def machine(seconds: float) -> list[str]:
     """Return what all numbers depend on, a line each: the machine, how fast it multiplies, and the versions."""
     with open("/proc/cpuinfo") as file:
         models = [line.partition(":")[2].strip() for line in file if line.startswith("model name")]
-    packages = ("jax", "gymnasium", "mujoco", "numpy")
+    packages = ", ".join(f"{name} {version(name)}" for name in ("jax", "gymnasium", "mujoco", "numpy"))
     return [
         f"processor: {models[0] if models else platform.machine()}, {os.cpu_count()} cores, {platform.system()}; "
         f"one core multiplies 256 x 256 x 256 at {one_core_rate(seconds):.0f} x 10⁹ operations/s",
-        f"csac {version('csac')} at commit {_commit()}, Python {platform.python_version()}, "
-        + ", ".join(f"{name} {version(name)}" for name in packages),
+        f"csac {version('csac')} at commit {_commit()}, Python {platform.python_version()}, {packages}",
     ]
 
 
-def lasting(lines: Iterable[str]) -> list[str]:
-    """Return the lines of `machine` without what changes on one machine: how fast it multiplied, and the commit."""
-    return [re.sub(r"; one core multiplies .*| at commit [^,]*", "", line) for line in lines]
-
-
 def _commit() -> str:
-    git: dict[str, Any] = {"cwd": ROOT, "capture_output": True, "text": True, "check": True}
-    try:
-        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], **git).stdout.strip()
-        changed = subprocess.run(["git", "status", "--porcelain", "csac"], **git).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return f"{commit} with changes" if changed else commit
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+    with suppress(OSError, subprocess.CalledProcessError):
+        return git("rev-parse", "--short", "HEAD") + (" with changes" if git("status", "--porcelain", "csac") else "")
+    return "unknown"

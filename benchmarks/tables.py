@@ -1,4 +1,4 @@
-"""From measurements to files: rows in CSV, and tables in Markdown.
+"""From measurements to files: rows in CSV, and tables in Markdown between the markers of a page.
 
 A row is a dictionary from column to number or text; all rows of a table have the same columns.
 """
@@ -6,11 +6,8 @@ A row is a dictionary from column to number or text; all rows of a table have th
 from __future__ import annotations
 
 import csv
-import io
 import statistics
 from typing import TYPE_CHECKING, Any, TypeAlias
-
-from csac.record.atomic import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,12 +18,11 @@ Row: TypeAlias = dict[str, Any]
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """Write rows in the order in which they were measured, numbers with six digits."""
-    file = io.StringIO(newline="")
-    writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
-    write_atomically(path, file.getvalue().encode())
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -67,3 +63,17 @@ def with_range(values: Sequence[float], form: str, unit: str = "") -> str:
     """Return the median, and in brackets the smallest and the largest where there are several."""
     median = f"{statistics.median(values):{form}}{unit}"
     return f"{median} ({min(values):{form}} to {max(values):{form}})" if len(values) > 1 else median
+
+
+def between_markers(page: str, name: str, text: str) -> str:
+    """Return a page with a text between its lines `<!-- name: begin -->` and `<!-- name: end -->`.
+
+    Raises:
+        ValueError: it lacks them.
+    """
+    begin, end = (f"<!-- {name}: {edge} -->" for edge in ("begin", "end"))
+    before, found, rest = page.partition(f"{begin}\n")
+    _, ended, after = rest.partition(end)
+    if not (found and ended):
+        raise ValueError(f"the page lacks the lines {begin} and {end}")
+    return f"{before}{begin}\n{text}{end}{after}"

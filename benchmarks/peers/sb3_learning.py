@@ -15,11 +15,25 @@ from pathlib import Path
 
 import gymnasium
 import torch
-from evaluation import evaluate
 from models import make_model
 from stable_baselines3.common.callbacks import BaseCallback
 
 warnings.filterwarnings("ignore", category=DeprecationWarning)
+
+# Episode j of every evaluation is reset with this seed + j: the same starts that csac's own evaluation uses.
+EVALUATION_SEED = 1_000_000
+
+
+def evaluate(model, environment, seed):
+    """Return the return and the length of one episode of deterministic actions."""
+    scales = model.get_vec_normalize_env()  # those that training has reached by now
+    observation, _ = environment.reset(seed=seed)
+    total, length, ended = 0.0, 0, False
+    while not ended:
+        action, _ = model.predict(scales.normalize_obs(observation) if scales else observation, deterministic=True)
+        observation, reward, terminated, truncated, _ = environment.step(action)
+        total, length, ended = total + float(reward), length + 1, terminated or truncated
+    return total, length
 
 
 class Evaluations(BaseCallback):
@@ -38,8 +52,8 @@ class Evaluations(BaseCallback):
 
     def _on_step(self):
         if self.num_timesteps % self.arguments.evaluation_interval == 0 or self.num_timesteps == self.arguments.steps:
-            episodes = evaluate(self.model, self.environment, self.arguments.evaluation_episodes)
-            for episode, (total, length) in enumerate(episodes):
+            for episode in range(self.arguments.evaluation_episodes):
+                total, length = evaluate(self.model, self.environment, EVALUATION_SEED + episode)
                 self.writer.writerow([self.arguments.seed, self.num_timesteps, episode, total, length, ""])
             self.file.flush()
         return self.num_timesteps < self.arguments.steps
@@ -60,9 +74,8 @@ def main():
     arguments = parser.parse_args()
 
     torch.set_num_threads(arguments.threads)
-    model = make_model(
-        "sb3", arguments.algorithm, arguments.task, arguments.seed, 10_000, entropy_weight=arguments.entropy_weight
-    )
+    environment = gymnasium.make(arguments.task)
+    model = make_model("sb3", arguments.algorithm, environment, arguments.seed, 10_000, arguments.entropy_weight)
     partial = arguments.out.with_suffix(".partial")
     with partial.open("w", newline="") as file:
         # One call for the whole run, because the schedule of PPO's learning rate spans what one call is asked for.

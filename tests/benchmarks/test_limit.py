@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.operations import Network, Product, operations, update_products
-from benchmarks.suites.limit import render_operations, render_shares, share
+from benchmarks.limit import render_shares, share
+from benchmarks.products import Network, Product, operations, update_products
 
 
 def shared(updates_per_second: float, one_core_rate: float) -> dict:
@@ -46,19 +46,7 @@ def test_the_table_has_medians_and_ranges():
     lines = render_shares([shared(100, 100), shared(200, 100), shared(160, 100)]).splitlines()
 
     assert lines[2:] == [
-        "| training, one seed, 2 cores | CSAC | 160 | 0.50 | 40 % (25 to 50) | 60 % |",
+        "| training, one seed, 2 cores | CSAC | 160 | 0.50 | 40 % (25 to 50) |",
         "",
         "One core multiplied 256 x 256 x 256 at 100 x 10⁹ operations/s (median of all repetitions).",
     ]
-
-
-def test_the_operations_are_shares_of_their_sum():
-    kinds = {"products": 300.0, "copies": 100.0}
-    rows = [
-        {"algorithm": "sac", "kind": kind, "microseconds": taken, "operations": 7, "update_microseconds": 380.0}
-        for kind, taken in kinds.items()
-    ]
-    lines = render_operations(rows).splitlines()
-
-    assert lines[2:4] == ["| products | 300 | 75% | 7 |", "| copies | 100 | 25% | 7 |"]
-    assert lines[-1] == "One update without tracing: 380 μs; the operations traced: 400 μs."

@@ -1,20 +1,17 @@
-"""The speed benchmark without its peers, which are not installed here: its cases, its windows and its report."""
+"""Speed beside the peers, which are not installed here: the cases, the clock and the table."""
 
 from __future__ import annotations
 
-import inspect
-import json
-import sys
-from argparse import Namespace
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
-from measuring import Window, argument_parser, parse
 
-from benchmarks.contenders import CASES, LIBRARIES, REACHES, Case, Reach
-from benchmarks.parts import Options
-from benchmarks.suites.peers import command, measure, ratios, render, window
-from benchmarks.workers import training
+from benchmarks import peers, stamps
+from benchmarks.measuring import Window, read_stamps, speed_of
+from benchmarks.part import Options
+from benchmarks.peers import CASES, Case, measure, ratios, render, window
 from csac.types import InputError
 
 
@@ -34,105 +31,80 @@ MEASURED = [
 
 def test_a_ratio_is_of_one_repetition():
     assert ratios(MEASURED, "one seed", "ours", "theirs") == [1.2, 1.5]
-
-
-def test_the_table_says_what_each_was_allowed():
-    lines = render(MEASURED, []).splitlines()
-
-    assert "| one seed | theirs | XLA, 2 cores | 80 (60 to 100) | 1.35 (1.20 to 1.50) | 9.0 | 600 |" in lines
-
-
-def test_what_was_to_be_reached_is_said_of_the_median():
-    wanted = [Reach("one seed", "ours", "theirs", 1.3), Reach("one seed", "ours", "theirs", 1.4)]
-    lines = render(MEASURED, wanted).splitlines()
-
-    assert "| one seed | ours / theirs | >= 1.3 | 1.35 (1.20 to 1.50) | yes |" in lines
-    assert "| one seed | ours / theirs | >= 1.4 | 1.35 (1.20 to 1.50) | **no** |" in lines
+    row = "| one seed | theirs | XLA, 2 cores | 80 (60 to 100) | 1.35 (1.20 to 1.50) | 9.0 | 600 |"
+    assert row in render(MEASURED).splitlines()
 
 
 def test_each_contender_is_once_in_a_setting_and_the_first_is_ours():
     places = [(case.setting, case.contender) for case in CASES]
-
     assert len(set(places)) == len(places)
     for setting in {case.setting for case in CASES}:
         assert next(case for case in CASES if case.setting == setting).library == "csac"
-
-
-def test_what_is_to_be_reached_is_measured_in_every_repetition():
-    repeated = {(case.setting, case.contender) for case in CASES if case.repeated}
-
-    for reach in REACHES:
-        assert {(reach.setting, reach.contender), (reach.setting, reach.peer)} <= repeated
-
-
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_the_scripts_understand_what_they_are_given(case: Case):
-    library = LIBRARIES[case.library]
-    arguments = command(case, window(case, Options()))
-    if case.library == "csac":
-        *_, module, name, given = arguments
-        known = Namespace(**inspect.signature(training.measure).bind(**json.loads(given)).arguments)
-        counted, unknown = Namespace(**known.counted), []
-        assert (module, name) == ("benchmarks.worker", "training")
-    else:
-        script = next(argument for argument in arguments if argument.endswith(library.script))
-        parser = argument_parser("", ("sac", "td3", "ppo"))
-        known, unknown = parser.parse_known_args(arguments[arguments.index(script) + 1 :])
-        counted = known
-        assert Path(script).is_file()
-        assert known.threads == (case.threads_each if library.has_threads else None)
-
-    assert unknown == list(library.options)
-    assert (known.algorithm, known.seeds) == (case.algorithm, case.seeds)
-    assert bool(counted.evaluation_interval) == case.evaluated
-    assert counted.warmup == (2048 if case.algorithm == "ppo" else 250)
-
-
-def test_without_the_peers_nothing_is_measured_and_their_places_are_not_left_empty(monkeypatch):
-    monkeypatch.setattr("benchmarks.suites.peers.PEERS_PYTHON", "/no/such/python")
-
-    with pytest.raises(InputError, match="run `make peers` first"):
-        measure(CASES[0], Options())
 
 
 @pytest.mark.parametrize(
     ("case", "allowed"),
     [
         (Case("", "", "csac", seeds=5), "XLA, 2 cores"),
-        (Case("", "", "sbx", together=2), "XLA, 1 core each"),
-        (Case("", "", "sb3", together=2), "PyTorch, 1 thread each"),
-        (Case("", "", "compiled"), "torch.compile, 2 threads"),
-        (Case("", "", "parl", threads=1), "Paddle, 1 thread"),
+        (Case("", "", "sbx", processes=2), "XLA, 1 core each"),
+        (Case("", "", "sb3", processes=2), "PyTorch, 1 thread each"),
+        (Case("", "", "sb3", threads=1), "PyTorch, 1 thread"),
     ],
 )
 def test_allowed(case: Case, allowed: str):
     assert case.allowed == allowed
 
 
-def test_a_machine_without_a_compiler_leaves_torch_compile_out(monkeypatch):
-    monkeypatch.setenv("CXX", "no-such-compiler")
-
-    assert "C++ compiler" in LIBRARIES["compiled"]._replace(python=sys.executable).lacks()
-    assert not LIBRARIES["eager"]._replace(python=sys.executable).lacks()
-    assert "make peers" in LIBRARIES["eager"]._replace(python="/no/such/python").lacks()
+def test_without_the_peers_only_csac_is_measured(monkeypatch):
+    monkeypatch.setattr(peers, "PYTHON", "/no/such/python")
+    with pytest.raises(InputError, match="run `make peers` first"):
+        measure(next(case for case in CASES if case.library == "sbx"), Options())
 
 
-def test_a_window_begins_once_settled_and_counts_its_steps(capsys):
-    window = Window(Namespace(warmup=3, settled=5, seconds=0.0, steps=4, launched=0.0, together=False))
+def test_a_stamp_says_when_steps_were_over(tmp_path, monkeypatch):
+    monkeypatch.setenv(stamps.FOLDER, str(tmp_path))
+    monkeypatch.setenv(stamps.EVERY, "2")
+    environment, began = stamps.make(), time.monotonic()
+    environment.reset(seed=0)
+    for _ in range(5):
+        environment.step(np.zeros(6, np.float32))
+    (path,) = tmp_path.iterdir()
+    with path.open("a") as file:
+        file.write("6 12")  # half a line
+    (stamp,) = read_stamps(tmp_path)
+    assert stamp[:, 0].tolist() == [2, 4]
+    assert began < stamp[0, 1] < stamp[1, 1] < time.monotonic()
 
-    assert next(step for step in range(3, 12) if window.is_over_at(step)) == 9
-    assert (window.first, window.start_seconds > 0) == (5, True)
 
-    window.report([-300.4, 12.0])
-    reported = json.loads(capsys.readouterr().out)
-    assert (reported["steps"], reported["returns"]) == (4, [-300, 12])
-    assert reported["steps_per_second"] == pytest.approx(4 / reported["seconds"])
-    assert {"start_seconds", "peak_mib"} < reported.keys()
+def test_a_window_begins_once_settled_and_lasts_its_seconds():
+    stamp = np.array([[step, 100 + step / 10] for step in range(10, 101, 10)])  # 10 steps a second
+    found = speed_of([stamp], Window(seconds=5.0, warmup=20, settled=40), seeds=1, launched=99.0)
+    assert found == {"steps_per_second": 10.0, "steps": 60.0, "seconds": 6.0, "start_seconds": 3.0}
+    assert speed_of([stamp], Window(seconds=6.5, warmup=20, settled=40), seeds=1, launched=99.0) is None
+    assert speed_of([stamp], Window(seconds=1.0, warmup=20, settled=40), seeds=2, launched=99.0) is None
 
 
-def test_a_peer_that_cannot_evaluate_says_so(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        parse(argument_parser("", ("sac",)), given=["--evaluation-interval", "250"])
+def test_the_window_of_several_seeds_is_the_time_that_all_train():
+    fast = np.array([[step, step / 20] for step in range(10, 401, 10)])
+    late = np.array([[step, 5 + step / 10] for step in range(10, 101, 10)])
+    found = speed_of([fast, late], Window(seconds=5.0, warmup=20, settled=40), seeds=2, launched=0.0)
+    assert found == pytest.approx({"steps_per_second": 30, "steps": 180, "seconds": 6, "start_seconds": 7})
 
-    assert stopped.value.code == 2
-    assert "without evaluation" in capsys.readouterr().err
+
+def test_ppo_s_windows_are_whole_rollouts():
+    case = next(case for case in CASES if case.algorithm == "ppo")
+    counted = window(case, Options())
+    assert (counted.warmup, counted.settled, counted.every) == (2048, 2048, 2048)
+
+
+needs_peers = pytest.mark.skipif(not Path(peers.PYTHON).exists(), reason="the peers are not installed: make peers")
+
+
+@pytest.mark.slow
+@needs_peers
+@pytest.mark.parametrize("library", ["sb3", "sbx"])
+def test_a_peer_is_measured(library):
+    case = next(case for case in CASES if case.library == library and case.algorithm == "sac")
+    (row,) = measure(case, Options(quick=True))
+    assert row["steps"] >= 50
+    assert row["steps_per_second"] > 0

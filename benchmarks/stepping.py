@@ -1,4 +1,4 @@
-"""Steps per second of a task alone, random actions, resets included: what is left for learning is less."""
+"""Steps per second of each task alone, with random actions: what is left for learning is less."""
 
 from __future__ import annotations
 
@@ -6,11 +6,23 @@ import time
 
 import numpy as np
 
-from csac.tasks.environment import Environment
+from benchmarks.measuring import call
+from benchmarks.part import Options, Part
+from benchmarks.tables import Row
+
+TASKS = ["HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4", "PyFlyt/QuadX-Waypoints-v1", "PandaReach-v3"]
 
 
-def measure(task: str, seconds: float) -> dict[str, float]:
+def measure(task: str, options: Options) -> list[Row]:
+    """Step one task on one core."""
+    found = call("benchmarks.stepping:speed", cores=1, task=task, seconds=options.lasting(5.0))
+    return [{"task": task, **found}]
+
+
+def speed(task: str, seconds: float) -> dict[str, float]:
     """Return the speed over at least so many seconds and one episode, and the mean length of those that ended."""
+    from csac.tasks.environment import Environment
+
     environment = Environment(task)
     environment.reset(0)
     generator = np.random.default_rng(0)
@@ -27,3 +39,11 @@ def measure(task: str, seconds: float) -> dict[str, float]:
             environment.reset(episodes)
     environment.close()
     return {"steps_per_second": steps / elapsed, "episode_length": in_episodes / episodes}
+
+
+COLUMNS = {
+    "task": "{task}",
+    "steps/s": "{steps_per_second:,.0f}",
+    "length of a random episode": "{episode_length:,.0f}",
+}
+PARTS = [Part("stepping", "docs/tasks.md", "each task alone", TASKS, measure, COLUMNS)]

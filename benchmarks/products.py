@@ -1,20 +1,25 @@
-"""The matrix products that one update needs, counted from the equations.
+"""The matrix products that one update needs, counted from the equations, and how fast this machine multiplies.
 
-What is counted is what has to be: forward passes, gradients of weights, and gradients of inputs where something learns
-from them. It is not what a compiled program happens to do, which would reward waste. Everything else that an update
-does (activations, Adam, noise, the draw from the replay) counts as nothing.
+Forward passes, gradients of weights, and gradients of inputs where something learns from them are counted, and not what
+a compiled program happens to do: that would reward waste. Activations, Adam, noise and the draw from the replay count
+as nothing.
 """
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
+
+    import jax
 
 OBSERVATION, ACTION = 17, 6  # of HalfCheetah-v4
 BATCH = 256
+TOGETHER = 20  # products in one dispatch: a single one would be over before the clock can tell
+WINDOWS = 10
 
 
 class Product(NamedTuple):
@@ -96,3 +101,41 @@ def operations(counts: dict[Product, float]) -> float:
 
 def _times(number: int, counts: Counter[Product]) -> Counter[Product]:
     return Counter({product: number * times for product, times in counts.items()})
+
+
+def measure(size: Sequence[int], seconds: float) -> dict[str, float]:
+    """Return operations per second of a product of this size in this process: the best of ten windows.
+
+    It is a limit, so everything is in its favour: the operands stay in the caches, and what a window loses to other
+    programs does not count.
+    """
+    product = Product(*size)
+    multiply, rates = _multiplying(product), []
+    for _ in range(WINDOWS):
+        calls, began = 0, time.perf_counter()
+        while (elapsed := time.perf_counter() - began) < seconds / WINDOWS:
+            multiply()
+            calls += 1
+        rates.append(calls * TOGETHER * product.operations / elapsed)
+    return {"rate": max(rates)}
+
+
+def _multiplying(size: Product) -> Callable[[], jax.Array]:
+    """Return a compiled function that multiplies `TOGETHER` times."""
+    import jax
+    import jax.numpy as jnp
+
+    left = jax.random.normal(jax.random.key(0), (size.rows, size.inner))
+    right = jax.random.normal(jax.random.key(1), (size.inner, size.columns))
+
+    @jax.jit
+    def multiply(left: jax.Array, right: jax.Array) -> jax.Array:
+        def again(_: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            operand, product = carry
+            operand = operand.at[0, 0].set(product[0, 0])  # so that each has to wait for the one before it
+            return operand, operand @ right
+
+        return jax.lax.fori_loop(0, TOGETHER, again, (left, jnp.zeros((len(left), right.shape[1]))))[1]
+
+    multiply(left, right)
+    return lambda: multiply(left, right).block_until_ready()

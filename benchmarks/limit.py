@@ -10,14 +10,13 @@ from __future__ import annotations
 import statistics
 from typing import NamedTuple
 
-from benchmarks.measuring import one_core_rate, product_rates, run_one, training, worker
-from benchmarks.operations import DOMINANT, Product, operations, update_products
-from benchmarks.parts import Options, Part
-from benchmarks.tables import Row, formatted, grouped, table, with_range
-from csac.processes import usable_cores
+from benchmarks.measuring import Launch, call, csac_command, one_core_rate, product_rates, time_training, usable_cores
+from benchmarks.part import Options, Part
+from benchmarks.products import DOMINANT, Product, operations, update_products
+from benchmarks.tables import Row, grouped, table, with_range
 
 PAGE = "docs/performance.md"
-SIZES = {
+PRODUCTS = {
     "forward, hidden layer": DOMINANT,
     "forward, a critic's first layer": Product(256, 23, 256),
     "forward, the actor's last layer": Product(256, 256, 12),
@@ -27,14 +26,13 @@ SIZES = {
 
 
 class Setting(NamedTuple):
-    """What is measured; `aim` is the share of the limit that it is to reach, in percent."""
+    """What is measured."""
 
-    kind: str  # "update alone", "training" or "training, evaluation on"
+    kind: str  # "update alone" or "training"
     algorithm: str
     seeds: int = 1
     cores: int = 2
     interval: int = 1
-    aim: int = 0
 
     @property
     def title(self) -> str:
@@ -53,12 +51,10 @@ SETTINGS = [
     *(Setting("update alone", name, cores=1) for name in ("csac", "sac", "td3", "sd3")),
     *(Setting("update alone", name) for name in ("csac", "sac", "td3", "sd3")),
     *(Setting("update alone", name, interval=10) for name in ("csac", "sac", "td3")),
-    Setting("training", "csac", cores=1, aim=78),
-    Setting("training", "csac", aim=60),
+    Setting("training", "csac", cores=1),
+    Setting("training", "csac"),
     Setting("training", "csac", interval=10),
-    Setting("training", "csac", seeds=5, aim=75),
-    Setting("training, evaluation on", "csac"),
-    Setting("training, evaluation on", "csac", seeds=5),
+    Setting("training", "csac", seeds=5),
 ]
 
 
@@ -74,8 +70,19 @@ def measure_share(setting: Setting, options: Options) -> list[Row]:
         "giga_operations_per_update": operations(update_products(setting.algorithm)) / 1e9,
         "one_core_rate": max(before, one_core_rate(options.lasting(1.0))),  # giga-operations per second
     }
-    print(f"{setting.name}: {share(row):.0f} % of the limit", flush=True)
     return [row]
+
+
+def updates_per_second(setting: Setting, options: Options) -> float:
+    """Measure one setting."""
+    if setting.kind == "update alone":
+        settings = {"algorithm": setting.algorithm, "interval": setting.interval}
+        found = call("benchmarks.updates:measure", setting.cores, seconds=options.lasting(5.0), **settings)
+        return found["updates_per_second"]
+    several = ["--update-interval", str(setting.interval)] * (setting.interval > 1)
+    launch = Launch(csac_command(setting.algorithm, *several, seeds=setting.seeds), usable_cores()[: setting.cores])
+    window = options.window(30.0 if setting.seeds > 1 else 5.0)
+    return time_training([launch], window, setting.seeds)["steps_per_second"]
 
 
 def share(row: Row) -> float:
@@ -84,36 +91,20 @@ def share(row: Row) -> float:
     return 100 * row["updates_per_second"] * row["giga_operations_per_update"] / limit
 
 
-def updates_per_second(setting: Setting, options: Options) -> float:
-    """Measure one setting."""
-    if setting.kind == "update alone":
-        settings = {"algorithm": setting.algorithm, "interval": setting.interval}
-        command = worker("updates", seconds=options.lasting(5.0), **settings)
-        return run_one(command, setting.cores)["updates_per_second"]
-    evaluated = setting.kind == "training, evaluation on"
-    # Five seeds take turns of a second and more.
-    window = options.window(30.0 if setting.seeds > 1 else 0.0 if evaluated else 5.0, evaluated)
-    command = training(setting.algorithm, window, setting.seeds, setting.interval)
-    return run_one(command, setting.cores)["steps_per_second"]
-
-
 def render_shares(rows: list[Row]) -> str:
     """Return a row for each setting, and the rate that the limit is made of."""
-    measured = grouped(rows, "setting", "algorithm")
     lines = [
         [
-            *(setting.title, setting.algorithm.upper()),
+            *(setting, algorithm.upper()),
             f"{statistics.median(row['updates_per_second'] for row in mine):.0f}",
             f"{mine[0]['giga_operations_per_update']:.2f}",
             with_range([share(row) for row in mine], ".0f", " %"),
-            f"{setting.aim} %" if setting.aim else "",
         ]
-        for setting in SETTINGS
-        if (mine := measured.get((setting.title, setting.algorithm)))
+        for (setting, algorithm), mine in grouped(rows, "setting", "algorithm").items()
     ]
-    head = ["", "algorithm", "updates/s", "10⁹ operations in one", "share of the limit", "aim"]
     rate = statistics.median(row["one_core_rate"] for row in rows)
     said = f"One core multiplied 256 x 256 x 256 at {rate:.0f} x 10⁹ operations/s (median of all repetitions)."
+    head = ["", "algorithm", "updates/s", "10⁹ operations in one", "share of the limit"]
     return f"{table(head, lines)}\n\n{said}"
 
 
@@ -122,9 +113,10 @@ def measure_rate(name: str, options: Options) -> list[Row]:
     first, second = usable_cores()[:2]
     groups = {"one_core": [[first]], "two_cores": [[first, second]], "a_process_on_each": [[first], [second]]}
     rates = {
-        column: sum(product_rates(SIZES[name], cores, options.lasting(1.0))) / 1e9 for column, cores in groups.items()
+        column: sum(product_rates(PRODUCTS[name], cores, options.lasting(1.0))) / 1e9
+        for column, cores in groups.items()
     }
-    return [{"product": name, "size": " x ".join(map(str, SIZES[name])), **rates}]
+    return [{"product": name, "size": " x ".join(map(str, PRODUCTS[name])), **rates}]
 
 
 RATE_COLUMNS = {
@@ -134,41 +126,7 @@ RATE_COLUMNS = {
     "2 cores, a process on each": "{a_process_on_each:.0f}",
 }
 
-
-def measure_operations(algorithm: str, options: Options) -> list[Row]:
-    """Trace updates on one core, where the times of their operations add up."""
-    updates = 5 if options.quick else 100
-    command = worker("operations", algorithm=algorithm, seconds=options.lasting(1.0), updates=updates)
-    return run_one(command, cores=1)["rows"]
-
-
-def render_operations(rows: list[Row]) -> str:
-    """Return a table for each algorithm."""
-    tables = []
-    for (algorithm,), mine in grouped(rows, "algorithm").items():
-        whole = sum(row["microseconds"] for row in mine)
-        columns = {
-            f"operations of {algorithm.upper()}": "{kind}",
-            "μs in one update, traced": "{microseconds:.0f}",
-            "share": "{share:.0%}",
-            "distinct operations": "{operations}",
-        }
-        shares = [{**row, "share": row["microseconds"] / whole} for row in mine]
-        untraced = mine[0]["update_microseconds"]
-        said = f"One update without tracing: {untraced:.0f} μs; the operations traced: {whole:.0f} μs."
-        tables.append(f"{formatted(shares, columns)}\n\n{said}")
-    return "\n\n".join(tables)
-
-
 PARTS = [
     Part("limit-share", PAGE, "updates and training beside the limit", SETTINGS, measure_share, render_shares, 3),
-    Part("limit-products", PAGE, "how fast matrix products are", list(SIZES), measure_rate, RATE_COLUMNS),
-    Part(
-        "limit-operations",
-        PAGE,
-        "the parts of an update",
-        ["sac", "csac", "td3"],
-        measure_operations,
-        render_operations,
-    ),
+    Part("limit-products", PAGE, "how fast matrix products are", list(PRODUCTS), measure_rate, RATE_COLUMNS),
 ]

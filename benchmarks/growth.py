@@ -1,16 +1,15 @@
 """What an update costs as the run grows: with seeds, width, batch, observation, replay.
 
-Seeds are trained as users train them, in as many processes as csac chooses. Everything else is one learner on all
-cores, without an environment.
+Seeds are trained by one command on two cores. Everything else is one learner on all cores, without an environment.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from benchmarks.measuring import run_one, training, worker
-from benchmarks.operations import operations, update_products
-from benchmarks.parts import Options, Part
+from benchmarks.measuring import Launch, call, csac_command, time_training, usable_cores
+from benchmarks.part import Options, Part
+from benchmarks.products import operations, update_products
 from benchmarks.tables import Row, grouped, table
 
 if TYPE_CHECKING:
@@ -41,12 +40,12 @@ class Size(NamedTuple):
 def measure(size: Size, options: Options) -> list[Row]:
     """Measure one point of an axis: updates per second, and the peak of the memory of all processes together."""
     if size.axis == "seeds":
-        window = options.window(5.0)._replace(settled=260)
-        found = run_one(training(ALGORITHM, window, seeds=size.value))
+        launch = Launch(csac_command(ALGORITHM, seeds=size.value), usable_cores()[:2])
+        found = time_training([launch], options.window(20.0), seeds=size.value)
         speed, cost = found["steps_per_second"], giga_operations()
     else:
-        changes = {size.axis: size.value}
-        found = run_one(worker("updates", algorithm=ALGORITHM, seconds=options.lasting(5.0), **changes))
+        changes: dict[str, Any] = {size.axis: size.value}
+        found = call("benchmarks.updates:measure", algorithm=ALGORITHM, seconds=options.lasting(5.0), **changes)
         speed, cost = found["updates_per_second"], giga_operations(**changes)
     row = {"updates_per_second": speed, "peak_mib": found["peak_mib"], "giga_operations": cost}
     return [{"axis": size.axis, "value": size.value, **row}]
@@ -102,6 +101,4 @@ def draw(rows: list[Row], path: Path) -> None:
 
 
 SIZES = [Size(axis, value) for axis, values in AXES.items() for value in values]
-PARTS = [
-    Part("growth", "docs/performance.md", "a table for each axis and a picture", SIZES, measure, render, draw=draw)
-]
+PARTS = [Part("growth", "docs/performance.md", "a table for each axis", SIZES, measure, render, draw=draw)]

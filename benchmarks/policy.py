@@ -1,0 +1,119 @@
+"""What a trained policy costs beside SB3's, on one core: one action of an exported policy, and an evaluation."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks.measuring import ROOT, TASK, Launch, answers, call, usable_cores
+from benchmarks.part import Options, Part
+from benchmarks.peers import PYTHON
+from benchmarks.tables import Row, grouped, table, with_range
+
+SCRIPT = ROOT / "benchmarks" / "peers" / "sb3_policy.py"
+EPISODES = 10  # of 1,000 steps each
+
+
+class Case(NamedTuple):
+    """A way to ask a policy: a format of csac's, or one of SB3's ways."""
+
+    name: str
+    format: str = ""
+    way: str = ""
+
+
+LATENCIES = [
+    Case("csac, C", "c"),
+    Case("csac, ONNX Runtime", "onnx"),
+    Case("csac, NumPy", "numpy"),
+    Case("SB3's ONNX recipe, ONNX Runtime", way="onnx"),
+    Case("SB3's predict, PyTorch", way="predict"),
+]
+EVALUATIONS = [Case("`csac.evaluate`"), Case("SB3's `evaluate_policy`", way="evaluate")]
+
+
+def ask_sb3(way: str, count: int) -> list[Row]:
+    """Return what SB3's script says; nothing where there are no peers."""
+    if not Path(PYTHON).exists():
+        print(f"SB3, {way}: there is no {PYTHON} (make peers)")
+        return []
+    command = [PYTHON, str(SCRIPT), "--way", way, "--count", str(count)]
+    return answers([Launch(command, usable_cores()[:1])])
+
+
+def measure_latency(case: Case, options: Options) -> list[Row]:
+    """Return the percentiles of one process, in microseconds."""
+    calls = 2_000 if options.quick else 100_000
+    if case.way:
+        return [{"policy": case.name, **found} for found in ask_sb3(case.way, calls)]
+    return [{"policy": case.name, **call("benchmarks.policy:latency", cores=1, format=case.format, calls=calls)}]
+
+
+def latency(format: str, calls: int) -> dict[str, float]:
+    """Export a policy of SAC's size that has learnt nothing, and return percentiles of single calls."""
+    import numpy as np
+
+    from csac.cli import main
+    from csac.evaluation.latency import measure
+
+    train_briefly()
+    main(["export", "run", "--format", format, "--out", "artefact", "--no-rollouts"])
+    (found,) = measure("artefact", calls, seconds=0)
+    percentiles = np.percentile(found.durations, [50, 99, 99.9, 100], method="higher") / 1e3
+    return dict(zip(("p50", "p99", "p99.9", "max"), percentiles.tolist(), strict=True))
+
+
+def train_briefly() -> None:
+    """Train SAC for a few steps into the folder `run`."""
+    from csac.cli import main
+
+    words = "--algorithm sac --warmup-steps 250 --steps 260 --evaluation-episodes 1 --directory run"
+    main(["train", TASK, *words.split()])
+
+
+def measure_evaluation(case: Case, options: Options) -> list[Row]:
+    """Return the seconds of an evaluation."""
+    episodes = 1 if options.quick else EPISODES
+    if case.way:
+        return [{"evaluation": case.name, **found} for found in ask_sb3(case.way, episodes)]
+    return [{"evaluation": case.name, **call("benchmarks.policy:evaluation", cores=1, episodes=episodes)}]
+
+
+def evaluation(episodes: int) -> dict[str, float]:
+    """Return the seconds of so many episodes, the environments made before."""
+    import csac
+
+    train_briefly()
+    policy = csac.load("run")
+    csac.evaluate(policy, TASK, episodes=1)
+    began = time.perf_counter()
+    csac.evaluate(policy, TASK, episodes=episodes)
+    return {"episodes": episodes, "seconds": time.perf_counter() - began}
+
+
+def render_latencies(rows: list[Row]) -> str:
+    """Return the medians over repetitions, and how many times csac's artefact in C is faster."""
+    policies = {name: mine for (name,), mine in grouped(rows, "policy").items()}
+    first = statistics.median(row["p50"] for row in next(iter(policies.values())))
+    lines = []
+    for name, mine in policies.items():
+        values = [statistics.median(row[column] for row in mine) for column in ("p50", "p99", "p99.9", "max")]
+        lines.append([name, *(f"{value:,.1f}" for value in values), f"{values[0] / first:.1f}"])
+    return table(["μs for one action", "p50", "p99", "p99.9", "max", "p50, times the first"], lines)
+
+
+def render_evaluations(rows: list[Row]) -> str:
+    """Return the medians and ranges."""
+    lines = [
+        [name, str(mine[0]["episodes"]), with_range([row["seconds"] for row in mine], ".2f")]
+        for (name,), mine in grouped(rows, "evaluation").items()
+    ]
+    return table(["", "episodes of 1,000 steps", "seconds"], lines)
+
+
+PARTS = [
+    Part("latency", "docs/deploy.md", "one action", LATENCIES, measure_latency, render_latencies, 3),
+    Part("evaluation", "benchmarks/README.md", "ten episodes", EVALUATIONS, measure_evaluation, render_evaluations, 3),
+]

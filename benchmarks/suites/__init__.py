@@ -1,1 +1,0 @@
-"""What is measured: each module has `PARTS`, and each of these a table."""
