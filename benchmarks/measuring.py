@@ -70,7 +70,7 @@ def started(launches: Sequence[Launch], environment: dict[str, str]) -> Iterator
         for number, (command, cores) in enumerate(launches):
             output = stack.enter_context((folder / f"output-{number}").open("w"))
             bound = ["taskset", "--cpu-list", ",".join(map(str, cores)), *command]  # first: XLA looks for cores once
-            options: dict[str, Any] = {"cwd": folder, "env": environment, "start_new_session": True}
+            options: dict[str, Any] = {"cwd": folder, "env": environment, "process_group": 0}
             processes.append(subprocess.Popen(bound, stdout=output, stderr=errors, **options))
             stack.callback(_kill, processes[-1])
         yield folder, processes
