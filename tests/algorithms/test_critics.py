@@ -157,7 +157,7 @@ def products(**changes: Any) -> float:
 
 
 def test_one_pass_gives_values_targets_and_moments():
-    # In products of a hidden layer SAC needs 16 (benchmarks/operations.py). Normalised critics need 2 + 2 forward and
+    # In products of a hidden layer SAC needs 16 (benchmarks/products.py). Normalised critics need 2 + 2 forward and
     # twice as many backward, where plain ones with targets have 2 + 2 and 4: 20. Each further pass would cost 2 or 4.
     assert 1.2 < products(critic_normalisation="batch") / products() < 1.4
 
