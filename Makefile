@@ -27,7 +27,7 @@ define require_python
 @test -n "$(PYTHON)" || { echo "csac needs Python 3.11 or newer: make setup PYTHON=/path/to/python"; exit 2; }
 endef
 
-.PHONY: help setup train test slow chaos format check docs lock clean peers bench limit growth gpu
+.PHONY: help setup train test slow chaos results format check docs lock clean peers bench limit growth gpu
 
 help:  ## List the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
@@ -46,6 +46,9 @@ slow: $(SETUP)  ## Run the tests that need longer: processes that are killed, cl
 
 chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave, 20 minutes: make chaos ARGS='--kills 12'
 	.venv/bin/python tests/support/chaos.py --out results/reliability $(ARGS)
+
+results: $(SETUP)  ## Write the tables and pictures of results/ from the CSVs there
+	$(VENV)/bin/python results/make.py
 
 format: $(SETUP)  ## Put the code into its format, and mend what ruff can mend
 	$(VENV)/bin/ruff format --exclude '*.md' .

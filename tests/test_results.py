@@ -1,147 +1,114 @@
-"""Every table in results/ follows from the rows beside it: the commands in a page write the tables that stand there."""
+"""The tables of results/: their rules by hand, and that the committed ones follow from the committed rows."""
 
 import csv
+import json
 import re
-import runpy
-import shlex
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
+import make
+import numpy as np
 import pytest
+import tables
 from chaos import MARKERS, Kill, summary
 
-from csac.cli import main
-
 ROOT = Path(__file__).parents[1]
-PAGES = sorted((ROOT / "results").glob("**/README.md"))
-TABLE = re.compile(r"^\|.*\|\n\| ?:?---", re.MULTILINE)
+PAGES = [*ROOT.glob("results/*/README.md"), ROOT / "docs" / "relative-entropy.md"]
 
 
-def commands(page: Path) -> list[list[str]]:
-    """The words of each `csac report` that a page names."""
-    blocks = "\n".join(re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL))
-    lines = blocks.replace("\\\n", " ").splitlines()
-    return [words[1:] for words in map(shlex.split, lines) if words[:2] == ["csac", "report"]]
+def rows(*curves: list[float]) -> np.ndarray:
+    """Evaluations at steps 10, 20, ... of seeds 0, 1, ..."""
+    told = [(seed, 10 * (i + 1), value, np.nan) for seed, curve in enumerate(curves) for i, value in enumerate(curve)]
+    return np.array(told, make.COLUMNS)
 
 
-# The tables that evidence.py writes, by the folders of their pages.
-EVIDENCE = {
-    "reference": ["fresh", "ant", "recovery", "screen", "stage-0", "stage-0-fresh"],
-    "strong": ["primary", "whose", "stage-1", "aims", "pieces", "leaner", "longer", "again"],
-}
-WITH_COMMANDS = [page for page in PAGES if commands(page)]
+def cells(table: str, *labels: str) -> list[str]:
+    """What stands in the row of a table that begins with these labels."""
+    lines = [line.strip("| ").split(" | ") for line in table.splitlines()]
+    (row,) = [line for line in lines if line[: len(labels)] == list(labels)]
+    return row[len(labels) :]
 
 
-@pytest.fixture
-def copied(tmp_path, monkeypatch):
-    """A copy of the rows and pages, without the pictures."""
-    shutil.copytree(ROOT / "results", tmp_path / "results", ignore=shutil.ignore_patterns("*.png"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+def test_the_final_return_is_the_mean_of_the_last_fifth_of_the_steps():
+    # Of 50 steps those after 40 count; the falls are from 5 to 2 and none.
+    found = tables.measure(rows([1, 5, 2, 2, 3], [1, 2, 3, 4, 4]), 50)
+    assert found.final.tolist() == [3, 4]
+    assert found.drawdown.tolist() == found.loss.tolist() == [3, 0]
+    assert np.isnan(found.early).all()  # nothing was evaluated at 100,000
 
 
-@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.parent.name)
-def test_the_commands_of_a_page_write_its_tables(copied, page):
-    there = copied / page.relative_to(ROOT)
-    others = [*EVIDENCE.get(page.parent.name, []), "equal-time"]  # which other commands write, and other tests
-    emptied = re.sub(
-        r"(<!-- (\S+): begin -->\n)(.*?)(<!-- \2: end -->)",
-        lambda found: found[0] if found[2] in others else found[1] + found[4],
-        page.read_text(),
-        flags=re.DOTALL,
-    )
-    there.write_text(emptied)
-    for words in commands(page):
-        if "--curve" in words:  # which would take a second each, and is another's test
-            place = words.index("--curve")
-            del words[place : place + 2]
-        assert main(words) == 0
-    assert there.read_text() == page.read_text()
+def test_the_loss_after_a_change_is_the_area_lost_as_a_share_of_the_return_before():
+    # After step 20 the return 4 falls to 2 and comes back: losses 0, 2, 0, 0 at 20, 30, 40, 50 make 20 in area, over 4.
+    assert tables.measure(rows([4, 4, 2, 4, 4]), 50, changed_at=20).loss.tolist() == [5.0]
 
 
-STUDIED = sorted((ROOT / "results" / "studies").glob("*/report.md"))
+def test_scores_are_shares_of_the_first_arm_and_pairs_of_seeds_are_compared():
+    found = {
+        "Hopper-v4": {
+            "SAC, 0.2": tables.measure(rows([0, 0, 0, 0, 2], [0, 0, 0, 0, 4]), 50),
+            "CSAC, paper": tables.measure(rows([0, 9, 0, 0, 5], [0, 0, 0, 0, 1]), 50),
+        }
+    }
+    _, overall, compared = tables.study_tables("S", found, [0, 1])
+    assert cells(overall, "CSAC, paper") == ["1.000", "1.000", "0.333"]  # 5/3 and 1/3
+    # 5 is above 2 and 4, 1 above neither; falls of 9 and 0 against 0 and 0: two pairs lost, two drawn.
+    assert cells(compared, "CSAC, paper", "**SAC, 0.2**") == ["0.500", "no verdict", "0.250", "no verdict", "0.500"]
 
 
-@pytest.mark.parametrize("page", STUDIED, ids=lambda page: page.parent.name)
-def test_the_command_of_a_study_s_report_writes_it(copied, page):
-    (line,) = re.findall(r"^csac (study report .*)$", page.read_text(), re.MULTILINE)
-    there = copied / page.parent.relative_to(ROOT)
-    shutil.rmtree(there)
-    assert main(shlex.split(line)) == 0
-    assert (there / "report.md").read_text() == page.read_text()
-    assert {path.name for path in there.glob("*.svg")} == {path.name for path in page.parent.glob("*.svg")}
+@pytest.mark.parametrize(
+    ("interval", "said"),
+    [((0.51, 0.9), "better"), ((0.1, 0.49), "worse"), ((0.5, 0.9), "not told apart"), (None, "no verdict")],
+)
+def test_a_verdict_needs_an_interval_beside_one_half(interval, said):
+    assert tables.verdict(interval) == said
 
 
-def test_the_table_of_the_relative_entropy_follows_from_its_runs(copied, monkeypatch, capsys):
-    script = copied / "results" / "reference" / "mechanism.py"
-    monkeypatch.setattr(sys, "argv", [str(script), "draw"])
-    runpy.run_path(str(script), run_name="__main__")
-    tables = capsys.readouterr().out.strip().split("\n\n")
-    assert [table.count("\n") > 10 for table in tables] == [True, True]
-    document = (ROOT / "docs" / "relative-entropy.md").read_text()
-    assert all(f"\n{table}\n" in document for table in tables)
-    assert (script.parent / "mechanism.png").stat().st_size > 10_000
+def test_returns_are_set_against_the_first_arm():
+    table = tables.returns_table({"one": rows([2, 2, 2, 2]), "two": rows([9, 6, 6, 6], [0, 0, 0, 0])})
+    assert cells(table, "one") == ["1", "40", "2.00", "1 seed: no interval", "1.00", "2.00 at 10"]
+    assert cells(table, "two") == ["2", "40", "3.00 ± 4.24", "2 seeds: no interval", "1.50", "4.50 at 10"]
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/algorithms/critics.md"])
-def test_what_documents_tell_of_the_preset_strong_stands_in_its_tables(document):
-    tables = (ROOT / "results" / "strong" / "README.md").read_text().partition("<!-- whose: begin -->")[2]
-    told = (ROOT / document).read_text().replace("95 % interval ", "")
-    returns = re.findall(r"[\d,]+\.\d ± [\d,]+\.\d", told)
-    assert len(returns) == 15
-    assert all(f"| {one} |" in tables for one in returns)
-    for pair in (
-        "CSAC, candidate | SAC, automatic",
-        "SAC, candidate | SAC, automatic",
-        "CSAC, candidate | **SAC, candidate**",
-    ):
-        probability = re.search(rf"^\| {re.escape(pair)} \| (.*?) \|", tables, re.MULTILINE)
-        assert probability is not None
-        assert probability[1] in told
+def test_an_arm_that_no_run_has_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="'SAC' is 0 arms"):
+        make.Page(tmp_path, {("CSAC", "Hopper-v4", ""): rows([1])}).arms(["SAC"])
 
 
-@pytest.mark.parametrize(("name", "tables"), EVIDENCE.items(), ids=EVIDENCE)
-def test_the_tables_of_the_evidence_follow_from_its_cells(copied, monkeypatch, name, tables):
-    page = copied / "results" / name / "README.md"
-    before = page.read_text()
-    emptied = before
-    for table in tables:
-        marks = rf"(<!-- {table}: begin -->\n).*?(<!-- {table}: end -->)"
-        emptied, count = re.subn(marks, r"\1\2", emptied, flags=re.DOTALL)
-        assert count == 1
-    page.write_text(emptied)
-    lines = re.findall(r"^python (results/reference/evidence.py tables .*)$", before, re.MULTILINE)
-    assert len(lines) == len(tables)
-    for line in lines:
-        monkeypatch.setattr(sys, "argv", shlex.split(line))
-        runpy.run_path(sys.argv[0], run_name="__main__")
-    assert page.read_text() == before
+@pytest.mark.slow
+def test_the_tables_of_every_page_follow_from_the_rows_beside_it(tmp_path):
+    shutil.copytree(ROOT / "results", tmp_path / "results", ignore=shutil.ignore_patterns("*.png", "__pycache__"))
+    (tmp_path / "docs").mkdir()
+    for page in PAGES:
+        emptied, count = make.TABLE.subn(r"\1\3", page.read_text())
+        assert count or page.parent.name == "reliability"
+        (tmp_path / page.relative_to(ROOT)).write_text(emptied)
+    make.main(tmp_path, has_pictures=False)
+    for page in PAGES:
+        assert (tmp_path / page.relative_to(ROOT)).read_text() == page.read_text()
 
 
-def test_the_tables_of_equal_time_follow_from_its_files(copied, monkeypatch):
-    page = copied / "results" / "strong" / "README.md"
-    before = page.read_text()
-    emptied, count = re.subn(
-        r"(<!-- equal-time: begin -->\n).*?(<!-- equal-time: end -->)", r"\1\2", before, flags=re.DOTALL
-    )
-    assert count == 1
-    page.write_text(emptied)
-    (line,) = re.findall(r"^python (results/strong/equal_time.py .*)$", before, re.MULTILINE)
-    monkeypatch.setattr(sys, "argv", shlex.split(line))
-    runpy.run_path(sys.argv[0], run_name="__main__")
-    assert page.read_text() == before
-    assert (copied / "results" / "strong" / "equal-time.png").exists()
+def test_every_interval_that_documents_tell_stands_in_a_table():
+    quoted = re.compile(r"\d\.\d{3} \(\d\.\d{3} to \d\.\d{3}\)")
+    known = {
+        one for page in PAGES for found in make.TABLE.finditer(page.read_text()) for one in quoted.findall(found[0])
+    }
+    told = {
+        one
+        for page in (ROOT / "README.md", *ROOT.glob("docs/algorithms/*.md"), ROOT / "docs" / "design.md", *PAGES)
+        for one in quoted.findall(make.TABLE.sub("", page.read_text()).replace("95 % interval ", ""))
+    }
+    assert told
+    assert told <= known
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
-def test_no_table_of_numbers_is_written_by_hand(page):
-    """What stands between markers is written by a command; any other table may only list files and commands."""
-    text = re.sub(r"<!-- (\S+): begin -->.*?<!-- \1: end -->", "", page.read_text(), flags=re.DOTALL)
-    text = re.sub(f"{MARKERS[0]}.*?{MARKERS[1]}", "", text, flags=re.DOTALL)
-    headings = [match.group().splitlines()[0] for match in TABLE.finditer(text)]
-    assert set(headings) <= {"| file | command |"}
+def test_every_run_has_evaluations_and_known_settings():
+    for path in ROOT.glob("results/*/runs.csv"):
+        runs = make.read_csv(path)
+        evaluated = {row["run"] for row in make.read_csv(path.with_name("evaluations.csv"))}
+        assert {run["run"] for run in runs} == evaluated
+        settings = json.loads(path.with_name("configs.json").read_text())
+        assert {run["config"] for run in runs} == settings.keys()
 
 
 def test_the_table_of_kills_follows_from_its_rows():
@@ -153,41 +120,3 @@ def test_the_table_of_kills_follows_from_its_rows():
 
 def _value(text: str) -> Any:
     return int(text) if text.lstrip("-").isdecimal() else text or None
-
-
-@pytest.mark.parametrize(
-    ("name", "mark", "pair", "documents"),
-    [
-        ("strong", "stage-1", "CSAC, paper | SAC, automatic", []),
-        ("strong", "aims", "CSAC, candidate | SAC, automatic", ["README.md", "docs/algorithms/critics.md"]),
-        ("strong", "aims", "CSAC, candidate | **SAC, candidate**", ["README.md", "docs/algorithms/critics.md"]),
-        ("strong", "aims", "SAC, candidate | SAC, automatic", ["README.md", "docs/algorithms/critics.md"]),
-        ("strong", "longer", "CSAC, candidate | **SAC, candidate**", ["docs/algorithms/critics.md"]),
-        ("strong", "again", "CSAC, candidate | **SAC, candidate**", []),
-        ("reference", "fresh", "CSAC, paper | **SAC, 0.2**", ["README.md"]),
-        ("reference", "fresh", "CSAC, paper | SAC, automatic", []),
-        ("reference", "fresh", "CSAC, previous | **SAC, 0.2**", ["README.md", "docs/design.md"]),
-        ("reference", "fresh", "CSAC, average 0.05 | **SAC, 0.2**", ["README.md", "docs/design.md"]),
-        ("reference", "fresh", "CSAC, average 0.05 | SAC, automatic", ["README.md"]),
-        ("reference", "ant", "CSAC, paper | **SAC, 0.2**", ["README.md"]),
-        ("reference", "ant", "CSAC, previous | **SAC, 0.2**", ["README.md"]),
-        ("reference", "ant", "CSAC, average 0.05 | **SAC, 0.2**", ["README.md"]),
-        ("reference", "recovery", "CSAC, previous | **SAC, 0.2**", []),
-        ("reference", "recovery", "CSAC, average 0.05 | **SAC, 0.2**", []),
-    ],
-)
-def test_what_documents_tell_of_a_comparison_stands_in_its_table(name, mark, pair, documents):
-    page = f"results/{name}/README.md"
-    table = (ROOT / page).read_text().partition(f"<!-- {mark}: begin -->")[2].partition(f"<!-- {mark}: end -->")[0]
-    row = re.search(rf"^\| {re.escape(pair)} \| (.*?) \| .*? \| (.*?) \|", table, re.MULTILINE)
-    assert row is not None
-    for document in [*documents, page]:
-        assert row[1] in _prose(document).replace("95 % interval ", "")
-    if pair.startswith("CSAC, previous | **"):  # of whose steadiness and recovery the verdict tells too
-        assert row[2] in _prose("README.md")
-        assert row[2] in _prose(page)
-
-
-def _prose(document: str) -> str:
-    """Return a document without what commands have written into it."""
-    return re.sub(r"<!-- (\S+): begin -->.*?<!-- \1: end -->", "", (ROOT / document).read_text(), flags=re.DOTALL)

@@ -55,8 +55,6 @@ NAVIGATION = {
         "docs/gpu",
         "benchmarks/README",
         "results/*/*",
-        "results/parity/*/README",
-        "results/studies/*/report",
     ],
     "Inside": ["docs/design", "docs/adding-an-algorithm", "CONTRIBUTING", "docs/reference/csac", "CHANGELOG"],
 }

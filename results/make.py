@@ -1,0 +1,336 @@
+"""Fill in the tables of the pages in results/ and of docs/relative-entropy.md, and draw their pictures: `make results`.
+
+A page says in a comment what stands below it: `<!-- table`, lines of TOML, `-->`, and at the end `<!-- end -->`. Their
+`kind` is a function in KINDS, the others are its arguments. Each folder has `runs.csv`, a row for each run,
+`evaluations.csv`, a row for each evaluation, which is the mean over its episodes, and `configs.json`, the settings that
+the column `config` names. Runs that differ in their seed alone are an arm.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tables import (
+    LAST_SHARE,
+    Finals,
+    comma,
+    compared,
+    measure,
+    number,
+    overall_table,
+    plus_minus,
+    recovery_table,
+    returns_table,
+    stacked,
+    study_tables,
+    table,
+)
+
+from csac.record.plots import COLOURS, learning_curve
+from csac.record.statistics import evaluation_matrix
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+TABLE = re.compile(r"(<!-- table\n(.*?)-->\n).*?(<!-- end -->)", re.DOTALL)
+COLUMNS = [("seed", int), ("step", int), ("return", float), ("success", float)]
+TOLD_SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the time, in the table of returns at equal time
+Rows = list[dict[str, str]]
+
+
+class Page:
+    """A page, the folder that its files are in, and all runs."""
+
+    def __init__(self, path: Path, runs: dict[tuple[str, str, str], np.ndarray], has_pictures: bool = True) -> None:
+        self.path, self.runs, self.has_pictures = path, runs, has_pictures
+
+    def fill_in(self) -> None:
+        """Write every table of the page."""
+        before = self.path.read_text(encoding="utf-8")
+        after = TABLE.sub(lambda found: f"{found[1]}{self._made(tomllib.loads(found[2]))}\n{found[3]}", before)
+        self.path.write_text(after, encoding="utf-8")
+
+    def _made(self, told: dict[str, Any]) -> str:
+        return KINDS[told.pop("kind")](self, **told)
+
+    def file(self, name: str) -> Path:
+        """Return a file by its path from the page."""
+        return self.path.parent / name
+
+    def arms(
+        self,
+        arms: list[str] | dict[str, str],
+        task: str = "",
+        seeds: list[int] | None = None,
+        until: float = np.inf,
+        changed: str = "",
+    ) -> dict[str, np.ndarray]:
+        """Return the evaluations of arms, by the names they are shown with; one of a single task needs no `task`."""
+        shown = arms if isinstance(arms, dict) else {arm.removeprefix("pilot: "): arm for arm in arms}
+        found = {}
+        for label, arm in shown.items():
+            parts = [rows for key, rows in self.runs.items() if key == (arm, task or key[1], changed)]
+            if len(parts) != 1:
+                raise ValueError(f"{self.path}: {arm!r} is {len(parts)} arms ({task or 'any task'}, {changed})")
+            wanted = (parts[0]["step"] <= until) & (np.isin(parts[0]["seed"], seeds or ()) | (not seeds))
+            found[label] = parts[0][wanted]
+        return found
+
+
+def read_csv(path: Path) -> Rows:
+    """Return the rows of a CSV."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def read_runs(directory: Path) -> dict[tuple[str, str, str], np.ndarray]:
+    """Return the evaluations of all runs in the folders of a directory, by arm, task and perturbation."""
+    found: dict[tuple[str, str, str], list[tuple[Any, ...]]] = {}
+    for path in sorted(directory.glob("*/runs.csv")):
+        runs = {row["run"]: row for row in read_csv(path)}
+        for row in read_csv(path.with_name("evaluations.csv")):
+            run = runs[row["run"]]
+            values = int(run["seed"]), int(row["step"]), float(row["return"]), float(row["success"] or "nan")
+            found.setdefault((run["arm"], run["task"], run["perturbation"]), []).append(values)
+    return {key: np.array(rows, COLUMNS) for key, rows in found.items()}
+
+
+# What stands on pages.
+
+
+def returns(page: Page, arms: Any, picture: str = "", title: str = "", **chosen: Any) -> str:
+    """Return the returns of arms, and draw their curves."""
+    found = page.arms(arms, **chosen)
+    if picture and page.has_pictures:
+        learning_curve(list(found.items()), page.file(picture), title)
+    return returns_table(found)
+
+
+def recoveries(
+    page: Page, arms: Any, step: int, friction: str = "", picture: str = "", title: str = "", **chosen: Any
+) -> str:
+    """Return what a change of the friction after a step cost, and draw the curves."""
+    found = page.arms(arms, changed=f"friction={friction}@{step}" if friction else "", **chosen)
+    if picture and page.has_pictures:
+        learning_curve(list(found.items()), page.file(picture), title, [(step, f"friction x {friction}")])
+    return recovery_table(found, step)
+
+
+def study(
+    page: Page,
+    file: str,
+    methods: tuple[str, ...] = (),
+    tasks: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (),
+    same: dict[str, str] | None = None,
+) -> str:
+    """Return all tables of a study, or of some of its methods, tasks or seeds; `same` are arms by other names."""
+    told = tomllib.loads(page.file(file).read_text(encoding="utf-8"))
+    labels = methods or [method["label"] for method in told["methods"]]
+    first = told.get("first_seed", 0)
+    of_study = seeds or range(first, first + told["seeds"])
+    changed = "".join(told.get("conditions", [[""]])[0])
+    changed_at = int(changed.partition("@")[2]) if changed else None
+    found = {}
+    for task in tasks or told["tasks"]:
+        steps = told.get("steps_on", {}).get(task, told["steps"])
+        arms = page.arms({label: (same or {}).get(label, label) for label in labels}, task, [*of_study], steps, changed)
+        found[task] = {label: measure(rows, steps, changed_at) for label, rows in arms.items()}
+    part = [f"seeds {comma(seeds)}"] * bool(seeds) + [f"on {comma(tasks)}"] * bool(tasks)
+    heading = f"## {told['title']}" + (f": {comma(part)} alone" if part else "")
+    return "\n\n".join([heading, *study_tables(told["title"], found, of_study, bool(changed))])
+
+
+def cases(page: Page, data: str) -> str:
+    """Return how often each event came in 1,000 fresh rollouts of each seed; returns and waypoints are means."""
+    rows = read_csv(page.file(data))
+    arms = list(dict.fromkeys(row["arm"] for row in rows))
+    lines = []
+    for name in list(rows[0])[3:]:
+        is_mean, form = name in ("return", "num_targets_reached"), ".3f" if name == "num_targets_reached" else ",.1f"
+        cells = [f"{name} (mean)" if is_mean else name]
+        for arm in arms:
+            values = np.array([float(row[name]) for row in rows if row["arm"] == arm]) * (1 if is_mean else 1_000)
+            cells.append(f"{values.mean():{form}} ± {values.std(ddof=1):{form}}")
+        lines.append(cells)
+    return table(["per 1,000 rollouts", *arms], lines)
+
+
+def equal_time(page: Page, data: str, peers: list[str], own: list[str], seeds: list[int], picture: str) -> str:
+    """Return what arms have reached in the time T that the first of `own` takes for all its steps, and draw it."""
+    plan, speeds, parts = read_csv(page.file(data)), [], []
+    finals: Finals = {}
+    drawn: dict[str, dict[str, np.ndarray]] = {}  # [seed, share], by task and arm
+    for task in dict.fromkeys(row["task"] for row in plan):
+        finals[task], drawn[task], lines = {}, {}, []
+        for label, rows in page.arms([*peers, *own], task, seeds).items():
+            told = [row for row in plan if (row["arm"], row["task"]) == (label, task)]
+            reached, final = _in_time(rows, told, label in own)
+            rate, seconds, steps = (float(told[-1][name]) for name in ("steps_per_second", "seconds", "steps"))
+            speeds.append([task, label, f"{rate:.1f}", f"{seconds:.0f}", f"{steps:,.0f}"])
+            means = [number(values.mean()) for share, values in reached.items() if share in TOLD_SHARES]
+            lines.append([label, plus_minus(final), number(final.min()), *means])
+            finals[task][label], drawn[task][label] = final, np.stack([*reached.values()], axis=1)
+        headings = ["method", "return at equal time, mean ± std", "worst seed", *(f"at {x:g} T" for x in TOLD_SHARES)]
+        parts.append(table(headings, lines, f"{task}: seeds {comma(seeds)}"))
+    if page.has_pictures:
+        times = {
+            task: sorted({float(r["share"]) * float(r["seconds"]) for r in plan if r["task"] == task}) for task in drawn
+        }
+        _draw_equal_time(page.file(picture), drawn, times)
+    speed = table(["task", "method", "steps per second", "T, s", "steps in T"], speeds, "How fast each is")
+    compared_with_peers = [_against(finals, label, peers, label != own[0], seeds) for label in own]
+    return "\n\n".join([speed, *parts, overall_table("Equal time", finals), *compared_with_peers])
+
+
+def _in_time(rows: np.ndarray, told: Rows, is_own: bool) -> tuple[dict[float, np.ndarray], np.ndarray]:
+    """Return each seed's last evaluation at each share of T, and the mean of those in the last fifth.
+
+    It is the last fifth of a peer's time, but of the steps of an own arm, which is what the other stages judge it by.
+    """
+    at, _, values = evaluation_matrix(rows)
+    reached = {float(row["share"]): values[:, at <= int(row["steps"])][:, -1] for row in told}
+    late = [values for share, values in reached.items() if share > 1 - LAST_SHARE]
+    within = min(int(told[-1]["steps"]), int(at[-1]))
+    return reached, measure(rows[rows["step"] <= within], within).final if is_own else np.mean(late, axis=0)
+
+
+def _against(finals: Finals, label: str, peers: list[str], is_secondary: bool, seeds: list[int]) -> str:
+    final, lines = stacked(finals), []
+    for peer in peers:
+        on_each = [compared(arms[label], arms[peer])[0] for arms in finals.values()]
+        lines.append([peer, *compared(final[label], final[peer]), *on_each])
+    headings = ["against", "P(higher return)", "so", *(f"P(higher return), {task}" for task in finals)]
+    return table(headings, lines, f"{label}{' (secondary)' * is_secondary}, against each peer: seeds {comma(seeds)}")
+
+
+def mechanism(page: Page, data: str, picture: str) -> str:
+    """Return the means over the second half of the runs with one weight, and draw these runs."""
+    arms = {name: rows for name, rows in _columns(page.file(data)).items() if "tau" not in name}
+    if page.has_pictures:
+        _draw_mechanism(page.file(picture), arms)
+    names = list(next(iter(arms.values())))[3:]
+    lines = [[name, *(f"{_late_mean(columns[name]):.3g}" for columns in arms.values())] for name in names]
+    return table(["second half of the run", *arms], lines)
+
+
+def weights(page: Page, data: str, columns: list[str]) -> str:
+    """Return some of these means for the runs with other weights, ordered by weight times lag."""
+    lines = []
+    for name, arm in _columns(page.file(data)).items():
+        tau, product = arm["tau"][0], arm["tau"][0] * arm["lag"][0]
+        if not name.endswith("sampled"):
+            line = [name, f"{tau:g}", f"{product:,.4g}", *(f"{_late_mean(arm[column]):.3g}" for column in columns)]
+            lines.append((product, line))
+    return table(["arm", "τ", "τL", *columns], [line for _, line in sorted(lines, key=lambda pair: pair[0])])
+
+
+def _columns(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Return the columns of each arm in a table whose first column names it."""
+    arms: dict[str, Rows] = {}
+    for row in read_csv(path):
+        arms.setdefault(row.pop("arm"), []).append(row)
+    return {
+        name: {column: np.array([float(row[column] or "nan") for row in rows]) for column in rows[0]}
+        for name, rows in arms.items()
+    }
+
+
+def _late_mean(values: np.ndarray) -> float:
+    return float(np.nanmean(values[len(values) // 2 :]))
+
+
+# Pictures.
+
+
+def _draw_equal_time(path: Path, reached: dict[str, dict[str, np.ndarray]], times: dict[str, list[float]]) -> None:
+    """Draw the mean over seeds and their range against the seconds of training."""
+    figure = _figure(7.5, 4.2)
+    for axes, (task, arms) in zip(figure.subplots(1, len(reached), sharey=True), reached.items(), strict=True):
+        for colour, (label, values) in zip(COLOURS, arms.items(), strict=True):
+            axes.fill_between(times[task], values.min(axis=0), values.max(axis=0), color=colour, alpha=0.1, linewidth=0)
+            axes.plot(
+                times[task],
+                values.mean(axis=0),
+                color=colour,
+                linewidth=2.2,
+                label=label.replace("candidate", "preset strong"),
+            )
+        _dress(axes, task, "seconds of training on two cores")
+        axes.set_xlim(0, times[task][-1])
+    figure.axes[0].set_ylabel("return per evaluation episode")
+    _save(figure, path, columns=4)
+
+
+FIGURES = (
+    ("relative_entropy", "KL to the reference, nats", True),
+    ("kl_gradient", "gradient of the KL part", True),
+    ("kl_noise", "noise of the KL part, batch of 256", True),
+    ("q_gradient", "gradient of the Q part", True),
+    ("cosine", "cosine of KL gradient and last update", False),
+    ("update", "length of the actor's last update", True),
+    ("churn", "KL of one update, held-out states", True),
+    ("critic_bias", "critic minus Monte-Carlo return", False),
+)
+
+
+def _draw_mechanism(path: Path, arms: dict[str, dict[str, np.ndarray]]) -> None:
+    """Draw what the relative entropy does along the runs: a colour for each reference, dots for the sampled KL."""
+    figure = _figure(16, 7.5)
+    colours = dict(zip(dict.fromkeys(name.partition(", ")[0] for name in arms), COLOURS, strict=False))
+    for axes, (column, title, is_log) in zip(figure.subplots(2, 4).flat, FIGURES, strict=True):
+        for name, rows in arms.items():
+            policy, _, estimator = name.partition(", ")
+            known = rows[column] > 1e-12 if is_log else ~np.isnan(rows[column])
+            style = "-" if estimator == "closed_form" else ":"
+            axes.plot(rows["step"][known], rows[column][known], style, color=colours[policy], label=name)
+        axes.set_yscale("log" if is_log else "linear")
+        _dress(axes, title, "environment steps")
+    _save(figure, path, columns=4)
+
+
+def _figure(width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _dress(axes: Axes, title: str, quantity: str) -> None:
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_xlabel(quantity)
+    axes.grid(color="#E4E4E4")
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _save(figure: Figure, path: Path, columns: int) -> None:
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
+    figure.savefig(path, dpi=1200 / figure.get_figwidth(), metadata={"Software": None})
+
+
+KINDS = {
+    "returns": returns,
+    "recoveries": recoveries,
+    "study": study,
+    "cases": cases,
+    "equal_time": equal_time,
+    "mechanism": mechanism,
+    "weights": weights,
+}
+
+
+def main(root: Path = Path(__file__).parents[1], has_pictures: bool = True) -> None:
+    """Make every page of a working copy."""
+    runs = read_runs(root / "results")
+    for path in (*sorted(root.glob("results/*/README.md")), root / "docs" / "relative-entropy.md"):
+        Page(path, runs, has_pictures).fill_in()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,235 @@
+"""The tables of the pages in results/, in Markdown, from rows of evaluations with the columns seed, step and return."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from csac.record.curve_measures import Recovery, drawdown, recovery
+from csac.record.statistics import (
+    FEWEST_FOR_BOOTSTRAP,
+    FEWEST_FOR_INTERVAL,
+    dispersion_across,
+    evaluation_matrix,
+    improvement_interval,
+    interquartile_mean,
+    last_evaluations,
+    maximum_average_return,
+    mean_and_interval,
+    probability_of_improvement,
+    stratified_bootstrap_interval,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+WORDS = {"method", "so", "against (bold: counterpart)"}  # headings of columns without numbers, beside the first
+LAST_SHARE = 0.2  # of a run's steps: its evaluations there are its final return
+EARLY = 100_000  # steps at which others publish their returns
+COUNTERPARTS = {"CSAC, candidate": "SAC, candidate"}  # of the other forms of CSAC it is SAC, 0.2
+
+Interval = tuple[float, float] | None
+Finals = dict[str, dict[str, np.ndarray]]  # final returns [seed], by task and arm
+
+
+class Measured(NamedTuple):
+    """What the seeds of one arm on one task have reached."""
+
+    final: np.ndarray  # [seed]
+    early: np.ndarray  # [seed] at 100,000 steps
+    drawdown: np.ndarray  # [seed]
+    loss: np.ndarray  # [seed] area lost as a share of the return before a change; without one, the drawdown
+    dispersion: float
+
+
+# Text.
+
+
+def table(headings: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> str:
+    """Return a table in Markdown, numbers to the right."""
+    rules = ["---" if index == 0 or heading in WORDS else "---:" for index, heading in enumerate(headings)]
+    lines = [f"| {' | '.join(cells)} |" for cells in (headings, rules, *rows)]
+    return "\n".join([f"**{title}**", "", *lines] if title else lines)
+
+
+def number(value: float, largest: float | None = None) -> str:
+    """Return a return as people read it, a small one with three digits; `largest` sets the form of a whole column."""
+    size = abs(value if largest is None else largest)
+    return f"{value:.3g}" if 0 < size < 0.1 else f"{value:,.{1 if size >= 100 else 2}f}"
+
+
+def plus_minus(values: np.ndarray) -> str:
+    """Return the mean and the standard deviation of the seeds."""
+    mean = values.mean()
+    return f"{number(mean)} ± {number(values.std(ddof=1), mean)}"
+
+
+def with_interval(value: float, interval: Interval, form: str = ".3f") -> str:
+    """Return a value with its interval in brackets, if it has one."""
+    return f"{value:{form}}" + (f" ({interval[0]:{form}} to {interval[1]:{form}})" if interval else "")
+
+
+def verdict(interval: Interval) -> str:
+    """Say what the interval of a probability of improvement says; there is none below five seeds."""
+    if interval is None:
+        return "no verdict"
+    return "better" if interval[0] > 0.5 else "worse" if interval[1] < 0.5 else "not told apart"
+
+
+def comma(values: Sequence[object]) -> str:
+    """Return values in one line."""
+    return ", ".join(map(str, values))
+
+
+# Returns, and recoveries from a change.
+
+
+def returns_table(runs: Mapping[str, np.ndarray]) -> str:
+    """Return what the last three evaluations of each arm are, and how they compare with the first arm's."""
+    scores = [np.array(list(last_evaluations(rows).values())) for rows in runs.values()]
+    has_middles = max(map(len, scores)) >= FEWEST_FOR_BOOTSTRAP
+    has_success = not any(np.isnan(rows["success"]).any() for rows in runs.values())
+    headings = ["run", "seeds", "steps", "last three evaluations, mean ± std over seeds", "95 % t-interval"]
+    headings += ["to the first", "maximum average return"]
+    headings += ["IQM, 95 % bootstrap interval", "above the first, probability"] * has_middles
+    headings += ["success, last three evaluations"] * has_success
+    lines = []
+    for (label, rows), own in zip(runs.items(), scores, strict=True):
+        best, step = maximum_average_return(rows)
+        ratio = f"{own.mean() / scores[0].mean():.2f}" if scores[0].mean() > 0 else ""
+        cells = [label, str(len(own)), f"{rows['step'].max():,}", *_mean_and_interval(own), ratio]
+        cells.append(f"{best:{_form(best)}} at {step:,}")
+        cells += _middle_and_above(own, scores[0]) if has_middles else ()
+        cells += [_success(rows)] if has_success else ()
+        lines.append(cells)
+    return table(headings, lines)
+
+
+def _mean_and_interval(values: np.ndarray) -> tuple[str, str]:
+    count, (mean, low, high) = len(values), map(float, mean_and_interval(values))
+    if count == 1:
+        return f"{mean:{_form(mean)}}", "1 seed: no interval"
+    std = float(values.std(ddof=1))
+    text = f"{mean:{_form(mean, std)}} ± {std:{_form(mean, std)}}"
+    if count < FEWEST_FOR_INTERVAL:
+        return text, f"{count} seeds: no interval"
+    form = _form(mean, high - low)
+    return text, f"{low:{form}} to {high:{form}}"
+
+
+def _middle_and_above(values: np.ndarray, first: np.ndarray) -> tuple[str, str]:
+    middle = interquartile_mean(values)
+    text = with_interval(middle, stratified_bootstrap_interval(values, interquartile_mean), _form(middle))
+    if values is first:
+        return text, ""
+    return text, with_interval(probability_of_improvement(values, first), improvement_interval(values, first), ".2f")
+
+
+def _success(rows: np.ndarray) -> str:
+    last = rows[np.isin(rows["step"], np.unique(rows["step"])[-3:])]
+    shares = np.array([last["success"][last["seed"] == seed].mean() for seed in np.unique(last["seed"])])
+    return f"{shares.mean():.0%} ± {shares.std(ddof=1):.0%}"
+
+
+def _form(value: float, spread: float = np.nan) -> str:
+    if abs(value) >= 20:
+        return ",.2f" if 0 < spread < 1 else ",.0f"
+    return ".3g" if 0 < abs(value) < 0.1 else ".2f"
+
+
+def recovery_table(runs: Mapping[str, np.ndarray], step: int) -> str:
+    """Return what a change after `step` cost each seed, and how it came back."""
+    headings = ("run", "seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "drawdown")
+    lines = []
+    for label, rows in runs.items():
+        seeds = recovery(rows, step)
+        values = np.array(list(seeds.values()))
+        largest = max(abs(value) for one in seeds.values() for value in (one.before, one.drop, one.final))
+        parts = {**seeds, "mean": Recovery(*values.mean(axis=0)), "± std": Recovery(*values.std(axis=0, ddof=1))}
+        lines += [[label, str(name), *_recovery_cells(one, largest)] for name, one in parts.items()]
+    return table(headings, lines)
+
+
+def _recovery_cells(one: Recovery, largest: float) -> list[str]:
+    size, suffix = (1e6, "M") if one.area_lost >= 1e6 else (1e3, "k")
+    area = f"{one.area_lost / size:.4g}{suffix}" if one.area_lost >= 1e3 else f"{one.area_lost:.3g}"
+    cells = [number(one.before, largest), number(one.drop, largest), f"{one.relative_drop:.0%}"]
+    return [*cells, f"{one.steps_to_regain:,.0f}", area, *(number(x, largest) for x in (one.final, one.worst_drawdown))]
+
+
+# By the rules of the protocols.
+
+
+def measure(rows: np.ndarray, steps: int, changed_at: int | None = None) -> Measured:
+    """Return what an arm has reached; a seed's final return is the mean of its evaluations in the last fifth."""
+    at, _, values = evaluation_matrix(rows)
+    falls = np.array([drawdown(curve) for curve in values])
+    areas = [one.area_lost / abs(one.before) for one in recovery(rows, changed_at).values()] if changed_at else falls
+    return Measured(
+        values[:, at > (1 - LAST_SHARE) * steps].mean(axis=1),
+        values[:, at == EARLY].mean(axis=1) if EARLY in at else np.full(len(values), np.nan),
+        falls,
+        np.array(areas),
+        dispersion_across(values),
+    )
+
+
+def study_tables(
+    title: str, found: Mapping[str, Mapping[str, Measured]], seeds: Sequence[int], is_changed: bool = False
+) -> list[str]:
+    """Return what each arm has reached on each task, by task and arm, and the comparisons over all tasks."""
+    finals = {task: {label: one.final for label, one in arms.items()} for task, arms in found.items()}
+    losses = {task: {label: one.loss for label, one in arms.items()} for task, arms in found.items()}
+    comparisons = _comparison_table(finals, losses, "less area lost" if is_changed else "smaller drawdown")
+    titled = f"**{title}: comparisons, seeds {comma(seeds)}**\n\n{comparisons}"
+    return [*(_task_table(task, arms) for task, arms in found.items()), overall_table(title, finals), titled]
+
+
+def _task_table(task: str, arms: Mapping[str, Measured]) -> str:
+    headings = ["method", "seeds", "final return, mean ± std", f"at {EARLY:,} steps, mean", "drawdown, mean"]
+    lines = []
+    for label, one in arms.items():
+        numbers = one.early.mean(), one.drawdown.mean(), one.dispersion, one.final.min()
+        lines.append([label, str(len(one.final)), plus_minus(one.final), *map(number, numbers)])
+    return table([*headings, "dispersion over seeds", "worst seed"], lines, task)
+
+
+def overall_table(title: str, finals: Finals) -> str:
+    """Return the scores over all tasks: final returns as shares of the first arm's mean."""
+    values = stacked(finals)
+    first = next(iter(values))
+    lines = []
+    for label, own in values.items():
+        shares = own / values[first].mean(axis=0)
+        middle = with_interval(interquartile_mean(shares), stratified_bootstrap_interval(shares, interquartile_mean))
+        lines.append([label, f"{shares.mean(axis=0).mean():.3f}", middle, f"{shares.min():.3f}"])
+    title = f"{title}: over {comma(list(finals))}, as shares of {first}"
+    return table(["method", "scaled mean", "scaled IQM", "worst seed"], lines, title)
+
+
+def stacked(values: Finals) -> dict[str, np.ndarray]:
+    """Return the values [seed, task] of each arm."""
+    return {label: np.stack([arms[label] for arms in values.values()], axis=1) for label in next(iter(values.values()))}
+
+
+def compared(values: np.ndarray, others: np.ndarray) -> tuple[str, str]:
+    """Return the probability that the first are higher, with its interval, and the verdict."""
+    interval = improvement_interval(values, others)
+    return with_interval(probability_of_improvement(values, others), interval), verdict(interval)
+
+
+def _comparison_table(finals: Finals, losses: Finals, less: str) -> str:
+    """Compare each form of CSAC with each of SAC, and these with the first of them, over all tasks and on each."""
+    final, loss = stacked(finals), stacked(losses)
+    forms_of_sac = [label for label in final if label.startswith("SAC")]
+    lines = []
+    for label in final:
+        for other in forms_of_sac[:1] if label in forms_of_sac else forms_of_sac:
+            if label != other:
+                is_counterpart = label not in forms_of_sac and COUNTERPARTS.get(label, "SAC, 0.2") == other
+                cells = [label, f"**{other}**" if is_counterpart else other]
+                cells += [*compared(final[label], final[other]), *compared(-loss[label], -loss[other])]
+                lines.append([*cells, *(compared(arms[label], arms[other])[0] for arms in finals.values())])
+    headings = ["method", "against (bold: counterpart)", "P(higher return)", "so", f"P({less})", "so"]
+    return table([*headings, *(f"P(higher return), {task}" for task in finals)], lines)
