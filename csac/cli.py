@@ -207,7 +207,7 @@ def _evaluate(arguments: list[str]) -> int:
     options = parse(Evaluate, arguments, "csac evaluate")
     from csac.console.tables import case_table, evaluation_table, make_console, silent_events
     from csac.console.waiting import progress_shown
-    from csac.deploy.choosing import step_of_policy
+    from csac.deploy.choosing import load
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.play import evaluate_run, perturbation_notes
     from csac.record.csv_tables import COLUMNS, check_new, write_rows
@@ -252,7 +252,7 @@ def _evaluate(arguments: list[str]) -> int:
         _say(f"note: seed {seed} failed at {manifest.failures[seed]}; it is in no mean, and in no file of rows")
     _tell_of_warmup(manifest)
     if options.csv:
-        steps = {seed: step_of_policy(run, seed, options.checkpoint) for seed in sound}
+        steps = {seed: load(run.path, seed, options.checkpoint).step for seed in sound}
         rows = [episode.row(seed, steps[seed]) for seed, episodes in sound.items() for episode in episodes]
         if not rows:
             return _complain(f"{options.csv} is not written: every seed that was tested had failed in training", 1)
@@ -295,34 +295,33 @@ def _play(arguments: list[str]) -> int:
 
 def _export(arguments: list[str]) -> int:
     options = parse(Export, arguments, "csac export")
-    from csac.console.exports import export_lines, size_table
+    from csac.console.exports import export_lines
     from csac.console.tables import make_console
     from csac.console.waiting import progress_shown
     from csac.evaluation.evaluator import EvaluationFailure
     from csac.evaluation.export import export_run
     from csac.record.run import RunDirectory
 
-    console, exported = make_console(), []
+    console = make_console()
     try:
-        with progress_shown(console, "verifying", "episodes") as on_progress:
-            for one in export_run(
+        with progress_shown(console, "exporting", "artefacts"):
+            exported = export_run(
                 options.run,
-                tuple(options.format.replace(" ", "").split(",")),  # pyright: ignore[reportArgumentType] (others are refused by name)
+                options.format,
                 options.seed_label(),
                 options.checkpoint,
                 options.out,
-                options.options(),
+                options.fallback,
+                options.rate_limit,
+                options.episodes,
+                options.card,
                 trust_task=options.trust_task,
-                on_progress=on_progress,
-            ):
-                exported.append(one)
-                for line in export_lines(one):
-                    console.print(line, soft_wrap=True)
+            )
     except EvaluationFailure as error:
         return _complain(error, 1)
-    if (sizes := size_table(exported)) is not None:
-        console.print(sizes)
-    for line in dict.fromkeys(line for one in exported for line in one.notes):  # most are of every format's
+    for line in (str(exported.place), *export_lines(exported.fields["verification"])):
+        console.print(line, soft_wrap=True)
+    for line in exported.notes:
         _say(f"note: {line}")
     _tell_of_warmup(RunDirectory.open(options.run).manifest)
     return 0
@@ -339,26 +338,16 @@ def _latency(arguments: list[str]) -> int:
     options = parse(Latency, arguments, "csac latency")
     if not options.artefacts:
         raise InputError("give the folder of an artefact (csac export writes one)")
-    from csac.console.latencies import latency_table
+    from csac.console.exports import latency_table
     from csac.console.tables import make_console
     from csac.deploy.artefact import open_artefact
-    from csac.evaluation.latency import check_measurement, measure
-    from csac.record.csv_tables import check_new
+    from csac.deploy.latency import measure
 
     console, measured = make_console(), {}
-    if options.plot:
-        check_new(options.plot, "picture", ".png")
-    for path in options.artefacts:  # bad arguments are refused before any is measured
-        check_measurement(open_artefact(path), options.calls, options.rate, options.seconds)
-    for path in options.artefacts:
-        console.print(f"measuring {path}", soft_wrap=True)  # once: what moves on a terminal takes time from a core
-        measured[str(path)] = measure(path, options.calls, options.rate, options.seconds)
+    for name, artefact in {str(path): open_artefact(path, optimise=True) for path in options.artefacts}.items():
+        console.print(f"measuring {name}", soft_wrap=True)  # once: what moves on a terminal takes time from a core
+        measured[name] = measure(artefact, options.calls, options.rate, options.seconds)
     console.print(latency_table(measured))
-    if options.plot:
-        from csac.record.jitter import Calls, jitter  # matplotlib is slow to import
-
-        jitter([Calls(name, *latency) for name, several in measured.items() for latency in several], options.plot)
-        console.print(str(options.plot), soft_wrap=True)
     return 0
 
 

@@ -16,7 +16,6 @@ from csac.training.options import Options
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from csac.evaluation.export import ExportOptions
     from csac.record.manifest import Manifest
     from csac.training.options import PlanOptions
 
@@ -180,7 +179,7 @@ class Play:
 class Export:
     """Export a policy that maps the raw observation to the environment's action, and verify it.
 
-    Each artefact is a folder with the policy and contract.json, which describes its inputs and outputs.
+    The artefact is a folder with the policy and contract.json, which describes its inputs and outputs.
     """
 
     run: Annotated[Positional[Path], arg(metavar="DIR")]
@@ -189,28 +188,14 @@ class Export:
     """Label of the seed; best is the one with the best last evaluations."""
     checkpoint: Literal["last", "best"] = "last"
     """The seed's last policy, or the one of its best evaluation."""
-    format: Annotated[str, arg(metavar="numpy|onnx|c,...")] = "numpy"
-    """numpy: needs only NumPy, with a loader beside it. onnx: a graph. c: one C99 header. Several: with commas."""
+    format: Literal["numpy", "onnx", "c"] = "numpy"
+    """numpy: needs only NumPy, with a loader beside it. onnx: a graph. c: one C99 header."""
     out: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="(default: DIR/export/FORMAT)")] = None
-    """The artefact's folder; with several formats, their parent folder."""
-    weights: Literal["float32", "float16", "int8"] = "float32"
-    """Number format of the weights in C; the error of the smaller formats is reported."""
-    stochastic: FlagCreatePairsOff[bool] = False
-    """Sample actions as in training. In ONNX the noise is a second input, because a graph cannot be seeded."""
-    noise_seed: Annotated[int | None, arg(help_behavior_hint="(default: 0)")] = None
-    """Seed of the noise of --stochastic."""
+    """The artefact's folder."""
     fallback: Annotated[str | None, arg(metavar="zero|middle|last|X,...", help_behavior_hint="(default: no guard)")] = (
         None
     )
-    """Guard against NaN and infinity in observations: the action to take then."""
-    observation_range: Annotated[
-        Literal["bounds", "recorded"] | None, arg(help_behavior_hint="(default: any finite number is good)")
-    ] = None
-    """Also guard against observations outside the task's bounds, or outside the range seen in the export's episodes."""
-    range_margin: Annotated[float | None, arg(help_behavior_hint="(default: 0.5)")] = None
-    """How far beyond the recorded range is still good, as a share of its width."""
-    watchdog: Annotated[int | None, arg(help_behavior_hint="(default: never)")] = None
-    """After this many bad observations in a row, stay with the fallback until a reset."""
+    """Guard against NaN and infinity: the action to take then."""
     rate_limit: Annotated[
         float | None,
         arg(
@@ -220,33 +205,11 @@ class Export:
         ),
     ] = None
     episodes: int = 10
-    """Episodes to verify with, the same as those of csac evaluate."""
-    no_rollouts: FlagCreatePairsOff[bool] = False
-    """Run no episodes, for example if the task cannot be made on this machine."""
+    """Episodes to verify with, the same as those of csac evaluate; 0 if the task cannot be made on this machine."""
     card: FlagCreatePairsOff[bool] = False
     """Also write a model card, README.md."""
     trust_task: FlagCreatePairsOff[bool] = False
     """Allow the task to import its module although you have never named it on this machine; read it first."""
-
-    def options(self) -> ExportOptions:
-        """Return how the policy is to leave its run."""
-        from csac.evaluation.export import ExportOptions
-
-        if self.episodes < 1:
-            raise InputError(f"--episodes {self.episodes}: give at least 1, or --no-rollouts")
-        if self.noise_seed is not None and not self.stochastic:
-            raise InputError(f"--noise-seed {self.noise_seed} is of noise that --stochastic samples with: give both")
-        return ExportOptions(
-            (self.noise_seed or 0) if self.stochastic else None,
-            self.weights,
-            self.fallback,
-            self.observation_range,
-            self.range_margin,
-            self.watchdog,
-            self.rate_limit,
-            0 if self.no_rollouts else self.episodes,
-            self.card,
-        )
 
     def seed_label(self) -> int | None:
         """Return the seed that was asked for, or None for the best. Raises InputError for neither."""
@@ -272,8 +235,6 @@ class Latency:
     """Calls per second of the measurement at a fixed rate."""
     seconds: float = 10.0
     """Length of the measurement at a fixed rate; 0 skips it."""
-    plot: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="(default: none)")] = None
-    """Draw the distributions of call times and of lateness."""
 
 
 @dataclass(frozen=True)

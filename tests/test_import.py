@@ -45,10 +45,7 @@ def tiny_run(tmp_path):
     run = RunDirectory.create(tmp_path / "run", manifest)
     rows = {"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 5, "success": None}
     run.append("evaluations", [rows])
-    agreement = contract()
-    (run.path / "policy").mkdir()
-    agreement.save(run.path / "policy" / "contract.json")
-    random_policy(agreement).save_layers(run.path / "policy" / "seed_0.safetensors")
+    random_policy(contract(), step=9).write(run.policy(0))
     return tmp_path
 
 
@@ -95,7 +92,7 @@ def test_what_needs_no_learning_imports_no_jax(arguments, tiny_run):
 def test_loading_a_policy_imports_no_jax_and_no_task(tiny_run):
     code = "from csac import load; import numpy; load('run').predict(numpy.zeros(2))"
 
-    assert not {"jax", "jaxlib", "equinox", "optax", "gymnasium", "safetensors"} & modules_after(code, tiny_run)
+    assert not {"jax", "jaxlib", "equinox", "optax", "gymnasium"} & modules_after(code, tiny_run)
 
 
 def test_evaluating_in_python_imports_no_jax(tiny_run):

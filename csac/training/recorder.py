@@ -85,7 +85,6 @@ class Recorder:
         if origin and origin.has_other_returns:
             known = known[known["step"] > origin.step]
         self._best = {k: v for k, v in best_returns(known).items() if self.run.policy(k, "best").exists()}
-        self._has_contract = False  # of this task: a fork begins with its source's
         # Told once, after the first evaluation of the run.
         self._unheard = set() if len(run.evaluations) else set(run.manifest.events)
         self._info_names: set[str] = set()
@@ -154,7 +153,7 @@ class Recorder:
         for seed, value in mean_returns(message.rows).items():
             if value > self._best.get(seed, -np.inf):
                 self._best[seed] = value
-                message.policies[seed].save_layers(self.run.policy(seed, "best"))
+                message.policies[seed].write(self.run.policy(seed, "best"))
 
     def _commit_when_whole(self, group: int, message: Saved) -> None:
         """Keep a group's best policies with its files; with the last living group's files there is a checkpoint."""
@@ -272,11 +271,7 @@ class Recorder:
 
     def _save(self, policies: dict[int, Policy]) -> None:
         for seed, policy in policies.items():
-            if not self._has_contract:
-                self.run.contract.parent.mkdir(exist_ok=True)
-                policy.contract.save(self.run.contract)
-                self._has_contract = True
-            policy.save_layers(self.run.policy(seed))
+            policy.write(self.run.policy(seed))
 
     def _flush(self, until: int = OVER) -> None:
         """Write the rows that no group can precede any more, as far as step `until`."""

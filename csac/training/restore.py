@@ -7,6 +7,7 @@ import re
 from contextlib import suppress
 from typing import TYPE_CHECKING, get_args
 
+from csac.deploy.contract import write_with_checksum
 from csac.record.atomic import write_atomically
 from csac.record.run import Table
 from csac.training.checkpoint import BEST, FOLDER, Damaged, original_of
@@ -52,7 +53,10 @@ def restore(run: Path, checkpoint: Checkpoint | None) -> list[str]:
                 told.append(f"{error}; the best policy is one of later evaluations")
                 continue
             kept.add(path)
-            if not _cut_back(path, content) and name.endswith(".csv"):
+            if name.endswith(BEST):
+                path.parent.mkdir(exist_ok=True)
+                write_with_checksum(path, content)
+            elif not _cut_back(path, content):
                 told.append(f"{path} had changed since the checkpoint; it is restored")
     for path in {*(run / f"{table}.csv" for table in get_args(Table)), *run.glob(f"policy/seed_*{BEST}")} - kept:
         path.unlink(missing_ok=True)
@@ -108,7 +112,6 @@ def _cut_back(path: Path, content: bytes) -> bool:
         if is_sound:
             os.truncate(path, len(content))
             return True
-    path.parent.mkdir(exist_ok=True)
     write_atomically(path, content)
     return False
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
+from csac.deploy.contract import Contract, write_json
 from csac.record.manifest import OTHER_TASK, Continuation, Origin, differences
 from csac.record.run import RunDirectory, Table, now
 from csac.tasks.perturbations import continued, perturbations_of
@@ -260,7 +260,7 @@ class Source(NamedTuple):
         values = {**self.checkpoint.values, "failures": {k: v for k, v in failures if int(k) in run.manifest.seeds}}
         if self.run.contract.exists():
             run.contract.parent.mkdir(exist_ok=True)
-            shutil.copyfile(self.run.contract, run.contract)
+            write_json(run.contract, Contract.load(self.run.contract).fields())  # without the checksums of its policies
         Checkpoints(run.checkpoints, keep).commit(self.checkpoint.step, files, values)
 
 

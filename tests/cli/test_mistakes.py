@@ -48,7 +48,7 @@ from typed import csac
             "study run smoke --engine x",
             "--engine: 'x' is not one of 'local', 'processes', 'ray' (csac study run --help)",
         ),
-        ("latency nowhere", "nowhere does not exist; give the folder of an artefact (csac export writes one)"),
+        ("latency nowhere", "nowhere is not an artefact: give a folder that csac export has written"),
         ("train X --no_such_thing=3", "there is no option --no-such-thing (csac train --help)"),
         ("train X Y", "there is no place for 'Y': one task a run; several: csac study (csac train --help)"),
         ("train X --algorithm SAC", "no algorithm is called 'SAC'; did you mean sac?"),

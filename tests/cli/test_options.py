@@ -13,7 +13,6 @@ import csac.evaluation.play as playing
 import csac.training.train as training
 from csac.algorithms import ALGORITHMS, CSAC, SAC
 from csac.arguments import peek
-from csac.evaluation.export import ExportOptions
 from csac.record.manifest import EvaluationPlan
 from csac.record.run import RunDirectory
 from csac.training.checkpoint import Checkpoint
@@ -125,24 +124,36 @@ def test_play_passes_its_options_on(monkeypatch):
 
 def test_export_passes_its_options_on(monkeypatch):
     make_run("run", "Pictures-v0", 3, [-2.0], [2.0])
-    calls = calls_of(monkeypatch, exporting, "export_run")
-    line = "export run --seed 1 --checkpoint best --format 'onnx, c' --out there --weights int8 --stochastic "
-    line += "--noise-seed 5 --fallback middle --observation-range recorded --range-margin 0.25 --watchdog 3 "
+    exported = exporting.Exported(Path("there"), {"verification": {"observations": 1, "largest_difference": 0.0}}, [])
+    calls = calls_of(monkeypatch, exporting, "export_run", exported)
+    line = "export run --seed 1 --checkpoint best --format onnx --out there --fallback middle "
     line += "--rate-limit 0.1 --episodes 4 --card --trust-task"
-    assert csac(line) == csac("export run") == csac("export run --stochastic --no-rollouts") == 0
-    told = {"directory": Path("run"), "seed": None, "which": "last", "place": None, "trust_task": False}
+    assert csac(line) == csac("export run") == 0
     assert calls == [
         {
             "directory": Path("run"),
-            "formats": ("onnx", "c"),
+            "format": "onnx",
             "seed": 1,
             "which": "best",
             "place": Path("there"),
-            "options": ExportOptions(5, "int8", "middle", "recorded", 0.25, 3, 0.1, 4, card=True),
+            "fallback": "middle",
+            "rate_limit": 0.1,
+            "episodes": 4,
+            "card": True,
             "trust_task": True,
         },
-        {**told, "formats": ("numpy",), "options": ExportOptions()},
-        {**told, "formats": ("numpy",), "options": ExportOptions(noise_seed=0, episodes=0)},
+        {
+            "directory": Path("run"),
+            "format": "numpy",
+            "seed": None,
+            "which": "last",
+            "place": None,
+            "fallback": None,
+            "rate_limit": None,
+            "episodes": 10,
+            "card": False,
+            "trust_task": False,
+        },
     ]
 
 

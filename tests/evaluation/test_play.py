@@ -63,9 +63,7 @@ def run_of(tmp_path):
         if task not in gymnasium.registry:
             gymnasium.register(task, entry_point=f"{__name__}:Stripes", max_episode_steps=steps)
         run = RunDirectory.create(tmp_path / "run", Manifest(task=task, algorithm="csac", seeds=(0,), steps=9))
-        run.contract.parent.mkdir()
-        agreement.save(run.contract)
-        random_policy(agreement).save_layers(run.policy(0))
+        random_policy(agreement).write(run.policy(0))
         return run
 
     return make
@@ -175,8 +173,8 @@ def test_an_ffmpeg_that_ends_is_told_in_one_line(run_of, tmp_path, monkeypatch, 
 def test_the_policy_of_the_best_evaluation_can_be_tested_and_watched(run_of, tmp_path, monkeypatch):
     """Its rows are of the step at which it was saved."""
     run = run_of(3)
-    best = random_policy(contract(), 5)
-    best.save_layers(run.policy(0, "best"))
+    best = random_policy(contract(), 5, step=6)
+    best.write(run.policy(0, "best"))
     run.append("evaluations", [evaluation(step, value) for step, value in ((3, 1.0), (6, 8.0), (9, 2.0))])
     (expected,) = best.contract.to_environment(best.act(np.zeros((1, 2), np.float32)))[0]
     monkeypatch.chdir(tmp_path)
@@ -204,8 +202,8 @@ def test_the_best_policies_of_a_run_are_those_of_the_seeds_that_were_evaluated(r
         list(evaluate_run(run.path, episodes=1, processes=1, which="best"))
     run.update_manifest(seeds=(0, 1), failures={1: "step 5: it broke"})
     for which in ("last", "best"):
-        random_policy(contract()).save_layers(run.policy(0, which))
-    random_policy(contract()).save_layers(run.policy(1))
+        random_policy(contract()).write(run.policy(0, which))
+    random_policy(contract()).write(run.policy(1))
     run.append("evaluations", [{"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 3}])
     assert [seed for seed, _ in evaluate_run(run.path, episodes=1, processes=1, which="best")] == [0]
     assert main(["evaluate", str(run.path), "--checkpoint", "best", "--episodes", "1", "--processes", "1"]) == 0

@@ -83,13 +83,11 @@ def make_run(path, task, observation_size, low, high, seeds=(0, 1)):
         action_low=np.array(low, np.float32),
         action_high=np.array(high, np.float32),
     )
-    (path / "policy").mkdir()
-    contract.save(path / "policy" / "contract.json")
     generator = np.random.default_rng(0)
     for seed in seeds:
         weight = generator.normal(size=(observation_size, 2 * len(low))).astype(np.float32)
         network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * len(low), np.float32)),),)))
-        Policy(network, contract).save_layers(path / "policy" / f"seed_{seed}.safetensors")
+        Policy(network, contract, step=100).write(run.policy(seed))
         rows = {"seed": seed, "step": 100, "episode": 0, "return": float(seed), "length": 5, "success": None}
         run.append("evaluations", [rows])
     run.update_manifest(state="finished")

@@ -68,7 +68,7 @@ def policy_for(task: str, width: int = 8, seed: int = 0) -> Policy:
     )
     contract = Contract(task, "sac", "relu", "tanh_gaussian", *environment.contract_parts)
     environment.close()
-    return Policy(PolicyNetwork(PolicyParameters((layers,))), contract)
+    return Policy(PolicyNetwork(PolicyParameters((layers,))), contract, step=9)
 
 
 def make_run(path: Path, task: str, events: tuple[str, ...] = (), seeds: tuple[int, ...] = (0,), arguments: Any = None):
@@ -83,11 +83,8 @@ def make_run(path: Path, task: str, events: tuple[str, ...] = (), seeds: tuple[i
         environment_arguments=arguments or {},
     )
     run = RunDirectory.create(path, manifest)
-    (path / "policy").mkdir()
     for seed in seeds:
-        policy = policy_for(task, seed=seed)
-        policy.contract.save(path / "policy" / "contract.json")
-        policy.save_layers(path / "policy" / f"seed_{seed}.safetensors")
+        policy_for(task, seed=seed).write(run.policy(seed))
     run.update_manifest(state="finished")
     return run
 

@@ -58,10 +58,7 @@ def stranger(tmp_path, monkeypatch):
     def make_run(task: str) -> Path:
         path = folder / "run"
         manifest = Manifest(task=task, algorithm="csac", seeds=(0,), steps=9, state="finished", steps_done=9)
-        RunDirectory.create(path, manifest)
-        (path / "policy").mkdir()
-        random_policy(contract()).save_layers(path / "policy" / "seed_0.safetensors")
-        contract().save(path / "policy" / "contract.json")
+        random_policy(contract()).write(RunDirectory.create(path, manifest).policy(0))
         return path
 
     return SimpleNamespace(folder=folder, marker=marker, make_run=make_run, state=tmp_path / "state")

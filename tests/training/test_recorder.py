@@ -9,7 +9,7 @@ from probes import Endless
 from resuming import SMALL
 
 from csac.algorithms import SAC
-from csac.deploy.choosing import step_of_policy
+from csac.deploy.choosing import load
 from csac.record.manifest import Manifest, Origin, differences
 from csac.record.run import RunDirectory
 from csac.training.checkpoint import Checkpoint, Checkpoints, steps_in
@@ -156,7 +156,7 @@ def test_a_task_that_cannot_be_made_again_for_an_evaluation_costs_no_run(tmp_pat
         run = train(SAC(**SMALL), only_one, steps=50, evaluation_interval=50, directory=tmp_path / "run")
     assert run.manifest.state == "failed"
     assert "port 5555 is taken" in run.manifest.failures[0]
-    assert (step_of_policy(run, 0, "last"), len(run.rows("episodes"))) == (50, 5)
+    assert (load(run.path, 0).step, len(run.rows("episodes"))) == (50, 5)
 
 
 @pytest.mark.parametrize(
@@ -175,8 +175,7 @@ def test_the_best_policy_of_another_task_gives_way_to_the_first_of_this(tmp_path
     forked = RunDirectory.create(tmp_path / "run", manifest)
     forked.append("evaluations", evaluations)
     policy = random_policy(contract())
-    forked.policy(0, "best").parent.mkdir(parents=True)
-    policy.save_layers(forked.policy(0, "best"))
+    policy.write(forked.policy(0, "best"))
     before = forked.policy(0, "best").read_bytes()
     recorder = Recorder(forked, [[0]], None, (), begin=100)
     row = {"seed": 0, "step": 150, "episode": 0, "return": 3.0, "length": 9}
