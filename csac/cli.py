@@ -62,9 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    with suppress(OSError):  # a folder that is gone
-        # The user's own modules, as `python -m csac` finds them; last, so that they hide nothing of csac's.
-        sys.path += [os.getcwd()] if os.getcwd() not in sys.path else []
     try:
         code = _answer(arguments)
     finally:
@@ -267,7 +264,7 @@ def _play(arguments: list[str]) -> int:
     from csac.console.waiting import progress_shown
     from csac.evaluation.play import perturbation_notes, play
     from csac.record.rendering import number
-    from csac.tasks.spaces import EnvironmentFailure
+    from csac.tasks.failures import EnvironmentFailure
 
     console = make_console()
     for line in perturbation_notes(options.run, options.perturb):

@@ -18,7 +18,7 @@ from csac.console.tables import duration, events_table, make_console, program, r
 from csac.console.waiting import SECONDS_OF_SILENCE, Speed
 from csac.record.rendering import number, short
 from csac.record.statistics import evaluation_matrix
-from csac.tasks.making import can_be_drawn
+from csac.tasks.registry import can_be_drawn
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -2,73 +2,44 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from contextlib import closing
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from csac.checks import check_flag, check_whole
 from csac.deploy.contract import BOUNDS_ROUNDING
-from csac.deploy.policy import Policy, noise_generator
-from csac.record.manifest import SEED_LIMIT
+from csac.deploy.policy import Policy
+from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, Playing
+from csac.evaluation.pending import EvaluationStopped, Pending
 from csac.tasks.environment import Environment
-from csac.tasks.known import check_events, events_of
 from csac.tasks.perturbations import constant_perturbations, values_at
+from csac.tasks.registry import check_events, events_of
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
-from csac.tasks.spaces import EnvironmentFailure
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from csac.deploy.contract import Contract
-    from csac.tasks.making import Task
+    from csac.evaluation.pending import Batch, OnProgress, Result
     from csac.tasks.perturbations import Perturbation
+    from csac.tasks.registry import Task
     from csac.tasks.spaces import Parts
 
-    OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
 
 EPISODES_AT_ONCE = 10  # rows of every batch that the policy sees: rounding depends on its shape
 LONGEST_EPISODE = 100_000  # steps; a task that never ends would never let training go on
+STEPS_BETWEEN_STOPS = 1_000
 
-
-class EvaluationFailure(RuntimeError):
-    """An evaluation environment raised, or gave what is not finite. The message names the episode and is one line."""
-
-
-class EvaluationEpisode(NamedTuple):
-    """One evaluation episode; `success` is the task's own verdict (1 or 0), or None where it gives none.
-
-    `events` are what the last step's `info` holds under the names asked for: a bool, a number, or None where it holds
-    neither. An episode that reaches `LONGEST_EPISODE` steps is broken off there.
-    """
-
-    episode: int
-    episode_return: float
-    length: int
-    success: float | None
-    events: Mapping[str, float | None] = MappingProxyType({})
-
-    def row(self, seed: int, step: int) -> dict[str, Any]:
-        """Return the row of evaluations.csv that says this of a seed's policy of that step."""
-        return {
-            "seed": seed,
-            "step": step,
-            "episode": self.episode,
-            "return": self.episode_return,
-            "length": self.length,
-            "success": self.success,
-            **self.events,
-        }
+_SEED_LIMIT = 2**32
 
 
 class Evaluator:
     """Evaluates policies on a task, always on the same episodes: episode j is reset with `first_seed + j`.
 
     Episodes run side by side in batches of one fixed shape, so that an episode's numbers depend neither on when the
-    others end nor on how many there are. The environments are made at the first `run` and kept, but for tasks whose
+    others end nor on how many there are. The environments are made at the first batch and kept, but for tasks whose
     resets do not forget what was before: they are made anew for each batch. `info_names` are the names of all numbers
     that the last steps of episodes have held in `info` so far, `perturbed` what `perturb` was last given. `watch`,
     where there is one, is called with each step's observations [running episode, observation].
@@ -79,6 +50,7 @@ class Evaluator:
         episodes: how many.
         first_seed: what episode 0 is reset with.
         events: names in the last step's `info` to keep of each episode.
+        episode_limit: steps after which an episode is broken off; None for `LONGEST_EPISODE`.
 
     Raises:
         InputError: episodes or seeds that there cannot be.
@@ -91,8 +63,12 @@ class Evaluator:
         episodes: int = 10,
         first_seed: int = EVALUATION_SEED,
         events: Sequence[str] = (),
+        episode_limit: int | None = None,
     ) -> None:
-        _check_episodes(episodes, first_seed)
+        check_whole("episodes", episodes, 1, _SEED_LIMIT)
+        check_whole("first_seed", first_seed, 0, _SEED_LIMIT - episodes)
+        self.episode_limit = LONGEST_EPISODE if episode_limit is None else episode_limit
+        check_whole("episode_limit", self.episode_limit, 1, _SEED_LIMIT)
         self._task, self._environment_arguments = task, environment_arguments
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
         self._environments: list[Environment] = []
@@ -101,10 +77,10 @@ class Evaluator:
         self.watch: Callable[[np.ndarray], object] | None = None
 
     def perturb(self, values: Mapping[str, float]) -> None:
-        """Change the task from the next `run` on, as `Environment.perturb`; what the task cannot be, `run` refuses.
+        """Change the task from the next batch on, as `Environment.perturb`; what the task cannot be, a batch refuses.
 
         Raises:
-            InputError: environments that are there already refuse it; then so does each `run`, until it is changed.
+            InputError: environments that are there already refuse it; then so does each batch, until it is changed.
         """
         self.perturbed = dict(values)
         try:
@@ -114,6 +90,12 @@ class Evaluator:
             self.close()  # those that are left as they were would be run as if they were perturbed
             raise
 
+    def begin(
+        self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
+    ) -> Pending:
+        """Return the evaluation of these policies, which `Pending.results` runs."""
+        return Pending(self, policies, deterministic, on_progress)
+
     def run(self, policy: Policy, deterministic: bool = True) -> list[EvaluationEpisode]:
         """Return the episodes in order; stochastic actions are drawn by the episode's seed, never as the task draws.
 
@@ -121,51 +103,95 @@ class Evaluator:
             InputError: the policy was trained on other observations or actions, or the task cannot be made.
             EvaluationFailure: an environment raised, or gave what is not a finite number.
         """
-        return self.run_all([policy], deterministic)[0]
+        batches = (self.run_batch(policy, first, deterministic) for _, first in self.batches(1))
+        return [episode for batch in batches for episode in batch]
 
-    def run_all(
-        self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
-    ) -> list[list[EvaluationEpisode]]:
-        """Return the episodes of each policy, as `run`; `on_progress(episodes done, of how many)` is called at times.
-
-        Raises:
-            InputError, EvaluationFailure: as `run`.
-        """
-        finished: list[list[EvaluationEpisode]] = [[] for _ in policies]
-        for index, first in self.batches(len(policies)):
-            finished[index] += self.run_batch(policies[index], first, deterministic)
-            if on_progress:
-                on_progress(sum(map(len, finished)), len(policies) * self.episodes)
-        return finished
-
-    def batches(self, policies: int) -> list[tuple[int, int]]:
+    def batches(self, policies: int) -> list[Batch]:
         """Return (which policy, number of its first episode) of every batch, in order."""
         return [(index, first) for index in range(policies) for first in range(0, self.episodes, EPISODES_AT_ONCE)]
 
-    def run_batch(self, policy: Policy, first: int, deterministic: bool = True) -> list[EvaluationEpisode]:
+    def run_batch(
+        self,
+        policy: Policy,
+        first: int,
+        deterministic: bool = True,
+        should_stop: Callable[[], bool] | None = None,
+    ) -> list[EvaluationEpisode]:
         """Return the episodes of the batch that begins with number `first`.
+
+        `should_stop` is asked every 1,000 steps.
+
+        Raises:
+            InputError, EvaluationFailure: as `run`.
+            EvaluationStopped: `should_stop` said so.
+        """
+        self._make_environments(min(EPISODES_AT_ONCE, self.episodes))
+        check_contract(policy, self._environments[0])
+        numbers = range(first, min(first + EPISODES_AT_ONCE, self.episodes))
+        episodes = [
+            Playing(environment, number, self._first_seed + number, self.episode_limit)
+            for environment, number in zip(self._environments, numbers, strict=False)
+        ]
+        try:
+            self._play(policy, episodes, deterministic, should_stop)
+        except EvaluationFailure:
+            self.close()  # what has raised may be broken for good, and the next policy is to fail by itself alone
+            raise
+        self.info_names.update(*(episode.info_names() for episode in episodes))
+        return [episode.result(self._events) for episode in episodes]
+
+    def answer(
+        self,
+        policy: Policy,
+        first: int,
+        deterministic: bool,
+        perturbed: dict[str, float],
+        should_stop: Callable[[], bool] | None = None,
+    ) -> Result:
+        """Return the episodes of a batch on the task perturbed so, or its failure.
+
+        Raises:
+            EvaluationStopped: as `run_batch`.
+        """
+        try:
+            if perturbed != self.perturbed:
+                self.perturb(perturbed)
+            return self.run_batch(policy, first, deterministic, should_stop)
+        except (EvaluationFailure, InputError) as error:  # the latter: the task cannot be made once more
+            return EvaluationFailure(str(error))
+
+    def play(self, policy: Any, number: int, deterministic: bool) -> EvaluationEpisode:
+        """Return an episode that a policy with Stable-Baselines3's `predict` plays, on the task's raw observations.
 
         Raises:
             InputError, EvaluationFailure: as `run`.
         """
-        if self._environments and self._environments[0].has_memory:
-            self.close()
-        self._make_environments()
-        check_contract(policy, self._environments[0])
-        try:
-            return self._run_batch(policy, range(first, min(first + EPISODES_AT_ONCE, self.episodes)), deterministic)
-        except EvaluationFailure:
-            self.close()  # what has raised may be broken for good, and the next policy is to fail by itself alone
-            raise
+        self._make_environments(1)
+        environment = self._environments[0]
+        episode = Playing(environment, number, self._first_seed + number, self.episode_limit)
+        episode.start()
+        state, start = None, np.ones(1, bool)
+        while not episode.ended:
+            observation = environment.raw_observation
+            answer = policy.predict(observation, state=state, episode_start=start, deterministic=deterministic)
+            if not isinstance(answer, tuple) or len(answer) != 2:
+                kind = type(policy).__name__
+                raise InputError(f"predict of a {kind} must return (action, state), not {answer!r:.40}")
+            action, state = answer
+            episode.step(action)
+            start = np.zeros(1, bool)
+        return episode.result(self._events)
 
     def close(self) -> None:
-        """Close the environments; another `run` makes new ones."""
+        """Close the environments; another batch makes new ones."""
         for environment in self._environments:
             environment.close()
         self._environments = []
 
-    def _make_environments(self) -> None:
-        while len(self._environments) < min(EPISODES_AT_ONCE, self.episodes):
+    def _make_environments(self, count: int) -> None:
+        if self._environments and self._environments[0].has_memory:
+            self.close()
+        while len(self._environments) < count:
             environment = Environment(self._task, self._environment_arguments)
             try:
                 environment.perturb(self.perturbed)
@@ -174,18 +200,24 @@ class Evaluator:
                 raise
             self._environments.append(environment)
 
-    def _run_batch(self, policy: Policy, numbers: range, deterministic: bool) -> list[EvaluationEpisode]:
+    def _play(
+        self,
+        policy: Policy,
+        episodes: Sequence[Playing],
+        deterministic: bool,
+        should_stop: Callable[[], bool] | None,
+    ) -> None:
+        """Play episodes side by side to their ends."""
         observation_size, action_size = policy.contract.spec
         observations = np.zeros((EPISODES_AT_ONCE, observation_size), np.float32)
         noise = None if deterministic else np.zeros((EPISODES_AT_ONCE, action_size), np.float32)
-        episodes = [
-            _Episode(environment, number, self._first_seed + number)
-            for environment, number in zip(self._environments, numbers, strict=False)
-        ]
         for row, episode in enumerate(episodes):
             observations[row] = episode.start()
-        running = list(enumerate(episodes))
+        running, steps = list(enumerate(episodes)), 0
         while running:
+            if should_stop and steps % STEPS_BETWEEN_STOPS == 0 and should_stop():
+                raise EvaluationStopped
+            steps += 1
             if self.watch:
                 self.watch(observations[[row for row, _ in running]])
             if noise is not None:
@@ -195,48 +227,6 @@ class Evaluator:
             for row, episode in running:
                 observations[row] = episode.step(actions[row])
             running = [(row, episode) for row, episode in running if not episode.ended]
-        for episode in episodes:
-            self.info_names |= {
-                name
-                for name, value in episode.last_info.items()
-                if isinstance(name, str) and _number(value) is not None
-            }
-        return [episode.result(self._events) for episode in episodes]
-
-
-class _Episode:
-    """One episode on its way."""
-
-    def __init__(self, environment: Environment, number: int, seed: int) -> None:
-        self.environment, self._number, self._seed = environment, number, seed
-        self.generator = noise_generator(seed)
-        self.ended = False
-        self._return, self._length = 0.0, 0
-        self.last_info: dict[str, Any] = {}
-
-    def start(self) -> np.ndarray:
-        try:
-            return self.environment.reset(self._seed)
-        except EnvironmentFailure as error:
-            raise self._failure(error) from error
-
-    def step(self, action: np.ndarray) -> np.ndarray:
-        try:
-            observation, reward, terminated, truncated, self.last_info = self.environment.step_environment_scale(action)
-        except EnvironmentFailure as error:
-            raise self._failure(error) from error
-        self._return += reward
-        self._length += 1
-        self.ended = terminated or truncated or self._length >= LONGEST_EPISODE
-        return observation
-
-    def result(self, events: Sequence[str]) -> EvaluationEpisode:
-        said = {name: _number(self.last_info.get(name)) for name in events}
-        return EvaluationEpisode(self._number, self._return, self._length, _success(self.last_info), said)
-
-    def _failure(self, error: EnvironmentFailure) -> EvaluationFailure:
-        place = f"evaluation episode {self._number}, reset with seed {self._seed}, at step {self._length}"
-        return EvaluationFailure(f"{place}: {error}")
 
 
 def evaluate(
@@ -253,10 +243,8 @@ def evaluate(
     Raises:
         InputError, EvaluationFailure: as `evaluate_episodes`.
     """
-    played = evaluate_episodes(
-        policy, task, episodes, first_seed, deterministic, environment_arguments, perturbations=perturbations
-    )
-    return np.array([episode.episode_return for episode in played])
+    evaluator = _evaluator(task, environment_arguments, episodes, first_seed, (), perturbations)
+    return np.array([episode.episode_return for episode in _played(evaluator, policy, task, deterministic)])
 
 
 def evaluate_episodes(
@@ -289,58 +277,39 @@ def evaluate_episodes(
         InputError: as `Evaluator`, a policy without `predict`, or perturbations that the task cannot have.
         EvaluationFailure: as `Evaluator.run`.
     """
-    check_flag("deterministic", deterministic)
-    perturbed = values_at(constant_perturbations(perturbations), 0)
     if events is not None:
         check_events(events)
-    events = events_of(task) if events is None else tuple(events)
-    if isinstance(policy, Policy):
-        evaluator = Evaluator(task, environment_arguments, episodes, first_seed, events)
-        evaluator.perturb(perturbed)
-        try:
-            played = evaluator.run(policy, deterministic)
-        finally:
-            evaluator.close()
-        _warn_of_another_task(policy.contract.task, task)
-        return played
-    if isinstance(policy, type):
-        raise InputError(f"{policy.__name__} is a class: give a policy as csac.load returns it")
-    if not callable(getattr(policy, "predict", None)):
-        raise InputError(f"a {type(policy).__name__} has no predict: give a policy as csac.load returns it")
-    _check_episodes(episodes, first_seed)
-    environment = Environment(task, environment_arguments)
-    try:
-        played = []
-        for number in range(episodes):
-            if number and environment.has_memory:
-                environment.close()
-                environment = Environment(task, environment_arguments)
-            environment.perturb(perturbed)
-            episode = _Episode(environment, number, first_seed + number)
-            played.append(_play(policy, episode, deterministic, events))
-        return played
-    finally:
-        environment.close()
+    events = events_of(task) if events is None else events
+    evaluator = _evaluator(task, environment_arguments, episodes, first_seed, events, perturbations)
+    return _played(evaluator, policy, task, deterministic)
 
 
-def _play(policy: Any, episode: _Episode, deterministic: bool, events: Sequence[str]) -> EvaluationEpisode:
-    episode.start()
-    state, start = None, np.ones(1, bool)
-    while not episode.ended:
-        answer = policy.predict(
-            episode.environment.raw_observation, state=state, episode_start=start, deterministic=deterministic
-        )
-        if not isinstance(answer, tuple) or len(answer) != 2:
-            raise InputError(f"predict of a {type(policy).__name__} must return (action, state), not {answer!r:.40}")
-        action, state = answer
-        episode.step(action)
-        start = np.zeros(1, bool)
-    return episode.result(events)
+def _evaluator(
+    task: Task,
+    environment_arguments: dict[str, Any] | None,
+    episodes: int,
+    first_seed: int,
+    events: Sequence[str],
+    perturbations: str | Perturbation | Iterable[str | Perturbation],
+) -> Evaluator:
+    evaluator = Evaluator(task, environment_arguments, episodes, first_seed, events)
+    evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
+    return evaluator
 
 
-def _check_episodes(episodes: int, first_seed: int) -> None:
-    check_whole("episodes", episodes, 1, SEED_LIMIT)
-    check_whole("first_seed", first_seed, 0, SEED_LIMIT - episodes)
+def _played(evaluator: Evaluator, policy: Any, task: Task, deterministic: bool) -> list[EvaluationEpisode]:
+    check_flag("deterministic", deterministic)
+    if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
+        raise InputError(f"{policy!r:.60} has no predict: give a policy as csac.load returns it")
+    with closing(evaluator):
+        if not isinstance(policy, Policy):
+            return [evaluator.play(policy, number, deterministic) for number in range(evaluator.episodes)]
+        episodes = evaluator.run(policy, deterministic)
+    one, other = (name.rpartition(":")[2] if isinstance(name, str) else "" for name in (policy.contract.task, task))
+    if one != other and one and other and not one.isidentifier():  # what a Python function is called says nothing
+        text = f"the policy was trained on {one} and is evaluated on {other}: their returns cannot be compared"
+        warnings.warn(text, stacklevel=3)
+    return episodes
 
 
 def check_contract(policy: Policy, environment: Environment) -> None:
@@ -348,69 +317,23 @@ def check_contract(policy: Policy, environment: Environment) -> None:
 
     A policy whose actions are within the task's bounds is none of another task: it may keep away from them.
     """
-    parts = environment.contract_parts
-    known = (policy.contract.observation_parts, policy.contract.action_shape)
-    given = (parts.observation_parts, parts.action_shape)
-    if known != given:
+    contract, parts, name = policy.contract, environment.contract_parts, environment.task_name
+    known = (contract.observation_parts, contract.action_shape)
+    if known != parts[:2]:
         raise InputError(
             f"the policy was trained on observations {_told(known[0])} and actions {known[1]}; "
-            f"{environment.task_name} has {_told(given[0])} and {given[1]}: evaluate it on its own task"
+            f"{name} has {_told(parts.observation_parts)} and {parts.action_shape}: evaluate it on its own task"
         )
-    _check_bounds(policy.contract, parts.action_low, parts.action_high, environment.task_name)
-
-
-def _warn_of_another_task(trained_on: str | None, task: Task) -> None:
-    """Warn, as from the line that called csac, where two tasks have ids that differ by more than their modules.
-
-    What a Python function is called says nothing of the task that it makes, and is an identifier, which ids are not.
-    """
-    one, other = (name.rpartition(":")[2] if isinstance(name, str) else "" for name in (trained_on, task))
-    if one == other or "" in (one, other) or one.isidentifier():
-        return
-    frame, level = sys._getframe(), 1
-    while frame.f_back and frame.f_code.co_filename == __file__:
-        frame, level = frame.f_back, level + 1
-    text = f"the policy was trained on {trained_on} and is evaluated on {task}: their returns cannot be compared"
-    warnings.warn(text, stacklevel=level)
-
-
-def _check_bounds(contract: Contract, low: np.ndarray, high: np.ndarray, task_name: str) -> None:
-    """Raise InputError where a policy has actions beyond a task's bounds [action] by more than rounding."""
-    low, high = low.astype(np.float64), high.astype(np.float64)  # the widest may not overflow
+    low, high = parts.action_low.astype(np.float64), parts.action_high.astype(np.float64)  # the widest may not overflow
     rounding = BOUNDS_ROUNDING * np.maximum(np.abs(low), np.abs(high))
     is_outside = (contract.action_low < low - rounding) | (contract.action_high > high + rounding)
     if is_outside.any():
         place = int(is_outside.argmax())
         raise InputError(
             f"the policy's action[{place}] is between {contract.action_low[place]:g} and "
-            f"{contract.action_high[place]:g}; {task_name} takes {low[place]:g} to {high[place]:g}: "
-            "evaluate it on its own task"
+            f"{contract.action_high[place]:g}; {name} takes {low[place]:g} to {high[place]:g}"
         )
 
 
 def _told(parts: Parts) -> str:
     return ", ".join(str(shape) if key is None else f"{key} {shape}" for key, shape in parts)
-
-
-def _number(value: Any) -> bool | float | None:
-    """Return a boolean or a finite number out of `info` as Python's own, and None for anything else."""
-    array = _numbers(value)
-    return None if array is None or array.size != 1 else array.item()
-
-
-def _success(info: dict[str, Any]) -> float | None:
-    """Return 1 or 0 for what a task says of its success, and None where it is silent or says nothing that counts."""
-    verdicts = (_numbers(info.get(name)) for name in ("is_success", "success"))
-    return next((float(verdict.all()) for verdict in verdicts if verdict is not None), None)
-
-
-def _numbers(value: Any) -> np.ndarray | None:
-    """Return booleans or finite numbers as an array, and None for anything else."""
-    if value is None or isinstance(value, str | bytes):
-        return None
-    try:
-        array = np.asarray(value)
-    except Exception:  # `info` may hold anything
-        return None
-    is_number = array.size > 0 and array.dtype.kind in "buif" and np.isfinite(array).all()
-    return array if is_number else None

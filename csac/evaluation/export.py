@@ -24,7 +24,7 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from csac.deploy.policy import Policy
-    from csac.tasks.making import Task
+    from csac.tasks.registry import Task
 
 IMPLAUSIBLE = 1e-4  # a chance so small is none
 

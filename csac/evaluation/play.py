@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from csac.checks import check_flag
+from csac.checks import check_flag, check_whole
 from csac.deploy.choosing import has_policy, load, no_policies
-from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, Evaluator, check_contract
+from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, EvaluationFailure, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
-from csac.record.atomic import check_name
 from csac.record.run import RunDirectory
 from csac.tasks.environment import Environment
-from csac.tasks.known import adapter_of
 from csac.tasks.perturbations import constant_perturbations, unlike_training, values_at
+from csac.tasks.registry import adapter_of
 from csac.tasks.seeds import FRESH_EVALUATION_SEED
 from csac.tasks.trust import refuse_untrusted
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
-    from csac.evaluation.evaluator import OnProgress
+    from csac.evaluation.pending import OnProgress
     from csac.record.run import Which
     from csac.tasks.perturbations import Perturbation
 
@@ -56,41 +55,25 @@ def evaluate_run(
     Raises:
         InputError: no run there, no such seed, a damaged file, a task that can no longer be made or perturbed so, or
             one whose module has never been named here.
-        EvaluationFailure: an environment raised, or gave what is not finite; or a process died.
+        EvaluationFailure: an environment raised, or gave what is not finite.
     """
     check_flag("deterministic", deterministic)
     run = _open(directory, trust_task)
-    evaluator = Evaluator(
-        run.manifest.task,
-        run.manifest.environment_arguments,
-        episodes,
-        FRESH_EVALUATION_SEED,
-        run.manifest.events,
-    )
+    task, arguments = run.manifest.task, run.manifest.environment_arguments
+    policies = {label: load(directory, label, which) for label in _labels(run, seed, which)}
+    evaluator = Evaluator(task, arguments, episodes, FRESH_EVALUATION_SEED, run.manifest.events)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
-    labels = _seeds_with_policies(run, which) if seed is None else [seed]
-    policies = [load(directory, label, which) for label in labels]
+    with closing(Environment(task, arguments)) as environment:
+        environment.perturb(evaluator.perturbed)
+        for policy in policies.values():
+            check_contract(policy, environment)
     processes = choose_processes(evaluator, len(policies)) if processes is None else processes
-    if processes == 1:
-        workers = evaluator
-    else:
-        Environment(run.manifest.task, run.manifest.environment_arguments).close()  # says what is to be said
-        workers = EvaluationPool(evaluator, processes)
-    try:
-        yield from zip(labels, workers.run_all(policies, deterministic, on_progress), strict=True)
-    finally:
-        workers.close()
-
-
-def perturbation_notes(
-    directory: str | Path, perturbations: str | Perturbation | Iterable[str | Perturbation]
-) -> list[str]:
-    """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
-    given = constant_perturbations(perturbations)
-    manifest = RunDirectory.open(directory).manifest
-    if given:
-        return [f"perturbed: {', '.join(item.label for item in given)}"]
-    return [f"{line}: see --perturb" for line in unlike_training(manifest.perturbations)]
+    with closing(evaluator if processes == 1 else EvaluationPool(evaluator, processes)) as workers:
+        results = workers.begin(list(policies.values()), deterministic, on_progress).results()
+    for label, result in zip(policies, results, strict=True):
+        if isinstance(result, EvaluationFailure):
+            raise result
+        yield label, result
 
 
 def play(
@@ -114,52 +97,39 @@ def play(
         EnvironmentFailure: the environment raised, or gave what is not finite.
     """
     run, perturbed = _open(directory, trust_task), values_at(constant_perturbations(perturbations), 0)
-    if episodes < 1:
-        raise InputError(f"{episodes} episodes: play at least one")
+    check_whole("episodes", episodes, 1, LONGEST_EPISODE)
     policy = load(directory, seed, which)
-    if video is None:
-        _require_display()
-    else:
-        _check_video(Path(video))
-        _draw_off_screen()
-    environment = _drawn_environment(run, "human" if video is None else "rgb_array")
-    adapter = adapter_of(run.manifest.task)
-    picture = adapter.camera(environment.raw) if adapter and adapter.camera else environment.raw.render
-    frames_per_second = round(
-        (adapter and adapter.pictures_per_second)
-        or environment.raw.metadata.get("render_fps")
-        or DEFAULT_FRAMES_PER_SECOND
-    )
-    longest, done = _longest_episode(environment), 0
-    try:
+    with closing(_drawn_environment(run, video)) as environment:
+        limit = environment.raw.spec.max_episode_steps if environment.raw.spec else None
+        longest, done = min(limit or LONGEST_EPISODE, LONGEST_EPISODE), 0
         check_contract(policy, environment)
         environment.perturb(perturbed)
-        _follow(environment)
-        with _recording(environment, picture, frames_per_second, video) as record:
+        with _filming(environment, run.manifest.task, video) as film:
             for number in range(episodes):
                 observation = environment.reset(FRESH_EVALUATION_SEED + number)
                 episode_return, length, ended = 0.0, 0, False
-                record()
+                film.add()
                 while not ended:
                     action = policy.contract.to_environment(policy.act(observation[None])[0])
                     observation, reward, terminated, truncated, _ = environment.step_environment_scale(action)
                     episode_return, length = episode_return + reward, length + 1
                     ended = terminated or truncated or length >= longest
-                    record()
+                    film.add()
                     if on_progress:
                         on_progress(done + length, done + (episodes - number) * longest)
                 done += length
-                for _ in range(length + 1, round(SECONDS_ON_SCREEN * frames_per_second)):
-                    record(again=True)
+                film.end_episode()
                 yield EvaluationEpisode(number, episode_return, length, None)
-    finally:
-        environment.close()
 
 
-def _longest_episode(environment: Environment) -> int:
-    """Return how many steps an episode can have."""
-    limit = environment.raw.spec.max_episode_steps if environment.raw.spec else None
-    return min(limit or LONGEST_EPISODE, LONGEST_EPISODE)
+def perturbation_notes(
+    directory: str | Path, perturbations: str | Perturbation | Iterable[str | Perturbation]
+) -> list[str]:
+    """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
+    if given := constant_perturbations(perturbations):
+        return [f"perturbed: {', '.join(item.label for item in given)}"]
+    trained = RunDirectory.open(directory).manifest.perturbations
+    return [f"{line}: see --perturb" for line in unlike_training(trained)]
 
 
 def _open(directory: str | Path, trust_task: bool) -> RunDirectory:
@@ -174,16 +144,10 @@ def _open(directory: str | Path, trust_task: bool) -> RunDirectory:
     return run
 
 
-def _follow(environment: Environment) -> None:
-    """Have the camera follow the body: Gymnasium's own would watch a HalfCheetah run out of the picture."""
-    renderer = getattr(environment.raw.unwrapped, "mujoco_renderer", None)
-    if renderer is None or renderer.camera_id != -1 or "trackbodyid" in (renderer.default_cam_config or {}):
-        return
-    with suppress(KeyError):  # no such camera
-        renderer.camera_id = renderer.model.camera("track").id
-
-
-def _seeds_with_policies(run: RunDirectory, which: Which) -> list[int]:
+def _labels(run: RunDirectory, seed: int | None, which: Which) -> list[int]:
+    """Return the seed asked for, or all that have such a policy. Raises InputError where none has."""
+    if seed is not None:
+        return [seed]
     seeds = run.seeds_with_policies()
     if not seeds:
         raise no_policies(run)
@@ -192,115 +156,111 @@ def _seeds_with_policies(run: RunDirectory, which: Which) -> list[int]:
     return those
 
 
-def _require_display() -> None:
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError("there is no display to play on: write a video instead, with --video out.mp4")
-
-
-def _draw_off_screen() -> None:
-    """Have MuJoCo draw without a display. It reads this variable when it is first imported."""
-    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
-
-
-def _check_video(path: Path) -> None:
-    if path.suffix.lower() != ".mp4":
-        better = path.with_suffix(".mp4") if path.name else path / "video.mp4"
-        raise InputError(f"the video is an .mp4 file: name it {better}")
-    check_name(path, _aside(path))
-    if path.is_dir():
-        raise InputError(f"{path} is a directory: give the name of a file for the video")
-
-
-def _drawn_environment(run: RunDirectory, render_mode: str) -> Environment:
+def _drawn_environment(run: RunDirectory, video: str | Path | None) -> Environment:
+    """Return the task of a run with something to draw it with. Raises InputError where there is nothing."""
     task, arguments = run.manifest.task, run.manifest.environment_arguments
+    has_display = not sys.platform.startswith("linux") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    if video is None and not has_display:
+        raise InputError("there is no display to play on: write a video instead, with --video out.mp4")
+    if video is not None and Path(video).suffix.lower() != ".mp4":
+        raise InputError(f"the video is an .mp4 file: name it so, not {video}")
+    if not has_display:
+        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is first imported
     adapter = adapter_of(task)
-    if adapter and render_mode == "rgb_array":
+    if adapter and video is not None:
         arguments = {**adapter.picture_arguments, **arguments}
     try:
-        return Environment(task, arguments, render_mode)
+        environment = Environment(task, arguments, "human" if video is None else "rgb_array")
     except InputError as error:
         raise _cannot_be_drawn(task, error) from error
+    renderer = getattr(environment.raw.unwrapped, "mujoco_renderer", None)
+    if renderer and renderer.camera_id == -1 and "trackbodyid" not in (renderer.default_cam_config or {}):
+        with suppress(KeyError):  # no camera that follows the body: a HalfCheetah runs out of the picture
+            renderer.camera_id = renderer.model.camera("track").id
+    return environment
 
 
 def _cannot_be_drawn(task: str, error: Exception) -> InputError:
-    reason = " ".join(str(error).split())
-    hint = ""
+    reason, hint = " ".join(str(error).split()), ""
     if os.environ.get("MUJOCO_GL") == "egl" and "egl" in reason.lower():
         hint = "; to draw without a display, MuJoCo needs the system's EGL library (on Debian: apt install libegl1)"
     return InputError(f"{task} cannot be drawn: {reason}{hint}")
 
 
-@contextmanager
-def _recording(
-    environment: Environment, picture: Callable[[], Any], frames_per_second: int, video: str | Path | None
-) -> Iterator[Callable[..., None]]:
-    """Yield a function that adds the present picture to the video, or the last one again.
+class _Film:
+    """Pictures of an environment, written into a video."""
 
-    The video gets its name once it is whole.
-    """
+    def __init__(self, environment: Environment, task: str, path: Path) -> None:
+        adapter, raw = adapter_of(task), environment.raw
+        self._picture: Callable[[], Any] = adapter.camera(raw) if adapter and adapter.camera else raw.render
+        speed = (adapter and adapter.pictures_per_second) or raw.metadata.get("render_fps") or DEFAULT_FRAMES_PER_SECOND
+        self._frames_per_second, self._task, self._path = round(speed), task, path
+        self._writer: Any = None
+        self._shown = 0  # pictures of this episode
+        self._last = np.zeros((0, 0, 3), np.uint8)
+
+    def add(self) -> None:
+        """Add the present picture. Raises InputError where there is none."""
+        try:
+            pixels = np.asarray(self._picture())
+        except Exception as error:
+            raise _cannot_be_drawn(self._task, error) from error
+        if pixels.ndim != 3 or pixels.shape[2] < 3:
+            raise InputError(f"{self._task} draws no pictures, so there is no video of it")
+        self._last = np.ascontiguousarray(pixels[:, :, :3], dtype=np.uint8)
+        self._write()
+
+    def end_episode(self) -> None:
+        """Keep the last picture for as long as the episode is too short to be seen."""
+        while self._shown < round(SECONDS_ON_SCREEN * self._frames_per_second):
+            self._write()
+        self._shown = 0
+
+    def close(self) -> None:
+        if self._writer:
+            self._writer.close()
+
+    def _write(self) -> None:
+        if self._writer is None:
+            import imageio_ffmpeg
+
+            size, speed = self._last.shape[1::-1], self._frames_per_second
+            self._writer = imageio_ffmpeg.write_frames(
+                str(self._path), size, fps=speed, macro_block_size=2, ffmpeg_log_level="error"
+            )
+            self._writer.send(None)
+        self._writer.send(self._last)
+        self._shown += 1
+
+
+class _Window:
+    """Where an environment draws by itself."""
+
+    def add(self) -> None:
+        """Do nothing."""
+
+    def end_episode(self) -> None:
+        """Do nothing."""
+
+
+@contextmanager
+def _filming(environment: Environment, task: str, video: str | Path | None) -> Iterator[_Film | _Window]:
+    """Yield what takes the pictures; a video gets its name once it is whole."""
     if video is None:
-        yield lambda again=False: None
+        yield _Window()
         return
     path = Path(video)
-    aside = _aside(path)
-    writer: list[Generator[None, Any, None]] = []
-    frame = np.zeros((0, 0, 3), np.uint8)
-
-    def record(again: bool = False) -> None:
-        nonlocal frame
-        frame = frame if again else _frame(environment, picture)
-        if not writer:
-            writer.append(_open_video(aside, frame.shape, frames_per_second))
-        writer[0].send(frame)
-
+    aside = path.with_name(f".{os.getpid()}.{path.name}")
+    film = _Film(environment, task, aside)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield record
-        for open_writer in writer:
-            open_writer.close()
+        aside.touch()
+        yield film
+        film.close()
         aside.replace(path)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {_reason(error, aside)}; choose another place") from error
+        raise InputError(f"cannot write {path}: {error.strerror or 'ffmpeg failed'}; choose another place") from error
     finally:
-        for open_writer in writer:
-            open_writer.close()
+        film.close()
         with suppress(OSError):  # what was raised is told
             aside.unlink()
-
-
-def _reason(error: OSError, aside: Path) -> str:
-    """Say in a few words why there is no video: a failure of ffmpeg's comes as a broken pipe with its whole command."""
-    if error.strerror:
-        return error.strerror
-    try:
-        aside.open("ab").close()
-    except OSError as own:
-        return own.strerror or str(own)
-    return "ffmpeg broke off, for the reason that it gave above"
-
-
-def _aside(path: Path) -> Path:
-    return path.with_name(f".{os.getpid()}.{path.name}")
-
-
-def _frame(environment: Environment, picture: Callable[[], Any]) -> np.ndarray:
-    """Return the present picture, uint8 [height, width, 3]."""
-    try:
-        frame = picture()
-    except Exception as error:
-        raise _cannot_be_drawn(environment.task_name, error) from error
-    pixels = np.asarray(frame)
-    if pixels.ndim != 3 or pixels.shape[2] < 3:
-        raise InputError(f"{environment.task_name} draws no pictures, so there is no video of it")
-    return np.ascontiguousarray(pixels[:, :, :3], dtype=np.uint8)
-
-
-def _open_video(path: Path, shape: tuple[int, ...], frames_per_second: int) -> Generator[None, Any, None]:
-    import imageio_ffmpeg
-
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (shape[1], shape[0]), fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
-    )
-    writer.send(None)
-    return writer

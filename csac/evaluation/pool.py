@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import pickle
-import traceback
 from collections import deque
-from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
-from csac.evaluation.evaluator import EvaluationEpisode, EvaluationFailure, Evaluator
+from csac.evaluation.pending import EvaluationStopped, Pending
 from csac.processes import Child, core_quota, die_with_parent, end, move_to, outlive_termination, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from csac.deploy.policy import Policy
-    from csac.evaluation.evaluator import OnProgress
-
-Batch = tuple[int, int]  # which policy, number of the first episode
-Work = tuple["Policy", int, bool, dict[str, float]]  # policy, first episode, whether deterministic, how it is perturbed
-Answer = tuple[list[EvaluationEpisode], set[str]] | Exception  # a batch's episodes and what `info` held, or a failure
+    from csac.evaluation.evaluator import Evaluator
+    from csac.evaluation.pending import Batch, OnProgress, Result
 
 _BATCHES_THAT_PAY = 2  # for each process: it takes as long to start as a short batch takes
+_SECONDS_BETWEEN_STOPS = 1.0
 
 
 def choose_processes(evaluator: Evaluator, policies: int) -> int:
@@ -31,18 +27,14 @@ def choose_processes(evaluator: Evaluator, policies: int) -> int:
     return max(1, min(len(usable_cores()[: core_quota()]), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
 
 
-class ProcessDied(EvaluationFailure):
-    """A process died in the middle of a batch: this says nothing of the policy."""
-
-
 class EvaluationPool:
     """Does what `Evaluator` does, batch by batch in processes of their own; the numbers are the same to the last bit.
 
     A batch is what one evaluator steps at a time, so that nothing depends on which process takes it. The processes
-    start at the first run, or at `start`, and wait for the next until `close`.
+    start at the first evaluation, or at `start`, and wait for the next until `close`. `info_names` are the evaluator's.
 
     Args:
-        evaluator: what each process works with, perturbed as it is when a run begins; itself, it is not run.
+        evaluator: what each process works with, perturbed as it is when an evaluation begins.
         processes: how many, at least one.
         cores: the processors that they may use; None for those that this process may use when it starts them.
 
@@ -61,54 +53,25 @@ class EvaluationPool:
             ) from None
         self._evaluator, self._processes, self._cores = evaluator, processes, cores
         self._workers: list[_Worker] = []
-        self.info_names: set[str] = set()
+
+    @property
+    def info_names(self) -> set[str]:
+        """The names of all numbers that the last steps of episodes have held in `info` so far."""
+        return self._evaluator.info_names
 
     def start(self) -> None:
-        """Start every process that is not there, so that a run need not wait for it."""
+        """Start every process that is not there, so that an evaluation need not wait for it."""
         self._start(self._processes)
 
-    def run(self, policy: Policy, deterministic: bool = True) -> list[EvaluationEpisode]:
-        """Return the episodes in order; as `Evaluator.run`."""
-        return self.run_all([policy], deterministic)[0]
-
-    def run_all(
-        self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
-    ) -> list[list[EvaluationEpisode]]:
-        """Return the episodes of each policy, as `Evaluator.run_all`.
-
-        Raises:
-            InputError: as `Evaluator.run`.
-            EvaluationFailure: as `Evaluator.run`, of the first batch that failed; or a process died.
-        """
-        try:
-            running = self.begin(policies, deterministic, stop_at_failure=True)
-            running.on_progress = on_progress
-            while not running.is_over:
-                running.wait()
-            episodes = [running.episodes(index) for index in range(len(policies))]
-        except BaseException:
-            self.close()
-            raise
-        self.info_names |= running.info_names
-        return episodes
-
     def begin(
-        self, policies: Sequence[Policy], deterministic: bool = True, stop_at_failure: bool = False
-    ) -> PendingEvaluation:
-        """Begin to evaluate policies and return. The run before must be over.
-
-        With `stop_at_failure` a failing batch leaves out all that no process has begun, else those of its own policy.
-        """
-        batches = self._evaluator.batches(len(policies))
-        self._start(min(self._processes, len(batches)))
-        tasks = {
-            (index, first): (policies[index], first, deterministic, self._evaluator.perturbed)
-            for index, first in batches
-        }
-        return PendingEvaluation(list(self._workers), tasks, len(policies) * self._evaluator.episodes, stop_at_failure)
+        self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
+    ) -> Pending:
+        """Begin to evaluate policies and return. The evaluation before must be over; after a stop, close the pool."""
+        self._start(min(self._processes, len(self._evaluator.batches(len(policies)))))
+        return _PendingInPool(list(self._workers), self._evaluator, policies, deterministic, on_progress)
 
     def close(self) -> None:
-        """End the processes, which close their environments; another run starts new ones.
+        """End the processes, which close their environments; another evaluation starts new ones.
 
         One that is in the middle of a long batch is killed: nobody waits for its episodes.
         """
@@ -123,98 +86,72 @@ class EvaluationPool:
             worker.kill()
             self._workers.remove(worker)
         while len(self._workers) < processes:
+            self._evaluator.close()  # no process is sent open environments
             self._workers.append(_Worker(self._evaluator, self._cores))
 
 
-class PendingEvaluation:
-    """A run of an `EvaluationPool` that is on its way.
+class _PendingInPool(Pending):
+    """An evaluation that is on its way in the processes of a pool.
 
-    The processes have a batch each, in order, and are given the next whenever somebody waits here or asks whether it is
-    over. `info_names` are those of the batches that are done.
+    They have a batch each, in order, and are given the next whenever somebody waits here or asks whether it is over.
+    What a process that dies takes along is made in this process, when the results are asked for.
     """
 
-    def __init__(self, workers: list[_Worker], tasks: dict[Batch, Work], total: int, stop_at_failure: bool) -> None:
-        self._idle, self._tasks, self._total, self._stop_at_failure = workers, tasks, total, stop_at_failure
-        self.on_progress: OnProgress | None = None
-        self.info_names: set[str] = set()
-        self._waiting, self._done = deque(tasks), 0
+    def __init__(
+        self,
+        workers: Sequence[_Worker],
+        evaluator: Evaluator,
+        policies: Sequence[Policy],
+        deterministic: bool,
+        on_progress: OnProgress | None,
+    ) -> None:
+        super().__init__(evaluator, policies, deterministic, on_progress)
+        self._idle = list(workers)
+        self._waiting = deque(evaluator.batches(len(policies)))
         self._busy: dict[_Worker, Batch] = {}
-        self._answers: dict[Batch, Answer] = {}
-        self._death: ProcessDied | None = None
         self._hand_out()
 
     @property
     def is_over(self) -> bool:
-        """Whether everything has been answered that will be. Does not wait."""
         self._receive(0.0)
         return not self._busy
 
-    def wait(self) -> None:
-        """Wait for the next answer."""
-        self._receive(None)
+    def results(self, should_stop: Callable[[], bool] | None = None) -> list[Result]:
+        while self._busy:
+            if should_stop and should_stop():
+                raise EvaluationStopped
+            self._receive(_SECONDS_BETWEEN_STOPS if should_stop else None)
+        return super().results(should_stop)
 
-    def episodes(self, index: int) -> list[EvaluationEpisode]:
-        """Wait for the episodes of one of the policies and return them in order.
-
-        Raises:
-            InputError: as `Evaluator.run`.
-            EvaluationFailure: as `Evaluator.run`, of its first batch that failed.
-            ProcessDied: what there is of it, because a process died.
-        """
-        batches = [batch for batch in self._tasks if batch[0] == index]
-        while self._busy and not self._answers.keys() >= set(batches):
-            self.wait()
-        episodes = []
-        for batch in batches:
-            answer = self._answers.get(batch, self._death)
-            if isinstance(answer, Exception):
-                raise answer
-            assert answer
-            episodes += answer[0]
-        return episodes
-
-    def _receive(self, timeout: float | None) -> None:
+    def _receive(self, seconds: float | None) -> None:
         """Take the answers that come within so many seconds, or the next one, and hand out what waits."""
-        ready = wait([worker.connection for worker in self._busy], timeout) if self._busy else []
+        ready = wait([worker.connection for worker in self._busy], seconds) if self._busy else []
         for worker in [worker for worker in self._busy if worker.connection in ready]:
             batch = self._busy.pop(worker)
-            answer = self._answers[batch] = worker.answer()
-            if isinstance(answer, Exception):
-                self._leave_out(batch, answer)
-            else:
-                self._done += len(answer[0])
-                self.info_names |= answer[1]
-                if self.on_progress:
-                    self.on_progress(self._done, self._total)
-            if not isinstance(answer, ProcessDied):
-                self._idle.append(worker)
+            try:
+                answer, info_names = worker.connection.recv()
+            except (EOFError, OSError):
+                self.notes.append(f"evaluation: {worker.cause_of_death()}; its episodes are run by this one instead")
+                continue
+            self._evaluator.info_names |= info_names
+            self._take(batch, answer)
+            self._idle.append(worker)
         self._hand_out()
-
-    def _leave_out(self, failed: Batch, reason: Exception) -> None:
-        """Do not begin what nobody needs after a failure, nor anything once a process has died: so might the next."""
-        if isinstance(reason, ProcessDied):
-            self._death = reason
-        if self._death or self._stop_at_failure:
-            self._waiting.clear()
-        self._waiting = deque(batch for batch in self._waiting if batch[0] != failed[0])
 
     def _hand_out(self) -> None:
         while self._waiting and self._idle:
-            worker, batch = self._idle.pop(), self._waiting.popleft()
-            worker.tell(self._tasks[batch])
-            self._busy[worker] = batch
+            batch = self._waiting.popleft()
+            if not self._is_spared(batch):
+                worker = self._idle.pop()
+                worker.tell(self._work(batch))
+                self._busy[worker] = batch
 
 
 class _Worker(Child):
-    """The parent's end of one process, which is told the `Work` to do, or None to end."""
+    """The parent's end of one process, which is told what to evaluate, or None to end."""
 
     def __init__(self, evaluator: Evaluator, cores: Sequence[int] | None) -> None:
         super().__init__(_work, evaluator, cores, daemon=False)
-
-    def answer(self) -> Answer:
-        with suppress(EOFError, OSError):
-            return self.connection.recv()
-        return ProcessDied(f"the evaluation was broken off: {self.cause_of_death()}")
 
 
 def _work(connection: Connection, evaluator: Evaluator, cores: Sequence[int] | None) -> None:
@@ -225,21 +162,8 @@ def _work(connection: Connection, evaluator: Evaluator, cores: Sequence[int] | N
         move_to(cores)
     try:
         while work := connection.recv():
-            connection.send(_answer(evaluator, *work))
+            connection.send((evaluator.answer(*work), evaluator.info_names))
     except (EOFError, OSError):
         return
     finally:
         evaluator.close()
-
-
-def _answer(
-    evaluator: Evaluator, policy: Policy, first: int, deterministic: bool, perturbed: dict[str, float]
-) -> Answer:
-    try:
-        if perturbed != evaluator.perturbed:
-            evaluator.perturb(perturbed)
-        return evaluator.run_batch(policy, first, deterministic), evaluator.info_names
-    except (EvaluationFailure, InputError) as error:
-        return type(error)(str(error))
-    except Exception:
-        return RuntimeError(traceback.format_exc())

@@ -16,8 +16,8 @@ from csac.checks import did_you_mean
 from csac.console.tables import short
 from csac.record.atomic import write_atomically
 from csac.record.run import LOCK, MANIFEST, RunDirectory, is_locked, is_run
-from csac.tasks.known import events_of
 from csac.tasks.perturbations import perturbations_of
+from csac.tasks.registry import events_of
 from csac.types import InputError
 
 if TYPE_CHECKING:

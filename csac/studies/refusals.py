@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from csac.processes import Child, die_with_parent
 from csac.studies.cells import is_final
-from csac.tasks.environment import Environment, try_arguments
+from csac.tasks.environment import Environment
 from csac.tasks.perturbations import perturbations_of
+from csac.tasks.preflight import try_task
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -75,8 +76,7 @@ def _try(cells: list[Cell]) -> None:
     conditions = dict.fromkeys(cell.perturbations for cell in cells)
     changes = {item.kind: item.value for condition in conditions for item in perturbations_of(condition)}
     with closing(Environment(cells[0].task, cells[0].environment_arguments)) as environment:
-        if cells[0].environment_arguments:
-            try_arguments(environment, cells[0].environment_arguments)
+        try_task(environment)
         for kind, value in changes.items():
             environment.perturb({kind: value})
 

@@ -15,9 +15,8 @@ from csac.presets import hyperparameters as preset_of
 from csac.record.manifest import SEED_LIMIT, STEPS_LIMIT
 from csac.studies import paper
 from csac.studies.cells import Cell, complete, similar
-from csac.tasks.known import adapter_of, check_events
-from csac.tasks.making import registered
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
+from csac.tasks.registry import adapter_of, check_events, registered
 from csac.training.options import LONGEST_INTERVAL, MOST_EPISODES
 from csac.types import InputError
 

@@ -16,7 +16,8 @@ from csac.studies.job import Stopped
 from csac.studies.shared_study import Question, SharedStudy, import_optuna
 from csac.studies.tune import MOST_TRIALS, tune
 from csac.studies.tune_progress import TuneProgress
-from csac.tasks.environment import Environment, try_arguments
+from csac.tasks.environment import Environment
+from csac.tasks.preflight import try_task
 from csac.training.options import check_groups
 
 if TYPE_CHECKING:
@@ -42,8 +43,7 @@ def run_tune(question: Question, directory: Path, trials: int, groups: int | Non
     import_optuna()
     choose_device(question.device)
     with closing(Environment(question.task, question.environment_arguments)) as environment:  # says what is to be said
-        if question.environment_arguments:
-            try_arguments(environment, question.environment_arguments)
+        try_task(environment)
     study, line = SharedStudy(directory, question), shlex.join(["csac", "tune", *arguments])
     console = make_console()
     stopped = None

@@ -5,39 +5,23 @@ from __future__ import annotations
 import json
 import logging
 import math
-import multiprocessing
 from collections.abc import Mapping
 from contextlib import nullcontext
-from typing import Any, Literal
+from typing import Any
 
-import gymnasium
 import numpy as np
 
 from csac.checks import check_arguments
 from csac.deploy.contract import ActionBounds
-from csac.tasks import known
-from csac.tasks.making import Task, check_render_mode, make, task_name
-from csac.tasks.mistakes import check_reset, failed_reset, failed_step, first_observation, raised
+from csac.tasks import snapshots
+from csac.tasks.failures import EnvironmentFailure, failure_of, one_line, raise_interrupt
 from csac.tasks.physics import NOISES, PHYSICS, Noise, Physics
-from csac.tasks.silence import quietly
-from csac.tasks.snapshots import restore, snapshot
-from csac.tasks.spaces import (
-    RAISED,
-    ContractParts,
-    EnvironmentFailure,
-    action_parts,
-    check_finite,
-    dict_part,
-    observation_parts,
-    one_line,
-    part,
-    scalar,
-    size,
-)
+from csac.tasks.pybullet import quietly
+from csac.tasks.registry import Task, has_memory, is_pybullet, make, task_name
+from csac.tasks.spaces import check_finite, contract_parts, dict_part, part, scalar, size
 from csac.types import InputError, Snapshot, Spec
 
 _log = logging.getLogger(__name__)
-_said: set[str] = set()
 
 
 class Environment:
@@ -57,27 +41,22 @@ class Environment:
     ) -> None:
         check_arguments("environment_arguments", environment_arguments)
         arguments = dict(environment_arguments or {})
-        if render_mode is not None:
-            arguments["render_mode"] = render_mode
-        self.raw = make(task, arguments)
+        self.raw = make(task, arguments if render_mode is None else {**arguments, "render_mode": render_mode})
         self.task_name = task_name(task, self.raw)
-        if multiprocessing.parent_process() is None:  # which has made one too, or will
-            _say_once(self.task_name, known.wrapper_notes(self.raw))
-        self._quietly = quietly if known.is_pybullet(self.raw) else nullcontext
-        self.has_memory = known.has_memory(task, self.raw)
+        self._quietly = quietly if is_pybullet(self.raw) else nullcontext
+        self.has_memory = has_memory(task, self.raw)
         try:
-            check_render_mode(self.raw, render_mode)
-            check_reset(self.raw)
-            parts = observation_parts(_space(self.raw, "observation_space"))
-            self.contract_parts = ContractParts(parts, *action_parts(_space(self.raw, "action_space")))
+            modes = self.raw.metadata.get("render_modes", [])
+            if render_mode is not None and render_mode not in modes:
+                raise InputError(f"no render mode {render_mode!r}: it has {', '.join(modes) or 'none'}")
+            self.contract_parts = contract_parts(self.raw)
         except InputError as error:
             self.close()
             raise InputError(f"{self.task_name}: {error}") from None
-        self.spec = Spec(size(parts), math.prod(self.contract_parts.action_shape))
-        self.bounds = ActionBounds(self.contract_parts.action_low, self.contract_parts.action_high)
+        self._parts, self._action_shape, low, high = self.contract_parts
+        self.spec = Spec(size(self._parts), math.prod(self._action_shape))
+        self.bounds = ActionBounds(low, high)
         self.raw_observation: Any = None  # the last one, as the environment gave it
-        self._parts = parts
-        self._action_shape = self.contract_parts.action_shape
         self._physics: Physics | None = None
         self._noise: Noise | None = None
         self._seed: int | None = None  # of the last reset
@@ -109,12 +88,11 @@ class Environment:
             self._noise.begin(seed)
         try:
             with self._quietly():
-                given = self.raw.reset(seed=seed)
-        except RAISED as error:
-            raise failed_reset(error) from error
+                observation, _ = self.raw.reset(seed=seed)
+        except BaseException as error:
+            raise failure_of("reset", error) from error
         if self._physics and (undone := self._physics.undone()):
             raise EnvironmentFailure(undone)
-        observation = first_observation(given)
         try:
             return self._flatten(observation)
         except EnvironmentFailure as error:
@@ -143,8 +121,8 @@ class Environment:
         try:
             observation, reward, terminated, truncated, info = self.raw.step(action)
             terminated, truncated, info = bool(terminated), bool(truncated), dict(info)
-        except RAISED as error:
-            raise failed_step(error) from error
+        except BaseException as error:
+            raise failure_of("step", error) from error
         return self._flatten(observation), scalar(reward), terminated, truncated, info
 
     def snapshot(self) -> Snapshot | None:
@@ -154,9 +132,9 @@ class Environment:
             EnvironmentFailure: its `get_snapshot` raised, or gave what cannot be saved.
         """
         try:
-            saved = snapshot(self.raw)
-        except RAISED as error:
-            raise EnvironmentFailure(f"get_snapshot raised {raised(error)}") from error
+            saved = snapshots.snapshot(self.raw)
+        except BaseException as error:
+            raise failure_of("get_snapshot", error) from error
         if saved:
             _check_savable(saved)
         if saved and self._noise:
@@ -167,23 +145,24 @@ class Environment:
         """Go on where `saved` was taken, in an episode that was reset with `seed`.
 
         Raises:
-            EnvironmentFailure: the environment does not take it back.
+            EnvironmentFailure: the environment does not take it.
         """
         self.reset(seed)
         try:
-            restore(self.raw, saved)
+            snapshots.restore(self.raw, saved)
             if self._noise:
-                self._noise.take_back(saved.values.get("noise", {}))
-        except RAISED as error:
-            raise EnvironmentFailure(f"the environment does not take its snapshot back: {raised(error)}") from error
+                self._noise.restore(saved.values.get("noise", {}))
+        except BaseException as error:
+            raise failure_of("restoring its snapshot", error) from error
 
     def close(self) -> None:
         """Close the Gymnasium environment. What that raises is logged: it takes nothing back of what was done."""
         try:
             with self._quietly():
                 self.raw.close()
-        except RAISED as error:
-            _log.warning("%s: close raised %s", getattr(self, "task_name", "the task"), one_line(error))
+        except BaseException as error:
+            raise_interrupt(error)
+            _log.warning("%s: close raised %s", self.task_name, one_line(error))
 
     def _flatten(self, observation: Any) -> np.ndarray:
         """Copy the observation, since environments may reuse their array."""
@@ -204,42 +183,6 @@ class Environment:
         raw = {key: part.reshape(shape) for (key, shape), part in zip(self._parts, np.split(noisy, ends), strict=True)}
         self.raw_observation = raw.get(None, raw)
         return noisy
-
-
-def try_arguments(environment: Environment, arguments: Mapping[str, Any]) -> None:
-    """Make one step, as some tasks take an argument of any type and fail where they first use it. Raises InputError.
-
-    Any other failure is left to the run, whose log has the traceback that the author of a task looks for.
-    """
-    try:
-        environment.reset(0)
-        environment.step(np.zeros(environment.spec.action_size, np.float32))
-    except EnvironmentFailure as error:
-        if isinstance(error.__cause__, TypeError):
-            message = f"{environment.task_name} does not work with the arguments {dict(arguments)}: {error}"
-            raise InputError(message) from error
-
-
-def _space(environment: gymnasium.Env, name: Literal["observation_space", "action_space"]) -> gymnasium.Space:
-    """Return a space of an environment. Raises InputError where there is none, or one of another package."""
-    try:
-        space = getattr(environment, name)
-    except RAISED as error:
-        raise InputError(f"the environment gives no {name}: {raised(error)}") from None
-    if not isinstance(space, gymnasium.Space):
-        kind = type(space)
-        raise InputError(
-            f"{name} is a {kind.__name__} of the module {kind.__module__}, and csac takes spaces of gymnasium"
-        )
-    return space
-
-
-def _say_once(task_name: str, notes: list[str]) -> None:
-    """Log what the user should know of a task, once in this process."""
-    for note in notes:
-        if note not in _said:
-            _log.warning("note: %s: %s", task_name, note)
-    _said.update(notes)
 
 
 def _check_savable(saved: Snapshot) -> None:

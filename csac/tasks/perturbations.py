@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from csac.checks import did_you_mean
-from csac.record.manifest import STEPS_LIMIT
+from csac.checks import check_whole
 from csac.tasks.physics import NOISES, PHYSICS
 from csac.types import InputError
 
@@ -25,6 +23,8 @@ if TYPE_CHECKING:
 KINDS = (*PHYSICS, *NOISES)
 
 _EXAMPLE = "friction=1.5@300000"
+_WRITTEN = re.compile(r"(?P<kind>[^=@]+?)\s*=(?P<value>[^=@]+)(?:@(?P<step>[^=@]+))?")
+_LAST_STEP = 2**31 - 1  # learners count their steps in 32 bits
 
 
 @dataclass(frozen=True)
@@ -45,31 +45,21 @@ class Perturbation:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            hint = " ".join(filter(None, [did_you_mean(str(self.kind), KINDS), f"there are {', '.join(KINDS)}"]))
-            raise InputError(f"no perturbation is called {self.kind!r}: {hint}")
-        is_number = isinstance(self.value, int | float | np.number) and not isinstance(self.value, bool)
-        value = _as_float(self.value) if is_number else math.nan
-        shown = str(value) if math.isinf(value) else repr(self.value)
-        what = "factor" if self.kind in PHYSICS else "standard deviation"
-        if self.kind == "mass" and not 0 < value < math.inf:
-            raise InputError(f"mass takes a finite factor above 0, not {shown}")
-        if not 0 <= value < math.inf:
-            raise InputError(f"{self.kind} takes a finite {what} of 0 or more, not {shown}")
-        if isinstance(self.step, bool) or not isinstance(self.step, int | np.integer) or self.step < 0:
-            raise InputError(f"the step of {self.kind} must be a whole number of 0 or more, not {self.step!r:.40}")
-        if self.step > STEPS_LIMIT:
-            raise InputError(f"the step of {self.kind} must be at most {STEPS_LIMIT:,}")
-        object.__setattr__(self, "value", value)
+            raise InputError(f"no perturbation is called {self.kind!r}: there are {', '.join(KINDS)}")
+        check_whole(f"the step of {self.kind}", self.step, 0, _LAST_STEP)
+        object.__setattr__(self, "value", _checked(self.kind, self.value))
         object.__setattr__(self, "step", int(self.step))
 
     @classmethod
     def parse(cls, text: str) -> Perturbation:
         """Return the perturbation that `KIND=VALUE@STEP` or `KIND=VALUE` describes. Raises InputError."""
-        kind, equals, rest = text.strip().partition("=")
-        value, at, step = rest.partition("@")
-        if not equals or not value or (at and not step):
-            raise InputError(f"a perturbation is written KIND=VALUE or KIND=VALUE@STEP, as {_EXAMPLE}, not {text!r}")
-        return cls(kind.strip().replace("-", "_"), _number(value, text), _step(step, text) if at else 0)
+        match = _WRITTEN.fullmatch(text.strip())
+        value, step = (_number(match[name] or "0") if match else math.nan for name in ("value", "step"))
+        if match is None or math.isnan(value) or not step.is_integer():  # a step may be written 3e5 too
+            raise InputError(
+                f"a perturbation is written KIND=VALUE or KIND=VALUE@STEP, as {_EXAMPLE}, not {text!r:.60}"
+            )
+        return cls(match["kind"].replace("-", "_"), value, int(step))
 
     def __str__(self) -> str:
         return f"{self.kind}={_plain(self.value)}" + (f"@{self.step}" if self.step else "")
@@ -77,9 +67,8 @@ class Perturbation:
     @property
     def label(self) -> str:
         """What it does, in few words: `friction x 1.5`, `observation noise 0.1`."""
-        return (
-            f"{self.kind} x {self.value:g}" if self.kind in PHYSICS else f"{self.kind.replace('_', ' ')} {self.value:g}"
-        )
+        times = "x " if self.kind in PHYSICS else ""
+        return f"{self.kind.replace('_', ' ')} {times}{self.value:g}"
 
 
 def unlike_training(trained: Iterable[str | Perturbation]) -> list[str]:
@@ -94,13 +83,10 @@ def perturbations_of(given: str | Perturbation | Iterable[str | Perturbation]) -
     Raises:
         InputError: one is not what it should be, or two of one kind have the same step.
     """
-    several = (given,) if isinstance(given, str | Perturbation) else given
-    if not isinstance(several, Iterable):
-        raise InputError(f"perturbations are a list such as [{_EXAMPLE!r}], not {given!r:.40}")
+    several = [given] if isinstance(given, str | Perturbation) or not isinstance(given, Iterable) else given
     parsed = [Perturbation.parse(item) if isinstance(item, str) else item for item in several]
-    for item in parsed:
-        if not isinstance(item, Perturbation):
-            raise InputError(f"{item!r} is no perturbation: write it as {_EXAMPLE!r}, or make a Perturbation")
+    if not all(isinstance(item, Perturbation) for item in parsed):
+        raise InputError(f"perturbations are a list such as [{_EXAMPLE!r}], not {given!r:.40}")
     parsed.sort(key=lambda item: (item.step, KINDS.index(item.kind)))
     for first, second in itertools.pairwise(parsed):
         if (first.kind, first.step) == (second.kind, second.step):
@@ -134,8 +120,7 @@ def continued(before: Sequence[Perturbation], given: Sequence[Perturbation], beg
     past = [item for item in before if item.step < begin]
     for item in given:
         if item.step < begin and item not in past:
-            later = Perturbation(item.kind, item.value, begin)
-            raise InputError(f"{item} lies before step {begin}, where this run begins: write {later}, or a later step")
+            raise InputError(f"{item} lies before step {begin}, where this run begins: give that step, or a later one")
     return perturbations_of([*past, *(item for item in given if item.step >= begin)])
 
 
@@ -144,12 +129,10 @@ def refuse_late(perturbations: Iterable[Perturbation], steps: int, planned: bool
 
     Those that were `planned` in the run that this one begins with have nobody who asked for them now.
     """
+    hint = "the source run planned it: --perturb none leaves it out" if planned else "give an earlier step"
     for item in perturbations:
         if item.step >= steps:
-            hint = "was planned in the run that this one begins with: --perturb none leaves that out" if planned else ""
-            raise InputError(
-                f"{item} would change nothing: the run ends at step {steps}; {hint or 'give an earlier step'}"
-            )
+            raise InputError(f"{item} would change nothing: the run ends at step {steps}; {hint}")
 
 
 def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:
@@ -160,29 +143,23 @@ def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:
     return [(step, ", ".join(texts)) for step, texts in labels.items()]
 
 
-def _number(text: str, whole: str) -> float:
+def _checked(kind: str, value: object) -> float:
+    """Return the value of a perturbation. Raises InputError for one that its kind cannot have."""
+    number = math.nan if isinstance(value, str | bool) else _number(value)
+    if not 0 <= number < math.inf or (kind == "mass" and not number):
+        what = "factor" if kind in PHYSICS else "standard deviation"
+        raise InputError(
+            f"{kind} takes a finite {what} {'above 0' if kind == 'mass' else 'of 0 or more'}, not {number}"
+        )
+    return number
+
+
+def _number(value: object) -> float:
+    """Return a float, or nan for what is none."""
     try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"{whole}: {text!r} is not a number; write it as {_EXAMPLE}") from None
-
-
-def _as_float(value: float | np.number) -> float:
-    try:
-        return float(value)
-    except OverflowError:  # a whole number beyond every float
-        return math.inf if value > 0 else -math.inf
-
-
-def _step(text: str, whole: str) -> int:
-    """Return a step, which may be written 3e5 too."""
-    try:
-        value = int(text) if text.strip("+-_ 0123456789") == "" else float(text)
-    except ValueError:
-        value = math.nan
-    if isinstance(value, float) and not value.is_integer():
-        raise InputError(f"{whole}: {text!r} is not a whole number of steps; write it as {_EXAMPLE}")
-    return int(value)
+        return float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def _plain(value: float) -> str:

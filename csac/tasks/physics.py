@@ -41,9 +41,7 @@ class Physics:
         self._mujoco: Any = sys.modules.get("mujoco")  # a task that it simulates has imported it
         self._model: Any = getattr(self._environment, "model", None)
         if self._mujoco is None or not isinstance(self._model, self._mujoco.MjModel):
-            raise InputError(
-                f"{task_name} is no MuJoCo task: {', '.join(PHYSICS)} cannot be changed, and {' and '.join(NOISES)} can"
-            )
+            raise InputError(f"{task_name} is no MuJoCo task: of it only {' and '.join(NOISES)} can be perturbed")
         self._task_name = task_name
         self._original = copy.copy(self._model)
         self._factors = dict.fromkeys(PHYSICS, 1.0)
@@ -77,10 +75,7 @@ class Physics:
         if is_same and all((_array(self._model, name) == array).all() for name, array in self._scaled.items()):
             return None
         kinds = " and ".join(kind for kind, factor in self._factors.items() if factor != 1.0)
-        return (
-            f"{self._task_name} sets its own physics at reset, which undoes a changed {kinds}: "
-            "it cannot be perturbed in this way"
-        )
+        return f"{self._task_name} sets its own physics at reset: {kinds} cannot be perturbed"
 
     def _renew_constants(self) -> None:
         """Have MuJoCo derive anew what it derives of masses, with data of its own: the episode's is not touched."""
@@ -95,7 +90,7 @@ class Physics:
         straight = np.isin(self._model.actuator_gaintype, [int(gains.mjGAIN_FIXED), int(gains.mjGAIN_AFFINE)])
         straight &= np.isin(self._model.actuator_biastype, [int(biases.mjBIAS_NONE), int(biases.mjBIAS_AFFINE)])
         if not straight.all():
-            raise InputError(f"{self._task_name} has actuators such as muscles, whose gain is more than a factor")
+            raise InputError(f"{self._task_name} has actuators, such as muscles, whose gain cannot be scaled")
 
 
 class Noise:
@@ -132,7 +127,7 @@ class Noise:
         """Return what JSON can hold of the generators."""
         return {kind: generator.bit_generator.state for kind, generator in self._generators.items()}
 
-    def take_back(self, state: Mapping[str, Any]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         """Go on drawing where `state` was taken."""
         for kind in self._generators.keys() & state.keys():
             self._generators[kind].bit_generator.state = state[kind]

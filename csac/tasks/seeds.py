@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac.tasks.environment import Environment
-from csac.tasks.making import Task
-from csac.tasks.spaces import EnvironmentFailure
+from csac.tasks.failures import EnvironmentFailure
+from csac.tasks.registry import Task
 from csac.types import Snapshot
 
 # What episode 0 of an evaluation is reset with; the next ones with the numbers after it.
@@ -80,7 +80,7 @@ class SeedEnvironments:
         self._returns = [0.0] * len(seeds)
         self._lengths = [0] * len(seeds)
         self._failures: list[Failure] = []
-        self.refused: dict[int, str] = {}  # why the episode saved of the seed at this place was not taken back
+        self.refused: dict[int, str] = {}  # why the episode saved of the seed at this place was not restored
 
     def reset(self) -> np.ndarray:
         """Start the next episode of every seed: observations [seed, observation].
@@ -125,10 +125,10 @@ class SeedEnvironments:
     def stop(self, index: int) -> None:
         """Step the seed at this place in the group no more."""
         self.alive[index] = False
-        self._rest(index)
+        self._running = [other for other in self._running if other != index]
 
     def save(self, index: int) -> Snapshot:
-        """Return what the seed at this place needs to go on; without "exact", from the start of its episode.
+        """Return what the seed at this place needs to go on; unless "exact", from the start of its episode.
 
         "problem" says what is wrong with an environment that offers to be saved and cannot.
         """
@@ -150,7 +150,7 @@ class SeedEnvironments:
         }
         return Snapshot(arrays, values)
 
-    def take_back(self, index: int, saved: Snapshot) -> bool:
+    def restore(self, index: int, saved: Snapshot) -> bool:
         """Let the seed at this place go on from `save`; return false where its episode had to start anew.
 
         That is so as well where the environment does not take the snapshot, which `refused` then says. A seed whose
@@ -167,12 +167,12 @@ class SeedEnvironments:
         self._observation[index], self._reward[index] = observation, values["reward"]
         if not values["alive"]:
             self.stop(index)
-        elif not (values["exact"] and self._restore(index, Snapshot(arrays, values["environment"]))):
+        elif values["exact"] and self._is_restored(index, Snapshot(arrays, values["environment"])):
+            self._returns[index], self._lengths[index] = values["episode_return"], values["episode_length"]
+        else:
             self._begun[index] -= 1
             self._reset(index)
             return False
-        else:
-            self._returns[index], self._lengths[index] = values["episode_return"], values["episode_length"]
         return True
 
     @property
@@ -199,7 +199,7 @@ class SeedEnvironments:
         except EnvironmentFailure as error:
             self._fail(index, error)
 
-    def _restore(self, index: int, saved: Snapshot) -> bool:
+    def _is_restored(self, index: int, saved: Snapshot) -> bool:
         """Return whether the environment goes on with its episode; one that was saved by another task may not."""
         try:
             self.environments[index].restore(training_seed(self.seeds[index], self._begun[index] - 1), saved)
@@ -208,11 +208,8 @@ class SeedEnvironments:
             return False
         return True
 
-    def _rest(self, index: int) -> None:
-        self._running = [other for other in self._running if other != index]
-
     def _fail(self, index: int, error: EnvironmentFailure) -> None:
-        self._rest(index)
+        self._running = [other for other in self._running if other != index]
         details = "".join(traceback.format_exception(error)) if error.__cause__ else ""
         self._failures.append(Failure(index, str(error), details))
 

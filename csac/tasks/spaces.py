@@ -5,22 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from csac.tasks.failures import EnvironmentFailure, one_line, raised
 from csac.types import InputError
 
 Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-
-
-# What an environment may raise that is its own failure; a script that ends with `sys.exit` is one too.
-RAISED = (Exception, SystemExit)
-
-
-class EnvironmentFailure(RuntimeError):
-    """An environment raised, or gave what is not a finite number of the right shape. The message is one line."""
 
 
 class ContractParts(NamedTuple):
@@ -32,40 +26,41 @@ class ContractParts(NamedTuple):
     action_high: np.ndarray  # [action] float32
 
 
-def observation_parts(space: spaces.Space) -> Parts:
+def contract_parts(environment: gymnasium.Env) -> ContractParts:
+    """Return the parts of an environment's spaces. Raises InputError for spaces that csac does not take."""
+    try:
+        observation, action = environment.observation_space, environment.action_space
+    except Exception as error:
+        raise InputError(f"the environment lacks a space: {raised(error)}") from None
+    return ContractParts(observation_parts(observation), *action_parts(action))
+
+
+def observation_parts(space: object) -> Parts:
     """Return the parts of a Box or Dict of Boxes in their flat order. Raises InputError for any other space."""
-    keys = list(space.spaces) if isinstance(space, spaces.Dict) else []
-    if unnamed := [key for key in keys if not isinstance(key, str)]:
-        raise InputError(
-            f"the observation has the key {unnamed[0]!r}, which is no text: give each part of the Dict a name"
-        )
-    named = [(key, space[key]) for key in sorted(keys)] if isinstance(space, spaces.Dict) else [(None, space)]
-    for key, part in named:
+    named: dict[Any, object] = dict(space.spaces) if isinstance(space, spaces.Dict) else {None: space}
+    parts = []
+    for key, part in sorted(named.items(), key=lambda item: str(item[0])):
         name = "the observation" if key is None else f"observation[{key!r}]"
-        if not isinstance(part, spaces.Box):
+        if not isinstance(part, spaces.Box) or not isinstance(key, str | None):
             raise InputError(
-                f"{name} is a {type(part).__name__} and csac takes Boxes, or one Dict of Boxes: "
-                "wrap the environment in gymnasium.wrappers.FlattenObservation"
+                f"{name} is a {type(part).__module__}.{type(part).__name__}, and csac takes gymnasium's Box, or a Dict "
+                "of Boxes with names: wrap the environment in gymnasium.wrappers.FlattenObservation"
             )
-        if part.dtype == np.uint8 and part.low.ndim == 3:
-            raise InputError(
-                f"{name} is an image {part.low.shape}, which csac does not learn from: choose a vector of states"
-            )
-        if key is not None and not part.low.size:
-            raise InputError(f"{name} is empty, a Box of shape {part.shape}: leave it out")
-    parts = tuple((key, tuple(part.shape or ())) for key, part in named)
-    if not size(parts):
-        raise InputError("the observation is empty: there is nothing to learn from")
-    return parts
+        if part.dtype == np.uint8 and len(part.shape) == 3:
+            raise InputError(f"{name} is an image {part.shape}: csac learns from vectors of states")
+        if not math.prod(part.shape):
+            raise InputError(f"{name} is empty: its shape is {part.shape}")
+        parts.append((key, tuple(part.shape)))
+    if not parts:
+        raise InputError("the observation is an empty Dict")
+    return tuple(parts)
 
 
-def action_parts(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+def action_parts(space: object) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
     """Return shape and flat float32 bounds of a bounded Box of floats. Raises InputError for any other space."""
-    if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
-        raise InputError(f"the action space is {space} and csac takes continuous actions, a Box of floats")
+    if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating) or not space.low.size:
+        raise InputError(f"the action space is {space}, and csac takes continuous actions, gymnasium's Box of floats")
     low, high = _float32_within(space.low.reshape(-1), space.high.reshape(-1))
-    if not low.size:
-        raise InputError("the action space is empty: there is nothing to learn")
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise InputError(
             "the action space has infinite bounds: give it finite ones, as gymnasium.wrappers.TransformAction("
@@ -136,25 +131,8 @@ def scalar(reward: Any) -> float:
         raise EnvironmentFailure(f"reward has shape {reward.shape} and is to be one number")
     try:
         reward = float(reward)
-    except (TypeError, ValueError):
-        raise EnvironmentFailure(f"reward is a {type(reward).__name__} and is to be one number") from None
-    except OverflowError:
-        raise EnvironmentFailure("reward is a whole number that no float can hold") from None
+    except (TypeError, ValueError, OverflowError) as error:
+        raise EnvironmentFailure(f"reward is not one number: {one_line(error)}") from None
     if not abs(reward) <= FLOAT32_MAX:
         raise EnvironmentFailure(f"reward is {reward}")
     return reward
-
-
-def message(error: BaseException) -> str:
-    """Return what an error says, in one line that every file and terminal takes."""
-    try:
-        text = str(error)
-    except Exception as unsaid:
-        text = f"(saying what it is raised {type(unsaid).__name__})"
-    return " ".join(text.encode("utf-8", "backslashreplace").decode().split())
-
-
-def one_line(error: BaseException) -> str:
-    """Return an error's type and what it says, in one line."""
-    told = message(error)
-    return f"{type(error).__name__}: {told}" if told else type(error).__name__

@@ -10,8 +10,8 @@ import numpy as np
 
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
-from csac.evaluation.pool import EvaluationPool, ProcessDied
+from csac.evaluation.evaluator import EvaluationFailure, Evaluator
+from csac.evaluation.pool import EvaluationPool
 from csac.tasks.perturbations import values_at
 from csac.tasks.seeds import SeedEnvironments
 from csac.training.checkpoint import Checkpoint, taken_back
@@ -30,29 +30,23 @@ from csac.training.messages import (
     Settings,
 )
 from csac.training.seed_files import SeedFiles
-from csac.types import InputError, Snapshot
+from csac.types import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
-    from csac.evaluation.evaluator import EvaluationEpisode
-    from csac.evaluation.pool import PendingEvaluation
+    from csac.evaluation.pending import Pending
     from csac.types import PolicyNetwork
 
 METRICS_INTERVAL = 1_000
 
 
 class Evaluation(NamedTuple):
-    """Policies that are to be evaluated: they are being so in other processes (`running`), or will be in this one."""
+    """Policies that are being evaluated in other processes, or will be in this one."""
 
     step: int
     policies: dict[int, Policy]
-    running: PendingEvaluation | None
-
-    @property
-    def is_over(self) -> bool:
-        """Whether it need not be waited for."""
-        return self.running is None or self.running.is_over
+    pending: Pending
 
 
 class Group:
@@ -150,7 +144,7 @@ class Group:
             if due:
                 yield from self.settle()  # one at a time
                 self._evaluation = self._begin_evaluation()
-            if self._evaluation and (due or boundary) and self._evaluation.is_over:
+            if self._evaluation and (due or boundary) and self._evaluation.pending.is_over:
                 yield from self.settle()
             if boundary or (due and not self._evaluation):  # so that who watches hears of an evaluation at once
                 yield Progress(self.step)
@@ -226,40 +220,25 @@ class Group:
         """Begin to evaluate the policies of now, on the task as it was in the last step."""
         policies = self.policies()
         self.evaluator.perturb(values_at(self.settings.plan.perturbations, self.step - 1))
-        running = self._pool.begin(list(policies.values())) if self._pool else None
-        return Evaluation(self.step, policies, running)
+        return Evaluation(self.step, policies, (self._pool or self.evaluator).begin(list(policies.values())))
 
     def _outcome(self, evaluation: Evaluation) -> Iterator[GroupMessage]:
         """Yield what an evaluation gives; stop the seeds that fail in it."""
         rows, policies, step = [], dict(evaluation.policies), evaluation.step
-        for index, seed in enumerate(evaluation.policies):
-            try:
-                episodes = yield from self._episodes(evaluation, index)
-            except (EvaluationFailure, InputError) as error:  # the latter: the task cannot be made once more
+        results = evaluation.pending.results()
+        for note in evaluation.pending.notes:
+            yield Noted(f"step {step}: {note}")
+        for seed, result in zip(evaluation.policies, results, strict=True):
+            if isinstance(result, EvaluationFailure):
                 self.environments.stop(self.seeds.index(seed))
-                yield Failed(seed, step, f"its evaluation failed: {error}", "", policies.pop(seed))
-                continue
-            rows += [episode.row(seed, step) for episode in episodes]
-        if any(row["length"] >= LONGEST_EPISODE for row in rows):
-            yield Noted(
-                f"step {step}: evaluation episodes were broken off after {LONGEST_EPISODE:,} steps: do they end?"
-            )
-        self._info_names |= self.evaluator.info_names | (evaluation.running.info_names if evaluation.running else set())
+                yield Failed(seed, step, f"its evaluation failed: {result}", "", policies.pop(seed))
+            else:
+                rows += [episode.row(seed, step) for episode in result]
+        limit = self.evaluator.episode_limit
+        if any(row["length"] >= limit for row in rows):
+            yield Noted(f"step {step}: evaluation episodes were broken off after {limit:,} steps: do they end?")
+        self._info_names |= self.evaluator.info_names
         yield Evaluated(step, rows, policies, frozenset(self._info_names))
-
-    def _episodes(self, evaluation: Evaluation, index: int) -> Generator[GroupMessage, None, list[EvaluationEpisode]]:
-        """Return the episodes of one of the policies; those that a dying process took along are made here."""
-        policy = list(evaluation.policies.values())[index]
-        if not evaluation.running:
-            return self.evaluator.run(policy)
-        try:
-            return evaluation.running.episodes(index)
-        except ProcessDied as error:
-            yield Noted(f"step {evaluation.step}: {error}; it is made by the process that trains instead")
-        try:
-            return self.evaluator.run(policy)
-        finally:
-            self.evaluator.close()  # no process is sent open environments
 
     def _stop_diverged(self) -> Iterator[GroupMessage]:
         """Stop each seed whose parameters, or what they led to, are not finite. Its last checkpoint stays sound."""
@@ -285,7 +264,7 @@ class Group:
             environment = saved.part("environment")
             if self.settings.has_other_task:
                 environment.values["exact"] = False
-            if not self.environments.take_back(index, environment):
+            if not self.environments.restore(index, environment):
                 anew.append(index)
         self.learner.take_back(learnt, [functools.partial(checkpoint.memory, seed) for seed in self.seeds])
         self._files = [SeedFiles(checkpoint.folder, seed, checkpoint.files) for seed in self.seeds]

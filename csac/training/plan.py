@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import pickle
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -10,13 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.algorithms import ALGORITHMS
-from csac.checks import check_arguments, check_whole
+from csac.checks import check_whole
 from csac.presets import matching_preset
 from csac.record.manifest import CheckpointPlan, EvaluationPlan, Manifest
 from csac.record.run import RunDirectory, is_run
-from csac.tasks.environment import Environment, try_arguments
-from csac.tasks.known import check_events, events_of
+from csac.tasks.environment import Environment
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
+from csac.tasks.preflight import json_arguments, try_task, wrapper_warnings
+from csac.tasks.registry import check_events, events_of
 from csac.tasks.seeds import EVALUATION_SEED, FIRST_TRAINING_SEED
 from csac.tasks.trust import remember
 from csac.training.checkpoint import steps_in
@@ -29,9 +31,12 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from csac.tasks.making import Task
+    from csac.tasks.registry import Task
     from csac.training.options import PlanOptions
     from csac.types import Algorithm, Spec
+
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,14 +146,14 @@ def make_plan(
     choose_device(options.device)
     if others.get("evaluation_processes") and not may_evaluate_beside:
         raise InputError("stop_when is asked before training goes on: leave out evaluation_processes")
-    check_arguments("environment_arguments", others.get("environment_arguments"))
-    arguments = dict(others.get("environment_arguments") or {})
+    arguments = json_arguments(others.get("environment_arguments"))
     asked = others.get("perturbations")
     continued = before.run.manifest if before.run else None
     with closing(Environment(task, arguments)) as environment:
         spec, task_name = environment.spec, environment.task_name
-        if arguments:
-            try_arguments(environment, arguments)
+        try_task(environment)
+        for line in wrapper_warnings(environment):
+            _log.warning("note: %s", line)
         remember(task)
         changes = planned_perturbations(asked, before.existing, before.source)
         if not before.existing:  # whose number of steps has its own refusal

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from csac import __version__
 from csac.processes import usable_cores
 from csac.record.manifest import Machine
-from csac.tasks.known import adapter_of
+from csac.tasks.registry import adapter_of
 from csac.training.devices import in_use
 
 if TYPE_CHECKING:
-    from csac.tasks.making import Task
+    from csac.tasks.registry import Task
 
 
 def provenance(task: Task, command: str | None) -> dict[str, Any]:

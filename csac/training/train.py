@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from csac.console.progress import Reporter
     from csac.record.manifest import Manifest, State
     from csac.record.scalars import Log
-    from csac.tasks.making import Task
+    from csac.tasks.registry import Task
     from csac.training.options import PlanOptions
     from csac.types import Algorithm
 

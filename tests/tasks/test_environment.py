@@ -18,7 +18,7 @@ from gymnasium import spaces
 
 from csac.tasks.environment import Environment
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED, SeedEnvironments, training_seed
-from csac.tasks.spaces import EnvironmentFailure, one_line
+from csac.tasks.failures import EnvironmentFailure, one_line
 from csac.types import InputError, Spec
 
 UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)

@@ -38,7 +38,7 @@ from csac.tasks.perturbations import (
 )
 from csac.tasks.seeds import EVALUATION_SEED, SeedEnvironments
 from csac.tasks.snapshots import _mujoco_arrays
-from csac.tasks.spaces import EnvironmentFailure
+from csac.tasks.failures import EnvironmentFailure
 from csac.training import messages
 from csac.training.group import Group
 from csac.training.messages import Progress

@@ -527,7 +527,7 @@ def test_the_environment_of_the_documentation_can_be_saved(tmp_path):
     for _ in range(70):  # into the second episode
         first.step(action)
     saved = first.save(0)
-    assert second.take_back(0, Snapshot(saved.arrays, json.loads(json.dumps(saved.values))))
+    assert second.restore(0, Snapshot(saved.arrays, json.loads(json.dumps(saved.values))))
     for _ in range(40):  # into the third
         ours, theirs = second.step(action), first.step(action)
         assert (ours.next_observation, ours.reward, ours.episodes) == (

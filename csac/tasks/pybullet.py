@@ -1,29 +1,40 @@
-"""What known tasks need beside `gymnasium.make`: who registers them, an adapter, their events, a better picture."""
+"""PyBullet's tasks: adapters for panda-gym and PyFlyt, pictures of them, and their output kept from the terminal."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Collection
+import ctypes
+import io
+import logging
+import os
+import re
+import sys
+import tempfile
+import threading
+from contextlib import contextmanager, suppress
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
-from gymnasium.wrappers import NormalizeObservation, NormalizeReward
-
-from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-INSTALL = "pip install '.[robots]' in a clone of csac"
-RESERVED = frozenset({"seed", "step", "episode", "return", "length", "success"})  # columns that there are anyway
-RESERVED_TAGS = frozenset({"mean_reward", "mean_ep_length", "success_rate"})
+    from collections.abc import Callable, Iterator, Mapping
 
 _CONTEXT = 2  # waypoints that the policy sees: the one it flies to and the next
 _EYE = np.array([0.0, 0.0, 0.5])  # metres above the drone
 _BESIDE = np.array([-0.6, -0.6, 0.3])  # metres from the drone
+
+# What PyBullet prints, the second half with a window alone, and with what PyFlyt's Aviary clears it from a terminal. It
+# need not begin a line: what a display has left may stand before it.
+_CHATTER = re.compile(
+    r"(?:pybullet build time: [^\n]*|arg[cv](?:\[\d+\])? ?=[^\n]*|\x1b\[A *\x1b\[A|b3(?:Printf|Warning|Error)[^\n]*"
+    r"|startThreads creating [^\n]*|start(?:ed|ing) thread \d+[^\n]*|numActiveThreads = \d+|stopping threads"
+    r"|GL_[A-Z_]+=[^\n]*|MotionThreadFunc: [^\n]*|Thread with taskId [^\n]*|Thread TERMINATED)\r?\n"
+)
+
+_lock = threading.RLock()  # the descriptors belong to the whole process
+_log = logging.getLogger(__name__)
 
 
 class Adapter(NamedTuple):
@@ -139,93 +150,68 @@ ADAPTERS: Mapping[str, Adapter] = MappingProxyType(
         },
     }
 )
-_FAMILIES = {"PyFlyt/": _PYFLYT, "Panda": Adapter("panda_gym")}  # what other ids of that name take is not known
+FAMILIES = {"PyFlyt/": _PYFLYT, "Panda": Adapter("panda_gym")}  # what other ids of that name take is not known
 
 
-def adapter_of(task: object) -> Adapter | None:
-    """Return the adapter of a task given by its id, with or without the module in front, or None."""
-    name = task.rpartition(":")[2] if isinstance(task, str) else ""
-    if name in ADAPTERS:
-        return ADAPTERS[name]
-    return next((adapter for prefix, adapter in _FAMILIES.items() if name.startswith(prefix)), None)
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Send what PyBullet prints in this block to the log, at level DEBUG.
 
-
-def register(name: str) -> None:
-    """Import what registers a known task, if there is such a task and it is not registered yet.
-
-    Raises:
-        InputError: the package is not installed, or another version; the message says what to install.
+    PyBullet prints from C, where Python's streams do not see it, and PyFlyt from Python, whose streams need not end in
+    the descriptors (a notebook's do not). Whatever else is written meanwhile comes out at the end of the block.
     """
-    adapter = adapter_of(name)
-    if adapter is None or name in gymnasium.registry:
-        return
+    with _lock, _descriptor_kept(1), _descriptor_kept(2), _stream_kept("stdout"), _stream_kept("stderr"):
+        yield
+
+
+@contextmanager
+def _descriptor_kept(descriptor: int) -> Iterator[None]:
+    """Let a descriptor point to a file during this block, and pass on what is not chatter."""
+    _flush()
     try:
-        importlib.import_module(adapter.module)
-    except ImportError as error:
-        if name in ADAPTERS:
-            raise InputError(missing(name, error)) from error
-    if name in ADAPTERS and name not in gymnasium.registry:
-        package = adapter.module.partition(".")[0]
-        raise InputError(f"the {package} that is installed has no {name}: {INSTALL}")
+        original = os.dup(descriptor)
+    except OSError:  # closed: nobody can be disturbed
+        yield
+        return
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), descriptor)
+        try:
+            yield
+        finally:
+            _flush()
+            os.dup2(original, descriptor)
+            os.close(original)
+            file.seek(0)
+            rest = _without_chatter(file.read().decode(errors="surrogateescape")).encode(errors="surrogateescape")
+            with suppress(OSError):  # nobody reads any more
+                while rest:
+                    rest = rest[os.write(descriptor, rest) :]
 
 
-def missing(name: str, error: Exception) -> str:
-    """Say what to install for a task of the robots."""
-    return f"{name} needs packages that are not installed ({' '.join(str(error).split())}): {INSTALL}"
+@contextmanager
+def _stream_kept(name: str) -> Iterator[None]:
+    """Let Python's stream of this name be another during this block, and pass on what is not chatter."""
+    stream, aside = getattr(sys, name), io.StringIO()
+    setattr(sys, name, aside)
+    try:
+        yield
+    finally:
+        if getattr(sys, name) is aside:
+            setattr(sys, name, stream)
+        with suppress(OSError, ValueError, AttributeError):  # nobody reads any more, or there is no stream
+            stream.write(_without_chatter(aside.getvalue()))
 
 
-def events_of(task: object, more: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return the names of a task's own events, then `more`, each once."""
-    adapter = adapter_of(task)
-    return tuple(dict.fromkeys([*(adapter.events if adapter else ()), *more]))
+def _without_chatter(written: str) -> str:
+    if chatter := _CHATTER.findall(written):
+        _log.debug("PyBullet: %s", "".join(chatter).strip())
+    return _CHATTER.sub("", written)
 
 
-def check_events(events: Sequence[str]) -> None:
-    """Raise InputError for a name that cannot be a column of evaluations.csv and a tag of TensorBoard."""
-    if isinstance(events, str):
-        raise InputError(f"events are a list of names: write ({events!r},)")
-    if not isinstance(events, Collection):
-        raise InputError(f"events are a list of names such as ('collision',), not {events!r:.40}")
-    for name in events:
-        if (
-            not isinstance(name, str)
-            or not name
-            or any(c in ",;\"'#" or c.isspace() or not c.isprintable() for c in name)
-        ):
-            raise InputError(f"{name!r} cannot name an event: names have no spaces, commas or quotes")
-        if name in RESERVED | RESERVED_TAGS:
-            raise InputError(f"{name!r} cannot name an event: evaluations have something of that name already")
-
-
-def is_pybullet(environment: gymnasium.Env) -> bool:
-    """Whether this is one of PyFlyt's or panda-gym's environments, or derived from one."""
-    return bool(_packages(environment) & {"PyFlyt", "panda_gym"})
-
-
-def has_memory(task: object, environment: gymnasium.Env) -> bool:
-    """Whether what an episode gives depends on those before it: so a task of panda-gym's that is not known not to."""
-    if isinstance(task, str) and (adapter := ADAPTERS.get(task.rpartition(":")[2])):
-        return adapter.has_memory
-    return "panda_gym" in _packages(environment)
-
-
-def wrapper_notes(environment: gymnasium.Env) -> list[str]:
-    """Return a line for each wrapper that learns something by itself, which csac neither saves nor hands on."""
-    notes = []
-    while isinstance(environment, gymnasium.Wrapper):
-        if isinstance(environment, NormalizeObservation):
-            notes.append(
-                "NormalizeObservation keeps statistics of its own, which are saved neither with the policy nor in "
-                "checkpoints, and each environment has others: leave it out (PPO normalises by itself)"
-            )
-        if isinstance(environment, NormalizeReward):
-            notes.append(
-                "NormalizeReward keeps statistics of its own, which no checkpoint saves, and returns are in units that "
-                "change as they do: leave it out, or put a constant factor in its place"
-            )
-        environment = environment.env
-    return notes
-
-
-def _packages(environment: gymnasium.Env) -> set[str]:
-    return {kind.__module__.partition(".")[0] for kind in type(environment.unwrapped).__mro__}
+def _flush() -> None:
+    """Write what the streams of Python and C hold back."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):
+            stream.flush()
+    if os.name == "posix":
+        ctypes.CDLL(None).fflush(None)

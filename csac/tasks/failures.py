@@ -1,0 +1,58 @@
+"""How an environment's errors are told: in one line, with the place in the code that raised."""
+
+from __future__ import annotations
+
+import os
+import sysconfig
+from pathlib import Path
+from traceback import walk_tb
+
+_CSAC = f"{Path(__file__).parents[1]}{os.sep}"
+_LIBRARIES = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"), "<frozen")
+
+
+class EnvironmentFailure(RuntimeError):
+    """An environment raised, or gave what is not a finite number of the right shape. The message is one line."""
+
+
+def failure_of(call: str, error: BaseException) -> EnvironmentFailure:
+    """Return the failure of an environment whose `call` raised, be it a panic of native code or `sys.exit`.
+
+    Raises:
+        KeyboardInterrupt, GeneratorExit: the error, if it is one of these.
+    """
+    raise_interrupt(error)
+    return EnvironmentFailure(f"{call} raised {raised(error)}")
+
+
+def raise_interrupt(error: BaseException) -> None:
+    """Raise an error again that is none of the code that raised it: KeyboardInterrupt or GeneratorExit."""
+    if isinstance(error, KeyboardInterrupt | GeneratorExit):
+        raise error
+
+
+def raised(error: BaseException) -> str:
+    """Return an error's type, message and place in one line: the last frame of the user's code, else of a library's."""
+    origin = error
+    while origin.__cause__:  # Gymnasium raises another one from what a constructor raised
+        origin = origin.__cause__
+    places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(origin.__traceback__)]
+    foreign = [place for place in places if not place[0].startswith(_CSAC)]
+    own = [place for place in foreign if not any(library in place[0] for library in _LIBRARIES)]
+    where = "".join(f" ({Path(path).name}:{line})" for path, line in (own or foreign)[-1:])
+    return one_line(error) + where
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error's type and message in one line."""
+    text = message(error)
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def message(error: BaseException) -> str:
+    """Return an error's message in one line that every file and terminal takes."""
+    try:
+        text = str(error)
+    except Exception as unsaid:
+        text = f"(its message cannot be had: {type(unsaid).__name__})"
+    return " ".join(text.encode("utf-8", "backslashreplace").decode().split())

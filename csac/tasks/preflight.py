@@ -1,0 +1,89 @@
+"""What is looked at once, before a run begins: its arguments, the task's seeds and its wrappers."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
+
+from csac.tasks.failures import EnvironmentFailure
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from csac.tasks.environment import Environment
+
+
+def json_arguments(arguments: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return keyword arguments for an environment as JSON keeps them: tuples become lists, NumPy's numbers Python's.
+
+    Raises:
+        InputError: JSON would change one of them, and a resumed run would have another task.
+    """
+    if not isinstance(arguments, Mapping | None):
+        raise InputError(f"environment_arguments are keyword arguments such as {{'g': 9.0}}, not {arguments!r:.40}")
+    return _as_json(dict(arguments or {}), "environment_arguments")
+
+
+def _as_json(value: Any, name: str) -> Any:
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, list | tuple):
+        return [_as_json(item, f"{name}[{index}]") for index, item in enumerate(value)]
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return {key: _as_json(item, f"{name}[{key!r}]") for key, item in value.items()}
+    if isinstance(value, str | int | float | bool | None):
+        return value
+    raise InputError(f"{name} cannot be kept in a file: JSON has no {type(value).__name__} such as {value!r:.40}")
+
+
+def try_task(environment: Environment) -> None:
+    """Reset a task and make one step, so that one of another API, or an argument of a wrong type, is told at once.
+
+    Any other failure is left to the run, whose log has the traceback.
+
+    Raises:
+        InputError: a TypeError or ValueError came of it.
+    """
+    try:
+        environment.reset(0)
+        environment.step(np.zeros(environment.spec.action_size, np.float32))
+    except EnvironmentFailure as error:
+        if isinstance(error.__cause__, TypeError | ValueError):
+            raise InputError(f"{environment.task_name} does not work: {error}") from error
+
+
+def seed_warning(environment: Environment) -> str | None:
+    """Return a line where a task does not begin as its reset seed says, and None where it does or cannot be reset."""
+    try:
+        first, second, other = (environment.reset(seed) for seed in (1, 1, 2))
+    except EnvironmentFailure:
+        return None
+    if not np.array_equal(first, second):
+        return (
+            f"{environment.task_name}: reset(seed=...) gives other observations for the same seed: runs do not repeat"
+        )
+    if np.array_equal(first, other):
+        return f"{environment.task_name}: reset(seed=...) gives the same observation for every seed"
+    return None
+
+
+def wrapper_warnings(environment: Environment) -> list[str]:
+    """Return a line for each wrapper that learns something by itself, which csac neither saves nor exports."""
+    lines, wrapper = [], environment.raw
+    while isinstance(wrapper, gymnasium.Wrapper):
+        if isinstance(wrapper, NormalizeObservation | NormalizeReward):
+            lines.append(
+                f"{environment.task_name}: {type(wrapper).__name__} keeps statistics that are saved neither with the "
+                "policy nor in checkpoints, and each environment has its own: leave it out (PPO normalises by itself)"
+            )
+        wrapper = wrapper.env
+    return lines
+
+
+def seed_globals(seed: int) -> None:
+    """Seed Python's and NumPy's global generators, which some tasks draw from."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)

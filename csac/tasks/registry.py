@@ -1,0 +1,192 @@
+"""From a task's name to a Gymnasium environment: ids, modules and callables, and what known tasks need besides."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Any
+
+import gymnasium
+
+from csac.checks import closest
+from csac.tasks.failures import message, raise_interrupt, raised
+from csac.tasks.pybullet import ADAPTERS, FAMILIES, Adapter, quietly
+from csac.types import InputError
+
+Task = str | Callable[..., gymnasium.Env]
+
+INSTALL = "pip install '.[robots]' in a clone of csac"
+# Columns of evaluations.csv and tags of TensorBoard that there are anyway.
+_RESERVED = {"seed", "step", "episode", "return", "length", "success", "mean_reward", "mean_ep_length", "success_rate"}
+
+_log = logging.getLogger(__name__)
+
+
+def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
+    """Return a new environment. Raises InputError where there is no such task or it refuses its arguments."""
+    if isinstance(task, gymnasium.Env) or not (isinstance(task, str) or callable(task)):
+        raise InputError(f"a task is a Gymnasium id or a function that makes an environment, not {task!r:.60}")
+    name = task if isinstance(task, str) else _name_of(task) or "the task"
+    adapter = adapter_of(task)
+    _silence_mujoco()
+    with _undisturbed(bool(adapter) or "pybullet" in sys.modules):
+        make_one = _maker(task, adapter)
+        try:
+            environment = make_one(**arguments)
+        except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
+            raise InputError(_missing(name, error, adapter)) from error
+        except BaseException as error:
+            raise_interrupt(error)
+            given = f" with the arguments {arguments}" if arguments else ""
+            raise InputError(f"{name} could not be made{given}: {raised(error)}") from error
+    if not isinstance(environment, gymnasium.Env):
+        raise InputError(f"{name} returned {environment!r:.40}: a task's callable returns a gymnasium.Env")
+    return environment
+
+
+def _maker(task: Task, adapter: Adapter | None) -> Callable[..., gymnasium.Env]:
+    if not isinstance(task, str):
+        return task
+    there = registered(task)
+
+    def make_one(**arguments: Any) -> gymnasium.Env:
+        environment = gymnasium.make(there, disable_env_checker=True, **arguments)
+        return adapter.wrap(environment) if adapter and adapter.wrap else environment
+
+    return make_one
+
+
+def registered(task: str) -> str:
+    """Return the registered id of a task, after importing its module where one is named. Raises InputError."""
+    module, _, name = task.rpartition(":")
+    if module:
+        import_module(module)
+    _register_known(name)
+    if name in gymnasium.registry:
+        return name
+    similar = [task.removesuffix(name) + id for id in closest(name, sorted({*ADAPTERS, *gymnasium.registry}), most=2)]
+    otherwise = f"{module} registers none of that name" if module else "write module:Id for one that a module registers"
+    hint = f"did you mean {' or '.join(similar)}?" if similar else otherwise
+    raise InputError(f"no task is called {task}: {hint}")
+
+
+def import_module(module: str) -> None:
+    """Import the module of a task, which the user has named. Raises InputError.
+
+    The working directory is searched last, and stays on the path for what the module imports later. What the user has
+    not named is never looked for there.
+    """
+    with suppress(OSError):  # a folder that is gone
+        if os.getcwd() not in sys.path:
+            sys.path.append(os.getcwd())
+    try:
+        importlib.import_module(module)
+    except BaseException as error:
+        raise_interrupt(error)
+        raise InputError(f"the module {module} cannot be imported: {raised(error)}") from error
+
+
+def adapter_of(task: object) -> Adapter | None:
+    """Return the adapter of a task given by its id, with or without the module in front, or None."""
+    name = task.rpartition(":")[2] if isinstance(task, str) else ""
+    families = (adapter for prefix, adapter in FAMILIES.items() if name.startswith(prefix))
+    return ADAPTERS.get(name) or next(families, None)
+
+
+def _register_known(name: str) -> None:
+    """Import what registers a known task. Raises InputError where its package is not installed, or another version."""
+    adapter = adapter_of(name)
+    if adapter is None or name in gymnasium.registry:
+        return
+    try:
+        importlib.import_module(adapter.module)
+    except ImportError as error:
+        if name in ADAPTERS:
+            raise InputError(_missing(name, error, adapter)) from error
+    if name in ADAPTERS and name not in gymnasium.registry:
+        raise InputError(f"the {adapter.module.partition('.')[0]} that is installed has no {name}: {INSTALL}")
+
+
+def _missing(name: str, error: Exception, adapter: Adapter | None) -> str:
+    hint = f": {INSTALL}" if adapter else ""
+    return f"{name} needs a package that is not installed ({message(error)}){hint}"
+
+
+def task_name(task: Task, environment: gymnasium.Env) -> str:
+    """Return the id, or what a callable or its environment is called."""
+    if isinstance(task, str):
+        return task
+    return _name_of(task) or (environment.spec.id if environment.spec else type(environment.unwrapped).__name__)
+
+
+def _name_of(task: Callable[..., gymnasium.Env]) -> str:
+    return getattr(task, "__name__", "").replace("<lambda>", "")
+
+
+def is_pybullet(environment: gymnasium.Env) -> bool:
+    """Whether this is one of PyFlyt's or panda-gym's environments, or derived from one."""
+    return bool(_packages(environment) & {"PyFlyt", "panda_gym"})
+
+
+def has_memory(task: object, environment: gymnasium.Env) -> bool:
+    """Whether what an episode gives depends on those before it: so a task of panda-gym's that is not known not to."""
+    adapter = ADAPTERS.get(task.rpartition(":")[2]) if isinstance(task, str) else None
+    return adapter.has_memory if adapter else "panda_gym" in _packages(environment)
+
+
+def _packages(environment: gymnasium.Env) -> set[str]:
+    return {kind.__module__.partition(".")[0] for kind in type(environment.unwrapped).__mro__}
+
+
+def can_be_drawn(task: str) -> bool:
+    """Whether a video can be made of a task of which this process has made an environment, as far as is known of it."""
+    spec = gymnasium.registry.get(task.rpartition(":")[2])
+    creator: Any = spec.entry_point if spec else None
+    if isinstance(creator, str):
+        module, _, name = creator.partition(":")
+        creator = getattr(sys.modules.get(module), name, None)
+    modes = (getattr(creator, "metadata", None) or {}).get("render_modes")
+    return modes is None or "rgb_array" in modes
+
+
+def events_of(task: object, more: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return the names of a task's own events, then `more`, each once."""
+    adapter = adapter_of(task)
+    return tuple(dict.fromkeys([*(adapter.events if adapter else ()), *more]))
+
+
+def check_events(events: Sequence[str]) -> None:
+    """Raise InputError for a name that cannot be a column of evaluations.csv and a tag of TensorBoard."""
+    if isinstance(events, str) or not isinstance(events, Iterable):
+        raise InputError(f"events are a list of names such as ('collision',), not {events!r:.40}")
+    for name in events:
+        is_word = isinstance(name, str) and name.isprintable() and name and not {*name} & {*" ,;\"'#"}
+        if not is_word or name in _RESERVED:
+            raise InputError(f"{name!r} cannot name an event: it is no plain word, or a column that there is anyway")
+
+
+@contextmanager
+def _undisturbed(is_pybullet: bool) -> Iterator[None]:
+    """Hide Gymnasium's warnings and PyBullet's output while a task is made, and stay in the working directory."""
+    with ExitStack() as stack, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r".*WARN: ")  # Gymnasium's: an id has a newer version
+        with suppress(OSError):  # a folder that is gone
+            stack.callback(os.chdir, os.getcwd())
+        if is_pybullet:
+            stack.enter_context(quietly())
+        yield
+
+
+def _silence_mujoco() -> None:
+    """Send MuJoCo's warnings to the log: by itself it prints them, and writes MUJOCO_LOG.TXT where the user works."""
+    try:
+        mujoco = importlib.import_module("mujoco")
+    except Exception:  # a task that needs it says so
+        return
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(_log.info)
