@@ -24,8 +24,8 @@ from csac.evaluation.evaluator import (
     evaluate_episodes,
 )
 from csac.tasks.environment import Environment
-from csac.tasks.registry import Task
 from csac.tasks.physics import Noise
+from csac.tasks.registry import Task
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 

@@ -20,6 +20,7 @@ import probes
 import psutil
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
+from csac.tasks.silence import quietly
 from scalars import scalars
 
 from csac.algorithms import SAC
@@ -36,7 +37,6 @@ from csac.record.run import RunDirectory
 from csac.tasks import known
 from csac.tasks.environment import Environment
 from csac.tasks.seeds import EVALUATION_SEED
-from csac.tasks.silence import quietly
 from csac.training.train import resume, train
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 
