@@ -12,7 +12,7 @@ import gymnasium
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from policies import policy_for, run_of_task
+from played import policy_for, run_of_task
 
 from csac.algorithms import SAC
 from csac.evaluation.evaluator import EPISODES_AT_ONCE, Evaluator
