@@ -102,6 +102,7 @@ def test_a_policy_that_fails_does_so_in_its_place(how):
     results = evaluating.begin([calm, wild, other, calm]).results()
     evaluating.close()
     assert results[0] == results[3]
+    assert isinstance(results[0], list)
     assert len(results[0]) == TWO_BATCHES
     assert [isinstance(result, EvaluationFailure) for result in results] == [False, True, True, False]
     assert "evaluation episode 2, reset with seed 1000002, at step 0: step raised RuntimeError" in str(results[1])

@@ -21,7 +21,7 @@ from csac.types import InputError
 
 LEARNER = SAC(actor_hidden_sizes=(8, 8), critic_hidden_sizes=(8, 8), batch_size=8, warmup_steps=40, replay_size=300)
 TIMES = ("created", "process", "history", "commit")  # of the manifest; the code may be committed meanwhile
-INSTEAD = "is made by the process that trains instead"
+INSTEAD = "its episodes are run by this one instead"
 
 
 def run(directory: Path, processes: int | None, task: Any = "Hopper-v4", steps: int = 700, **settings: Any):
@@ -131,7 +131,7 @@ def test_what_a_dying_process_takes_along_is_made_in_line(tmp_path):
         run(tmp_path / str(processes), processes, "probes:Deadly-v0", steps=200, environment_arguments=arguments)
     ours, theirs = contents(tmp_path / "1"), contents(tmp_path / "0")
     assert ours["log.txt"].count(INSTEAD.encode()) == 2
-    assert b"its process was killed by SIGKILL" in ours["log.txt"]
+    assert b"evaluation: its process was killed by SIGKILL" in ours["log.txt"]
     assert without(ours, INSTEAD) == without(theirs, INSTEAD)
     assert ours["manifest.json"] == theirs["manifest.json"]
 
