@@ -75,7 +75,7 @@ from typed import csac
         ("train Hopper-v4 --perturb", "--perturb needs a value (csac train --help)"),
         (
             "train Hopper-v4 --perturb frction=2",
-            "no perturbation is called 'frction': did you mean friction? there are friction, gravity, mass, gain, "
+            "no perturbation is called 'frction': there are friction, gravity, mass, gain, "
             "observation_noise, action_noise",
         ),
         (
@@ -84,8 +84,7 @@ from typed import csac
         ),
         (
             "train probes:Endless-v0 --perturb mass=2",
-            "probes:Endless-v0 is no MuJoCo task: friction, gravity, mass, gain cannot be changed, and "
-            "observation_noise and action_noise can",
+            "probes:Endless-v0 is no MuJoCo task: of it only observation_noise and action_noise can be perturbed",
         ),
         ("train X --perturb none --perturb mass=2", "--perturb none leaves everything out: give it alone"),
         ("evaluate", "DIR is missing (csac evaluate --help)"),

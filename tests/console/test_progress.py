@@ -204,22 +204,19 @@ def test_a_run_that_failed_before_it_was_evaluated_points_at_the_traceback_alone
 
 
 @pytest.mark.parametrize(
-    ("task", "has_pygame", "is_watched"),
+    ("task", "is_watched"),
     [
-        ("Pendulum-v1", False, False),
-        ("Pendulum-v1", True, True),
-        ("Hopper-v4", False, True),
-        ("probes:Endless-v0", True, False),  # which draws nothing
-        ("elsewhere:Unknown-v0", False, True),
+        ("Hopper-v4", True),
+        ("probes:Endless-v0", False),  # which draws nothing
+        ("elsewhere:Unknown-v0", True),
     ],
 )
-def test_a_video_is_offered_where_it_can_be_made(plain, clock, tmp_path, monkeypatch, task, has_pygame, is_watched):
+def test_a_video_is_offered_where_it_can_be_made(plain, clock, tmp_path, task, is_watched):
     if not task.startswith("elsewhere:"):  # it is known of what this process has made
         Environment(task).close()
     run = make_run(tmp_path / "run", [[1.0]])
     leave_policies(run)
     run.update_manifest(task=task)
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: object() if has_pygame else None)
     Reporter(plain, clock).finish(run)
     assert ("watch it" in plain.file.getvalue()) == is_watched
     assert "test it" in plain.file.getvalue()
