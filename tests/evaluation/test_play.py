@@ -132,12 +132,18 @@ def test_a_folder_that_goes_meanwhile_is_told_in_one_line(run_of, tmp_path):
     gc.collect()
 
 
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-def test_an_ffmpeg_that_ends_is_told_in_one_line(run_of, tmp_path, monkeypatch):
-    monkeypatch.setattr("imageio_ffmpeg._io.get_ffmpeg_exe", lambda: "/bin/false")
-    with pytest.raises(InputError, match=r"^cannot write .*film\.mp4: .*choose another place$") as caught:
-        list(play(run_of(3).path, video=tmp_path / "film.mp4"))
-    assert "\n" not in str(caught.value)
+@pytest.mark.parametrize("breaks", [True, False])
+def test_an_ffmpeg_that_ends_is_told_in_one_line(run_of, tmp_path, monkeypatch, breaks):
+    def write_frames(*_, **__):
+        while True:
+            if (yield) is not None and breaks:
+                raise OSError("[Errno 32] Broken pipe\n\nFFMPEG COMMAND:\nffmpeg -y\n\nFFMPEG STDERR OUTPUT:\n")
+
+    monkeypatch.setattr("imageio_ffmpeg.write_frames", write_frames)
+    film = tmp_path / "film.mp4"
+    with pytest.raises(InputError) as caught:
+        list(play(run_of(3).path, video=film))
+    assert str(caught.value) == f"cannot write {film}: ffmpeg failed; choose another place"
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
