@@ -42,9 +42,9 @@ _MISWRITTEN = (
     (r"--seeds (\S*,.*|\d+( \d+)+)", r"--seeds is how many: --seeds 3"),
     (r"--perturb (\S+=\S+) (\S+=\S+).*", r"write --perturb before each: --perturb \1 --perturb \2"),
     (r"--device cuda.*", r"--device takes cpu or gpu (cuda is gpu here)"),
-    (r"--entropy-weight auto.*", r"the entropy weight adapts with --temperature automatic"),
     (r"(--(?:relative-)?entropy-weight) auto\w+.*", r"write \1 auto"),
-    (r"--temperature ([\d.]\S*).*", r"write --temperature fixed --entropy-weight \1"),
+    (r"--reference-policy previous", r"write --reference-policy average --reference-rate 1"),
+    (r"--reference-policy algorithm1", r"write --reference-policy periodic --reference-period 1"),
 )
 
 _PLACES = ("--directory", "--results", "--from")  # of folders that are written to, or learnt from

@@ -21,7 +21,7 @@ _CALLED_OTHERWISE = MappingProxyType(
         "--rho": ("--target-rate",),
         "--sigma": ("--entropy-weight",),
         "--alpha": ("--entropy-weight",),
-        "--ent-coef": ("--temperature", "--entropy-weight"),
+        "--ent-coef": ("--entropy-weight",),
         "--gamma": ("--discount",),
         "--polyak": ("--target-rate",),
         "--learning-starts": ("--warmup-steps",),
@@ -40,7 +40,9 @@ _CALLED_OTHERWISE = MappingProxyType(
         "--exp-name": ("--directory",),
         "--cuda": ("--device gpu",),
         "--gpu": ("--device gpu",),
-        "--autotune": ("--temperature automatic",),
+        "--autotune": ("--entropy-weight auto",),
+        "--temperature": ("--entropy-weight (a number, or auto)",),
+        "--temperature-learning-rate": ("--weight-learning-rate",),
         "--out": ("--video",),
         "--deterministic": ("the default, without --stochastic,",),
         "--env-kwargs": ("--environment-arguments",),  # in Python
@@ -71,6 +73,13 @@ _NEEDLESS = MappingProxyType(
     }
 )
 
+_WRITTEN_FORMERLY = MappingProxyType(
+    {
+        ("reference_policy", "previous"): 'reference_policy="average", reference_rate=1',
+        ("reference_policy", "algorithm1"): 'reference_policy="periodic", reference_period=1',
+    }
+)
+
 
 def called_here(option: str, known: Collection[str]) -> str:
     """Return what the `known` options have for one of another name, as "it is --discount here", or nothing."""
@@ -83,16 +92,11 @@ def called_here(option: str, known: Collection[str]) -> str:
 def called_in_python(name: str, known: Collection[str]) -> str:
     """Return what the `known` arguments have for one of another name, as "it is discount here", or nothing."""
     flag, *flags = ("--" + word.replace("_", "-") for word in (name, *known))
-    told = re.sub(r"(--[a-z-]+) (automatic|gpu)", r'\1="\2"', called_here(flag, flags))
+    told = re.sub(r"(--[a-z-]+) (auto|gpu)", r'\1="\2"', called_here(flag, flags))
     return re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), told)
 
 
-def written_in_python(name: str, value: object, known: Collection[str]) -> str:
-    """Return how a value is given here that other libraries give otherwise, or nothing."""
-    if "temperature" not in known:
-        return ""
-    if name == "entropy_weight" and str(value).startswith("auto"):
-        return 'it adapts with temperature="automatic"'
-    if name == "temperature" and type(value) in (int, float):
-        return f'write temperature="fixed", entropy_weight={value}'
-    return ""
+def written_in_python(name: str, value: object) -> str:
+    """Return how a value of former versions is written now, or nothing."""
+    now = _WRITTEN_FORMERLY.get((name, str(value)), "")
+    return now and f"write {now}"

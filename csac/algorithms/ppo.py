@@ -22,14 +22,14 @@ from csac.algorithms.hyperparameters import (
     check_hyperparameters,
 )
 from csac.algorithms.memory import Rollout
-from csac.algorithms.networks import MLP, descend, init_optimiser, make_optimiser, make_orthogonal_mlp
+from csac.algorithms.networks import MLP, gradient_step, init_optimiser, make_optimiser, make_orthogonal_mlp
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar, Scalars
 from csac.algorithms.statistics import EPSILON, Statistics, normalise
 from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
 class Parameters(NamedTuple):
-    """What descends, all by one optimiser."""
+    """What gradient_steps, all by one optimiser."""
 
     actor: MLP  # [observation] -> mean [action]
     critic: MLP  # [observation] -> [1]
@@ -183,7 +183,7 @@ class PPO:
 
         def learn(learnt: tuple[Parameters, Any], minibatch: Sample) -> tuple[tuple[Parameters, Any], Metrics]:
             minibatch = minibatch._replace(advantage=self.normal_advantages(minibatch.advantage))
-            parameters, optimiser_state, metrics = descend(optimiser, self.loss, *learnt, minibatch)
+            parameters, optimiser_state, metrics = gradient_step(optimiser, self.loss, *learnt, minibatch)
             return (parameters, optimiser_state), metrics
 
         def pass_over(learnt: tuple[Parameters, Any], key: Key) -> tuple[tuple[Parameters, Any], Metrics]:

@@ -137,10 +137,8 @@ SPACES: Mapping[str, Mapping[str, Dimension]] = MappingProxyType(
             **_NORMALISABLE,
         },
         "sac": {
-            "entropy_weight": Range(0.01, 1.0, "logarithmic", _ENTROPY_WEIGHT, ("temperature", "fixed")),
-            "temperature_learning_rate": Range(
-                _LEARNING_RATE.low, _LEARNING_RATE.high, "logarithmic", _LEARNING_RATE.why, ("temperature", "automatic")
-            ),
+            "entropy_weight": Range(0.01, 1.0, "logarithmic", _ENTROPY_WEIGHT),
+            "weight_learning_rate": replace(_LEARNING_RATE, needs=("entropy_weight", "auto")),
             **_NORMALISABLE,
         },
         "td3": {"policy_delay": Range(1, 4, "linear", "2 in the paper"), **_NOISE, **_OFF_POLICY},
