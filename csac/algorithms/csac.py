@@ -77,7 +77,7 @@ class CSAC(TwinCritics):
     def bracket_terms(
         self, observation: Observation, noise: Action, *, actor: MLP, reference: MLP, critics: Critics
     ) -> tuple[Scalar, Scalar, Scalar]:
-        """Return min Q, log π and log(π/π̃) at ã(s, ξ), which the bracket of Eq. Q_CSAC weighs; or KL(π ‖ π̃) for it."""
+        """Return min Q, log π and log(π/π̃) or its mean, the KL, at ã(s, ξ): the terms of the bracket in Eq. Q_CSAC."""
         policy = policy_at(actor, observation)
         q_value, log_prob = min_q(critics, observation, policy.sample(noise)), policy.log_prob(noise)
         previous = policy_at(reference, observation)
@@ -125,7 +125,7 @@ class CSAC(TwinCritics):
         """Run the update phase of Algorithm 1, lines 12 to 23, on the mini-batch of line 13."""
         observations, batch = normalise_batch(state.observations, batch)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
-        weights = self.weights(state)
+        weights = adaptation.current_weights(self.given_weights, state.learnt_weights)
         # Line 12: φ_p ← φ
         reference = self.reference_before(state.reference, state.actor, step)
         state = state._replace(reference=reference, observations=observations)
@@ -144,7 +144,7 @@ class CSAC(TwinCritics):
         self, state: State, critics: Critics, observations: Observations, noise: Actions, step: Count
     ) -> tuple[State, Metrics]:
         """Return the state after one step on the actor, then of a running average and of weights that are learnt."""
-        weights = self.weights(state)
+        weights = adaptation.current_weights(self.given_weights, state.learnt_weights)
         loss = partial(self.actor_loss, reference=state.reference, critics=critics, weights=weights)
         adam = self.optimiser(self.actor_learning_rate)
         actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)
@@ -156,24 +156,23 @@ class CSAC(TwinCritics):
         )
         return new_state, metrics
 
-    def weights(self, state: State) -> Weights:
-        """Return σ and τ of this update."""
-        return adaptation.current_weights(
-            Weights(self.entropy_weight, self.relative_entropy_weight), state.learnt_weights
-        )
+    @property
+    def given_weights(self) -> Weights:
+        """σ and τ, or `auto`."""
+        return Weights(self.entropy_weight, self.relative_entropy_weight)
 
     def adapted(self, state: State, metrics: Metrics, dimensions: int, step: Count) -> LearntWeights | None:
         """Return the learnt weights after one step: σ follows the entropy, τ the KL at the end of the last period."""
-        age, target = step % self.reference_period, adaptation.entropy_target(self.target_entropy, dimensions)
-        is_last = self.reference_policy == "average" or age + self.policy_delay >= self.reference_period
+        target = adaptation.entropy_target(self.target_entropy, dimensions)
         targets = Weights(target, self.target_relative_entropy * dimensions)
+        until_renewal = self.reference_period - step % self.reference_period
+        is_last = self.reference_policy == "average" or until_renewal <= self.policy_delay
         adam = make_optimiser(self.weight_learning_rate)
         return adaptation.adapt_weights(state.learnt_weights, metrics, targets, is_last, adam)
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return random networks; targets and reference are copies (Algorithm 1, line 1)."""
-        networks = self.first_networks(key, spec, 2 * spec.action_size)
-        given = Weights(self.entropy_weight, self.relative_entropy_weight)
+        networks, given = self.first_networks(key, spec, 2 * spec.action_size), self.given_weights
         return State(
             **networks,
             reference=copy_tree(networks["actor"]),

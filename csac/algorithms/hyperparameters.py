@@ -59,6 +59,7 @@ def check_hyperparameters(algorithm: Any) -> None:
     hints = get_type_hints(type(algorithm), include_extras=True)
     for field in dataclasses.fields(algorithm):
         given = getattr(algorithm, field.name)
+        given = given.item() if isinstance(given, np.generic) else given
         try:
             object.__setattr__(algorithm, field.name, _checked(given, hints[field.name]))
         except ValueError as error:
@@ -127,16 +128,16 @@ def _whole(value: Any, kind: Any = int) -> int:
 
 
 def _switch(value: Any, kind: Any) -> bool:
-    if not isinstance(value, bool | np.bool_):
+    if not isinstance(value, bool):
         raise ValueError("true or false")
-    return bool(value)
+    return value
 
 
 def _choice(value: Any, kind: Any) -> str:
     choices = get_args(kind)
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{'one of ' * (len(choices) > 1)}{', '.join(choices)}")
-    return str(value)
+    return value
 
 
 def _widths(value: Any, kind: Any) -> tuple[int, ...]:
