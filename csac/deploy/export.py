@@ -92,7 +92,7 @@ def provenance(run: RunDirectory, seed: int, policy: Policy, which: Which) -> di
 def _learnt_weights(run: RunDirectory, seed: int, steps: int) -> dict[str, float]:
     rows = run.rows("metrics")
     rows = rows[(rows["seed"] == seed) & (rows["step"] <= steps)]
-    learnt = [name for name, value in run.manifest.hyperparameters.items() if value in ("auto", "automatic")]
+    learnt = [name for name, value in run.manifest.hyperparameters.items() if value == "auto"]
     return {name: float(rows[name][-1]) for name in learnt if len(rows) and name in (rows.dtype.names or ())}
 
 

@@ -99,7 +99,7 @@ REFERENCE = replace(
                 hyperparameters={"relative_entropy_weight": 0.5, **PINNED, **hyperparameters},
             )
             for label, hyperparameters in (
-                ("previous", {"reference_policy": "previous"}),
+                ("previous", {"reference_policy": "average", "reference_rate": 1.0}),
                 ("periodic 100", {"reference_policy": "periodic", "reference_period": 100}),
                 ("periodic 1000", {"reference_policy": "periodic", "reference_period": 1000}),
                 ("average 0.005", {"reference_policy": "average", "reference_rate": 0.005}),

@@ -34,7 +34,7 @@ NORMALISED = [
     TD3(critic_normalisation="batch", policy_delay=1, **SMALL),
 ]
 NAMES = [algorithm.name for algorithm in NORMALISED]
-NOISE = np.random.default_rng(4).normal(size=(16, 2)).astype(np.float32)
+NOISE = jnp.asarray(np.random.default_rng(4).normal(size=(16, 2)), jnp.float32)
 
 
 FAR = transitions(16, shift=3.0, scale=2.0)

@@ -74,7 +74,8 @@ def test_numbers_of_numpy_become_those_of_python():
     assert ours == plain
     assert json.loads(json.dumps(vars(ours))) == json.loads(json.dumps(vars(plain)))  # as the manifest holds it
     assert hash(ours) is not None  # a static argument of compiled programs
-    for value in (np.float32("nan"), np.True_, np.array([0.5])):
+    wrong: list[Any] = [np.float32("nan"), np.True_, np.array([0.5])]
+    for value in wrong:
         with pytest.raises(InputError, match="discount must be a finite number"):
             SAC(discount=value)
 
@@ -110,7 +111,8 @@ def test_a_replay_holds_a_batch_and_a_normalised_batch_has_a_spread(algorithm):
 
 
 def test_minibatches_are_equal_parts_of_more_than_one_transition():
-    for settings in ({"minibatches": 30}, {"rollout_steps": 16}, {"rollout_steps": 8, "minibatches": 8}):
+    cases: list[dict[str, Any]] = [{"minibatches": 30}, {"rollout_steps": 16}, {"rollout_steps": 8, "minibatches": 8}]
+    for settings in cases:
         with pytest.raises(InputError, match="minibatches"):
             PPO(**settings)
 

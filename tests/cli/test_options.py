@@ -202,13 +202,13 @@ def test_a_preset_depends_on_the_task_and_options_win_over_it(train_call):
     assert train_call(f"--preset paper {quad}")["algorithm"].relative_entropy_weight == 0.1
     given = train_call(f"{quad} --preset=paper --relative-entropy-weight 5")
     assert given["algorithm"].relative_entropy_weight == 5.0
-    assert given["algorithm"].reference_policy == "algorithm1"
+    assert given["algorithm"].reference_period == 1
 
 
 def test_a_preset_is_the_algorithms_own(train_call):
     algorithm = train_call("Ant-v4 --algorithm sac --preset paper")["algorithm"]
 
-    assert algorithm == SAC(temperature="fixed", entropy_weight=0.2)
+    assert algorithm == SAC(entropy_weight=0.2)
 
 
 def test_weights_that_adapt_come_back_from_the_manifest(train_call):
@@ -228,17 +228,6 @@ def test_weights_that_adapt_come_back_from_the_manifest(train_call):
     told = replace(NOTHING, hyperparameters=asdict(algorithm))
     RunDirectory.create(Path("adaptive"), told)
     assert algorithm_of(RunDirectory.open("adaptive").manifest) == algorithm
-
-
-def test_a_manifest_from_before_csac_had_options_means_what_it_meant():
-    newer = {"critic_reference", "relative_entropy_form", "target_log_prob_bound"}
-    newer |= {"target_entropy", "target_relative_entropy", "weight_learning_rate"}
-    values = {name: value for name, value in asdict(CSAC(entropy_weight=0.3)).items() if name not in newer}
-    told = replace(NOTHING, hyperparameters=values)
-    explicit = CSAC(
-        entropy_weight=0.3, critic_reference="same", relative_entropy_form="explicit", target_log_prob_bound=0.0
-    )
-    assert algorithm_of(told) == explicit
 
 
 def test_negative_numbers_are_values(train_call):

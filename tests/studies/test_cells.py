@@ -71,7 +71,7 @@ def test_the_name_tells_what_is_not_default():
 
 def test_what_a_manifest_says_is_the_cell_again(tmp_path):
     store = Store(tmp_path)
-    one = cell(perturbations=("friction=2@100",), hyperparameters={"entropy_weight": 0.1, "temperature": "fixed"})
+    one = cell(perturbations=("friction=2@100",), hyperparameters={"entropy_weight": 0.1})
     run = make_run(store, one)
     assert Cell.of_run(run.manifest) == one
 

@@ -476,7 +476,7 @@ def test_the_one_cell_of_a_job_that_another_process_has_is_not_done(engine, monk
 @pytest.mark.parametrize("names", ["SAC, 0.2,SAC, automatic", " SAC, 0.2 , SAC, automatic "])
 def test_a_method_whose_name_has_a_comma_is_found(engine, names):
     assert csac(f"study run reference --tasks 'Hopper-v4, Walker2d-v4' --algorithms '{names}' --seeds 1") == 0
-    assert sorted(job.cell.hyperparameters["temperature"] for job in engine) == ["automatic"] * 2 + ["fixed"] * 2
+    assert sorted(str(job.cell.hyperparameters["entropy_weight"]) for job in engine) == ["0.2"] * 2 + ["auto"] * 2
     assert {job.cell.task for job in engine} == {"Hopper-v4", "Walker2d-v4"}
 
 

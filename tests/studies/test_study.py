@@ -1,12 +1,10 @@
 import re
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from studying import TINY, write
 
-from csac.studies.cells import complete
 from csac.studies.named import NAMED, WHOLE, find
 from csac.studies.study import Method, Study, cells_of, read_study
 from csac.types import InputError
@@ -28,7 +26,7 @@ def test_a_cell_for_each_task_condition_method_and_seed():
     assert {one.seed for one in cells[:12]} == {0}  # seed by seed
     assert {(one.task, one.steps) for one in cells} == {("Hopper-v4", 2_000_000), ("Walker2d-v4", 1_000_000)}
     csac = next(one for one in cells if one.algorithm == "csac")
-    assert csac.hyperparameters["reference_policy"] == "algorithm1"
+    assert csac.hyperparameters["reference_period"] == 1
 
 
 def test_a_shortened_study_says_what_it_shortens():
@@ -230,61 +228,6 @@ def test_mistakes_in_a_file_are_told_in_one_line(tmp_path, change, message):
     assert str(raised.value).startswith(str(path))
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
-
-
-EVIDENCE = Path(__file__).parents[2] / "results" / "reference"
-
-
-def test_the_screen_is_the_named_study_at_100_000_steps_and_one_arm_more():
-    # A tenth of Hopper's are 200,000: what the protocol takes is their first half.
-    (named,) = NAMED["reference"]
-    screen = read_study(EVIDENCE / "screen.toml")
-    named = named.shortened(0.1).narrowed(tasks=screen.tasks, seeds=2)
-    beside = {entry.cell.key: entry.method.label for entry in screen.entries()}
-    for cell in cells_of([named]):
-        del beside[replace(cell, steps=100_000).key]
-    assert set(beside.values()) == {"CSAC, periodic 1000, in the actor only"}
-
-
-def test_the_early_answer_is_made_of_cells_of_the_paper_s_study():
-    (paper,) = NAMED["mujoco"]
-    keys = {one.key for one in cells_of([paper.shortened(0.1)])}
-    assert {one.key for one in cells_of([read_study(EVIDENCE / "tenth.toml")])} < keys
-
-
-PROTOCOLS = [*sorted(EVIDENCE.glob("*.toml")), *sorted((EVIDENCE.parent / "strong").glob("*.toml"))]
-FRESH = {"confirm", "ant", "recovery", "aims", "leaner"}
-LATER = {"longer", "again"}
-
-
-@pytest.mark.parametrize("path", PROTOCOLS, ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_every_study_of_the_protocols_is_understood(path):
-    study, is_reference = read_study(path), path.parent == EVIDENCE
-    first = study.methods[0].hyperparameters_on(study.tasks[0])
-    scale = ("fixed", 0.2) if is_reference else ("automatic", 1.0)
-    assert (study.methods[0].algorithm, first["temperature"], first["entropy_weight"]) == ("sac", *scale)
-    assert (study.evaluation_interval, study.evaluation_episodes) == (5_000, 10)
-    first_seed = 100 * (path.stem in FRESH) + 200 * (path.stem in LATER)
-    count = 5 if first_seed else {"tenth": 5, "screen": 2}.get(path.stem, 3)
-    assert {one.seed for one in cells_of([study])} == set(range(first_seed, first_seed + count))
-
-
-def test_both_protocols_share_the_runs_of_what_they_compare_with():
-    folder = EVIDENCE.parent / "strong"
-    there = {one.key for name in ("confirm", "ant") for one in cells_of([read_study(EVIDENCE / f"{name}.toml")])}
-    for path, labels in (
-        (folder / "confirm.toml", {"SAC, automatic", "CSAC, paper"}),
-        (folder / "aims.toml", {"SAC, automatic"}),
-    ):
-        assert {entry.method.label for entry in read_study(path).entries() if entry.cell.key in there} == labels
-
-
-@pytest.mark.parametrize("path", PROTOCOLS, ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_no_default_decides_what_an_arm_of_the_protocols_is(path):
-    for method in read_study(path).methods:
-        # None, which TOML has not, is minus the number of action dimensions.
-        named = {**method.common, **method.hyperparameters, "target_entropy": None}
-        assert named.keys() == complete(method.algorithm, {}).keys()
 
 
 def test_a_file_that_there_is_not(tmp_path):

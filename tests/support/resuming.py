@@ -32,7 +32,6 @@ ADAPTIVE = CSAC(
     entropy_weight="auto",
     relative_entropy_weight="auto",
     weight_learning_rate=0.01,
-    critic_reference="earlier",
     reference_policy="periodic",
     reference_period=30,
     relative_entropy_estimator="closed_form",
