@@ -76,7 +76,7 @@ def _try(cells: list[Cell]) -> None:
     conditions = dict.fromkeys(cell.perturbations for cell in cells)
     changes = {item.kind: item.value for condition in conditions for item in perturbations_of(condition)}
     with closing(Environment(cells[0].task, cells[0].environment_arguments)) as environment:
-        try_task(environment)
+        try_task(environment, cells[0].environment_arguments)
         for kind, value in changes.items():
             environment.perturb({kind: value})
 

@@ -43,7 +43,7 @@ def run_tune(question: Question, directory: Path, trials: int, groups: int | Non
     import_optuna()
     choose_device(question.device)
     with closing(Environment(question.task, question.environment_arguments)) as environment:  # says what is to be said
-        try_task(environment)
+        try_task(environment, question.environment_arguments)
     study, line = SharedStudy(directory, question), shlex.join(["csac", "tune", *arguments])
     console = make_console()
     stopped = None

@@ -151,7 +151,7 @@ def make_plan(
     continued = before.run.manifest if before.run else None
     with closing(Environment(task, arguments)) as environment:
         spec, task_name = environment.spec, environment.task_name
-        try_task(environment)
+        try_task(environment, arguments)
         for line in wrapper_warnings(environment):
             _log.warning("note: %s", line)
         remember(task)

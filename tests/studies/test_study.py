@@ -186,7 +186,7 @@ def test_what_methods_have_in_common_gives_way_to_presets_and_to_their_own(tmp_p
         (('algorithm = "sac"', 'algorithm = "sac"\npublished = "SAC2"'), "the paper has no 'SAC2'; did you mean SAC?"),
         (('tasks = ["Hopper-v4"]', "tasks = []"), "tasks missing"),
         (('tasks = ["Hopper-v4"]', 'tasks = "Hopper-v4"'), "tasks is a list of texts, not 'Hopper-v4'"),
-        (("seeds = 2", 'conditions = [["fricton=2@10"]]'), "did you mean friction?"),
+        (("seeds = 2", 'conditions = [["fricton=2@10"]]'), "'fricton': there are friction"),
         (("seeds = 2", 'conditions = [["friction=2@300"]]'), "would change nothing: the run ends at step 300"),
         (("seeds = 2", 'analyses = ["curve"]'), "analyses: there is no 'curve'; did you mean curves?"),
         (("seeds = 2", 'steps_on = {"Hopper-v5" = 10}'), "the study has no task 'Hopper-v5'; did you mean Hopper-v4?"),
