@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -28,25 +28,19 @@ Format = Literal["numpy", "onnx", "c"]
 FILES: dict[str, str] = {"numpy": "policy.py", "onnx": "policy.onnx", "c": "policy.h"}
 
 
-class Runner(Protocol):
-    """Runs an artefact of one format."""
-
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action [action] for an observation, float32 [observation]."""
-        ...
-
-    def reset(self) -> None:
-        """Forget the action before."""
-        ...
-
-
 class Artefact:
     """An exported policy. Made by `open_artefact`.
 
     `fields` is what its `contract.json` holds, `runner` what computes its actions.
     """
 
-    def __init__(self, fields: dict[str, Any], contract: Contract, guards: Guards, runner: Runner) -> None:
+    def __init__(
+        self,
+        fields: dict[str, Any],
+        contract: Contract,
+        guards: Guards,
+        runner: numpy.Loader | onnx.Session | c.Library,
+    ) -> None:
         self.fields, self.contract, self.guards, self.runner = fields, contract, guards, runner
 
     def act(self, observation: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from csac.deploy.guards import Guards
     from csac.deploy.policy import Policy
-    from csac.types import Layer
 
 BLOCK = 16  # outputs of a layer that are summed side by side: as many as the registers of a Cortex-M4 hold well
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
@@ -68,25 +67,13 @@ def header(policy: Policy, guards: Guards, control_rate: float | None) -> str:
         control_rate=None if control_rate is None else _number(control_rate),
         block=BLOCK,
         arrays=[_array(name.replace(".", "_"), array) for name, array in tensors.items()],
-        actors=[_network(layers) for layers in parameters.actors],
-        critics=[_network(layers) for layers in parameters.critics],
+        actors=parameters.actors,
+        critics=parameters.critics,
         activation=contract.activation,
         activations=sorted({contract.activation, "relu"} if parameters.critics else {contract.activation}),
         is_clipped=contract.head == "clipped_gaussian",
         has_normaliser=parameters.normaliser is not None,
     )
-
-
-class _Network(NamedTuple):
-    sizes: list[tuple[int, int]]
-    """Inputs and outputs of each layer."""
-    width: int
-    """Of its widest hidden layer, or 0."""
-
-
-def _network(layers: tuple[Layer, ...]) -> _Network:
-    sizes = [layer.weight.shape for layer in layers]
-    return _Network(sizes, max((outputs for _, outputs in sizes[:-1]), default=0))
 
 
 def _array(name: str, array: np.ndarray) -> str:

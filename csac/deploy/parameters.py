@@ -1,4 +1,4 @@
-"""The arrays of a policy: by name in a file, copied, and checked against the contract."""
+"""The arrays of a policy: by name in a file, copied, and without those that a deterministic action does not need."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from csac.types import InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters
+from csac.types import Layer, Normaliser, PolicyParameters
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from csac.deploy.contract import Contract
 
     Networks = tuple[tuple[Layer, ...], ...]
 
@@ -67,36 +65,3 @@ def _networks(tensors: Mapping[str, np.ndarray], kind: str) -> Networks:
             layers.append(Layer(tensors[name + ".weight"], tensors[name + ".bias"]))
         networks.append(tuple(layers))
     return tuple(networks)
-
-
-def check_network(network: PolicyNetwork, contract: Contract) -> None:
-    """Raise InputError if the layers do not fit each other or the contract."""
-    observation_size, action_size = contract.spec
-    actors, critics, normaliser, log_std = network.parameters
-    if (network.activation, network.head) != (contract.activation, contract.head):
-        raise InputError(f"the policy is {network.activation}/{network.head}, not as its contract says")
-    if not actors or len(critics) != (len(actors) if len(actors) > 1 else 0):
-        raise InputError(f"the policy has {len(actors)} actors and {len(critics)} critics to choose between them")
-    outputs = 2 * action_size if network.head == "tanh_gaussian" else action_size
-    for actor in actors:
-        _check_layers("actor", actor, observation_size, outputs)
-    for critic in critics:
-        _check_layers("critic", critic, observation_size + action_size, 1)
-    if (np.shape(log_std) if log_std is not None else None) != (
-        (action_size,) if network.head == "clipped_gaussian" else None
-    ):
-        raise InputError(f"the log_std of a {network.head} policy with {action_size} actions does not fit")
-    if normaliser is not None:
-        shapes = [array.shape for array in normaliser]
-        if shapes != [(observation_size,), (observation_size,), ()] or not (normaliser.std > 0).all():
-            raise InputError(f"the normaliser does not fit {observation_size} inputs, or its std is not positive")
-
-
-def _check_layers(name: str, layers: tuple[Layer, ...], inputs: int, outputs: int) -> None:
-    width = inputs
-    for index, (weight, bias) in enumerate(layers):
-        if weight.ndim != 2 or bias.shape != weight.shape[1:] or weight.shape[0] != width:
-            raise InputError(f"{name} layer {index} has shapes {weight.shape} and {bias.shape} after {width} inputs")
-        width = weight.shape[1]
-    if not layers or width != outputs:
-        raise InputError(f"the {name} gives {width} outputs where the task takes {outputs}")

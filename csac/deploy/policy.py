@@ -10,7 +10,7 @@ import safetensors.numpy
 
 from csac.checks import check_flag, check_path
 from csac.deploy.contract import CONTRACT, Contract, check_checksum, read_json, write_with_checksum
-from csac.deploy.parameters import check_network, copied, from_tensors, to_tensors
+from csac.deploy.parameters import copied, from_tensors, to_tensors
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork
 
 if TYPE_CHECKING:
@@ -47,9 +47,22 @@ class Policy:
     def __init__(self, network: PolicyNetwork, contract: Contract, seed: int = 0, step: int | None = None) -> None:
         self.network = network._replace(parameters=copied(network.parameters))
         self.contract, self.step = contract, step
-        check_network(self.network, contract)
         self._generator = noise_generator(seed)
         self._actors = [_split_actor(actor, contract) for actor in self.network.parameters.actors]
+        self._check()
+
+    def _check(self) -> None:
+        """Raise InputError if the layers do not fit each other or the contract."""
+        (observation_size, action_size), network = self.contract.spec, self.network
+        if (network.activation, network.head) != (self.contract.activation, self.contract.head):
+            raise InputError(f"the policy is {network.activation}/{network.head}, not as its contract says")
+        try:
+            given = np.zeros((1, observation_size), np.float32), False, np.zeros((1, action_size), np.float32)
+            fits = self.act(*given).shape == (1, action_size)
+        except (ValueError, TypeError, IndexError):
+            fits = False
+        if not fits:
+            raise InputError(f"the policy's layers do not take {observation_size} numbers and give {action_size}")
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -105,11 +118,12 @@ class Policy:
         hidden = _hidden(actor.hidden, inputs, self.network.activation)
         action = hidden @ actor.mean.weight
         action += actor.mean.bias
-        if noise is not None and self.network.head == "tanh_gaussian":
-            log_std = hidden @ actor.log_std.weight + actor.log_std.bias
-            action += np.exp(np.clip(log_std, *LOG_STD_RANGE)) * noise
-        if (log_std := self.network.parameters.log_std) is not None:
-            action += 0.0 if noise is None else np.exp(log_std) * noise
+        if noise is not None and self.network.head != "tanh":
+            log_std: Any = self.network.parameters.log_std
+            if self.network.head == "tanh_gaussian":
+                log_std = np.clip(hidden @ actor.log_std.weight + actor.log_std.bias, *LOG_STD_RANGE)
+            action += np.exp(log_std) * noise
+        if self.network.head == "clipped_gaussian":
             return np.clip(action, -1.0, 1.0, out=action)
         return np.tanh(action, out=action)
 

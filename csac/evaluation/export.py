@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 
-from csac.deploy.artefact import Format, open_artefact, write_artefact
+from csac.deploy.artefact import Artefact, Format, open_artefact, write_artefact
 from csac.deploy.card import CARD, CURVE, model_card
 from csac.deploy.choosing import choose_seed, load
 from csac.deploy.contract import CONTRACT, FLOAT32_MAX, read_json, write_json
@@ -86,16 +86,7 @@ def export_run(
     place = Path(run.path / "export" / format if place is None else place)
     with placed(place) as folder:
         write_artefact(folder, policy, format, guards, facts)
-        artefact, watched = open_artefact(folder), _Watched(policy)
-        verification: dict[str, Any] = {}
-        if episodes and task:
-            before = evaluate(watched, task, episodes, environment_arguments=arguments)
-            after = evaluate(artefact, task, episodes, environment_arguments=arguments)
-            if guards.fallback is None:
-                check_returns(before, after)
-            verification = {"returns": summary(after), "returns_of_the_run": summary(before)}
-        compared = compare_actions(artefact, policy, np.array(watched.seen) if episodes else None)
-        verification |= {"observations": compared.observations, "largest_difference": compared.largest}
+        verification = _verify(open_artefact(folder), policy, task if episodes else None, arguments, episodes)
         fields = {**read_json(folder / CONTRACT), "verification": verification}
         write_json(folder / CONTRACT, fields)
         if card:
@@ -103,6 +94,22 @@ def export_run(
                 write_atomically(folder / CURVE, run.curve.read_bytes())
             write_atomically(folder / CARD, model_card(fields, run.curve.exists()).encode())
     return Exported(place, fields, _notes(run, label, episodes))
+
+
+def _verify(
+    artefact: Artefact, policy: Policy, task: Task | None, arguments: dict[str, Any], episodes: int
+) -> dict[str, Any]:
+    """Return what is found beside the policy; without a task in no closed loop."""
+    found, recorded = {}, None
+    if task:
+        watched = _Watched(policy)
+        before = evaluate(watched, task, episodes, environment_arguments=arguments)
+        after = evaluate(artefact, task, episodes, environment_arguments=arguments)
+        if artefact.guards.fallback is None:
+            check_returns(before, after)
+        found, recorded = {"returns": summary(after), "returns_of_the_run": summary(before)}, np.array(watched.seen)
+    compared = compare_actions(artefact, policy, recorded)
+    return {**found, "observations": compared.observations, "largest_difference": compared.largest}
 
 
 class _Watched:
