@@ -56,11 +56,12 @@ def latency(format: str, calls: int) -> dict[str, float]:
     import numpy as np
 
     from csac.cli import main
-    from csac.evaluation.latency import measure
+    from csac.deploy.artefact import open_artefact
+    from csac.deploy.latency import measure
 
     train_briefly()
-    main(["export", "run", "--format", format, "--out", "artefact", "--no-rollouts"])
-    (found,) = measure("artefact", calls, seconds=0)
+    main(["export", "run", "--format", format, "--out", "artefact", "--episodes", "0"])
+    (found,) = measure(open_artefact("artefact", optimise=True), calls, seconds=0)
     percentiles = np.percentile(found.durations, [50, 99, 99.9, 100], method="higher") / 1e3
     return dict(zip(("p50", "p99", "p99.9", "max"), percentiles.tolist(), strict=True))
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from csac.types import Algorithm
 
-# The paper's "Common hyper-parameter settings of compared approaches": its columns CSAC and SAC are equal.
+# The paper's "Common hyper-parameter settings of compared approaches": its columns CSAC, SAC and TD3 are equal.
 _PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
     {
         "actor_learning_rate": 3e-4,
@@ -42,14 +42,12 @@ _PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             **_PAPER_COMMON,
             "entropy_weight": 0.2,
             "relative_entropy_weight": 0.5,
-            "reference_policy": "algorithm1",
+            "reference_policy": "periodic",
+            "reference_period": 1,
             "relative_entropy_estimator": "sampled",
-            # Not used with `algorithm1`; named because runs are known by every hyperparameter.
-            "reference_period": 1000,
-            "reference_rate": 0.005,
         },
         # PARL's SAC, on which the paper built: a fixed temperature.
-        "sac": {**_PAPER_COMMON, "temperature": "fixed", "entropy_weight": 0.2},
+        "sac": {**_PAPER_COMMON, "entropy_weight": 0.2},
         "td3": {**_PAPER_COMMON, **_NOISE, "policy_delay": 2},
         # The paper's column SD3, and the settings of SD3's authors for what it leaves out.
         "sd3": {
@@ -85,20 +83,14 @@ _PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     }
 )
 
-# The inverse temperatures of SD3's authors, task by task.
-_SD3_TASKS: Mapping[str, float] = MappingProxyType(
-    {"Ant": 0.001, "HalfCheetah": 0.005, "Hopper": 0.05, "Walker2d": 0.1}
-)
-
-# The paper's "Specific hyperparameters of CSAC"; its PandaReach row equals the MuJoCo tasks' values.
+# The paper's "Specific hyperparameters of CSAC", whose PandaReach row equals the MuJoCo tasks' values, and the inverse
+# temperatures of SD3's authors.
+_SD3_TASKS = (("Ant", 0.001), ("HalfCheetah", 0.005), ("Hopper", 0.05), ("Walker2d", 0.1))
 _PAPER_TASKS: Mapping[tuple[str, str], Mapping[str, Any]] = MappingProxyType(
     {
         ("csac", "PyFlyt/QuadX-Waypoints-v1"): {"relative_entropy_weight": 0.1},
-        **{
-            ("sd3", f"{task}-{version}"): {"inverse_temperature": beta}
-            for task, beta in _SD3_TASKS.items()
-            for version in ("v4", "v5")
-        },
+        **{("sd3", f"{task}-v4"): {"inverse_temperature": beta} for task, beta in _SD3_TASKS},
+        **{("sd3", f"{task}-v5"): {"inverse_temperature": beta} for task, beta in _SD3_TASKS},
     }
 )
 
@@ -113,7 +105,9 @@ _FASTER_CRITICS: Mapping[str, Any] = MappingProxyType(
         "actor_learning_rate": 1e-3,
         "policy_delay": 3,
         "adam_momentum": 0.5,
+        "entropy_weight": "auto",
         "target_entropy": None,
+        "weight_learning_rate": 3e-4,
     }
 )
 
@@ -121,23 +115,14 @@ _STRONG: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "csac": {
             **_FASTER_CRITICS,
-            "entropy_weight": "auto",
             "relative_entropy_weight": 0.5,
             "relative_entropy_form": "actor_only",
             "reference_policy": "periodic",
             "reference_period": 1000,
-            "reference_rate": 0.005,  # not used with `periodic`; named as in the preset `paper`
             "relative_entropy_estimator": "closed_form",
-            "critic_reference": "same",
             "target_log_prob_bound": 0.0,
-            "weight_learning_rate": 3e-4,
         },
-        "sac": {
-            **_FASTER_CRITICS,
-            "temperature": "automatic",
-            "entropy_weight": 1.0,
-            "temperature_learning_rate": 3e-4,
-        },
+        "sac": {**_FASTER_CRITICS, "initial_entropy_weight": 1.0},
     }
 )
 

@@ -31,6 +31,7 @@ SECONDS_TO_CLOSE = 2.0
 UNGUARDED = 97
 
 _PR_SET_PDEATHSIG = 1
+_SAFE_PATH = "PYTHONSAFEPATH"  # else Python would search the working directory first in a child, whatever lies there
 
 # Of those that the system has: Windows has no hang-up.
 _HELD_BACK = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
@@ -153,9 +154,10 @@ class Child:
     def __init__(self, work: Callable[..., None], *arguments: Any, daemon: bool) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=work, args=(theirs, *arguments), daemon=daemon)
+        before = os.environ.get(_SAFE_PATH)
+        self.process = context.Process(target=_work, args=(before, work, theirs, *arguments), daemon=daemon)
         try:
-            with worker_surroundings():
+            with _environment({_SAFE_PATH: "1"}), worker_surroundings():
                 self.process.start()
         except BaseException:  # a Ctrl-C that waited until the process was there
             if self.process.pid:
@@ -194,6 +196,14 @@ class Child:
             self._at_exit.cancel()
 
 
+def _work(safe_path: str | None, work: Callable[..., None], *arguments: Any) -> None:
+    """Do the work of a child, whose own children search for modules as ever."""
+    os.environ.pop(_SAFE_PATH, None)
+    if safe_path is not None:
+        os.environ[_SAFE_PATH] = safe_path
+    work(*arguments)
+
+
 def _kill(process: SpawnProcess) -> None:
     if process.is_alive():
         process.kill()
@@ -223,16 +233,25 @@ def worker_surroundings() -> Iterator[None]:
     A Ctrl-C reaches every process of the terminal; the parent alone decides what it means.
     """
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
     resource_tracker.ensure_running()  # starts at the first spawn otherwise, and would let the signals through again
-    os.environ.update(dict.fromkeys(names, "1"))
     has_masks = hasattr(signal, "pthread_sigmask")  # not on Windows, where a Ctrl-C reaches the workers too
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK) if has_masks else set()
+    with _environment(dict.fromkeys(names, "1")):
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK) if has_masks else set()
+        try:
+            yield
+        finally:
+            if has_masks:
+                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+@contextmanager
+def _environment(variables: dict[str, str]) -> Iterator[None]:
+    """Set environment variables in this block."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:
-        if has_masks:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 

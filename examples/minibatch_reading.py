@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac.algorithms.adaptation import current_weights
+from csac.algorithms.adaptation import Weights
 from csac.algorithms.csac import CSAC
 from csac.algorithms.networks import MLP
 from csac.types import Layer
@@ -35,7 +35,7 @@ def flat_critics() -> tuple[MLP, MLP]:
 def gradients(algorithm: CSAC, std: float) -> np.ndarray:
     """Return dJ/dmean at every quadrature node of the action noise [64], with the actor as its own reference."""
     actor = constant_policy(0.3, std)
-    weights = current_weights((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
+    weights = Weights(algorithm.entropy_weight, algorithm.relative_entropy_weight)
 
     def gradient(noise: jax.Array) -> jax.Array:
         def loss(learnt: MLP) -> jax.Array:
@@ -56,8 +56,8 @@ def moments(values: np.ndarray) -> tuple[float, float]:
 def main() -> None:
     """Print the table."""
     sac = CSAC(relative_entropy_weight=0.0)
-    exact = CSAC(relative_entropy_estimator="closed_form", reference_policy="algorithm1")
-    sampled = CSAC(relative_entropy_estimator="sampled", reference_policy="algorithm1")
+    exact = CSAC(relative_entropy_estimator="closed_form", reference_policy="periodic", reference_period=1)
+    sampled = CSAC(relative_entropy_estimator="sampled", reference_policy="periodic", reference_period=1)
     print("Gradient of the actor loss with respect to the mean; sigma = 0.2, tau = 0.5, flat critics")
     print("       |    SAC (tau = 0)     |     closed_form      |       sampled        | sampled - closed_form,")
     print("std    |      mean        std |      mean        std |      mean        std | mean of 256: std (tau/16std)")

@@ -10,7 +10,7 @@ second with Adam.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,6 @@ import optax
 from csac.algorithms.adaptation import Weights
 from csac.algorithms.csac import CSAC
 from csac.algorithms.networks import MLP
-from csac.algorithms.references import ReferencePolicy, reference_after, references_before
 from csac.types import Layer
 
 STATES, ACTIONS = 10, 5
@@ -31,14 +30,14 @@ NOISE = 0.05  # standard deviation of the noise in the gradient that Adam is giv
 class Choice(NamedTuple):
     """A reference policy and the number that belongs to it."""
 
-    policy: ReferencePolicy
+    policy: Literal["periodic", "average"]
     period: int = 1000
     rate: float = 0.005
 
 
 CHOICES = (
-    Choice("algorithm1"),
-    Choice("previous"),
+    Choice("periodic", period=1),
+    Choice("average", rate=1.0),
     Choice("average", rate=0.05),
     Choice("average", rate=0.005),
     Choice("periodic", period=100),
@@ -71,15 +70,17 @@ def contraction(sigma: float, tau: float, discount: float) -> float:
 
 
 def longest_lag(choice: Choice) -> float:
-    """Return how many updates ago the policy was where its reference is; of a period, at its end."""
-    return {"algorithm1": 0.0, "previous": 1.0, "average": 1.0 / choice.rate, "periodic": choice.period}[choice.policy]
+    """Return how many updates ago the policy was where its reference is; of a period, when that is over."""
+    if choice.policy == "average":
+        return 1.0 / choice.rate
+    return choice.period if choice.period > 1 else 0.0
 
 
 def predicted_slow_down(choice: Choice, resistance: float) -> float:
     """Return how many times longer the same way takes; resistance = learning rate x τ / std².
 
-    With the effective lag L of the reference, in updates, it is 1 + L x resistance: L is 0, 1, 1 / rate or, for periods
-    of N, (N - 1) / 2 where the resistance of a period is small, and N where it is large.
+    With the effective lag L of the reference, in updates, it is 1 + L x resistance: L is 1 / rate or, for periods of
+    N, (N - 1) / 2 where the resistance of a period is small, and N where it is large.
     """
     if choice.policy == "periodic":
         return choice.period * resistance / (1.0 - (1.0 - resistance) ** choice.period)
@@ -125,14 +126,12 @@ def predicted_half_life(choice: Choice, weights: Weights, std: float, learning_r
     `periodic` and takes 1 - α of the way with `average`.
     """
     pull, resistance = (float(learning_rate * weight / std**2) for weight in weights)
-    if choice.policy == "algorithm1":
-        return float(np.log(0.5) / np.log(1.0 - pull))
     if choice.policy == "periodic":
         alpha = resistance / (pull + resistance)
         left = alpha + (1.0 - alpha) * (1.0 - pull - resistance) ** choice.period
         return float(choice.period * np.log(0.5) / np.log(left))
-    rate = 1.0 if choice.policy == "previous" else choice.rate
-    together = np.array([[1.0 - pull - resistance, resistance], [rate, 1.0 - rate]])  # of the mean, and of the kept one
+    kept = [choice.rate, 1.0 - choice.rate]
+    together = np.array([[1.0 - pull - resistance, resistance], kept])  # of the mean, and of the kept one
     return float(np.log(0.5) / np.log(np.abs(np.linalg.eigvals(together)).max()))
 
 
@@ -149,7 +148,9 @@ def measured_half_life(choice: Choice, weights: Weights, std: float, learning_ra
 
 def largest_stable_resistance(choice: Choice) -> float:
     """Return the learning rate x τ / std² from which on plain descent goes to and fro in growing steps."""
-    return {"algorithm1": np.inf, "previous": 1.0, "average": 2.0 - choice.rate, "periodic": 2.0}[choice.policy]
+    if choice.policy == "average":
+        return 2.0 - choice.rate
+    return 2.0 if choice.period > 1 else np.inf
 
 
 def means(
@@ -165,22 +166,25 @@ def means(
 
     `noise` is the standard deviation of what is added to the gradient.
     """
-    algorithm = CSAC(relative_entropy_weight=float(weights.relative_entropy), relative_entropy_estimator="closed_form")
+    algorithm = CSAC(
+        reference_policy=choice.policy,
+        reference_period=choice.period,
+        reference_rate=choice.rate,
+        relative_entropy_estimator="closed_form",
+    )
 
-    def loss(actor: MLP, reference: MLP | None) -> jax.Array:
+    def loss(actor: MLP, reference: MLP) -> jax.Array:
         networks = {"reference": reference, "critics": (critic, critic)}
         return algorithm.actor_loss(actor, jnp.zeros(1), jnp.zeros(1), weights=weights, **networks)[0]
 
     def update(carry: tuple[MLP, MLP, optax.OptState], step: jax.Array) -> tuple[tuple, jax.Array]:
         actor, kept, optimiser_state = carry
-        used = references_before(choice.policy, kept, None, actor, step % choice.period == 0).actor
+        used = algorithm.reference_before(kept, actor, step)
         slope = jax.grad(loss)(actor, used).layers[0].bias[0]
         slope += noise * jax.random.normal(jax.random.fold_in(jax.random.key(0), step))
         change, optimiser_state = optimiser.update(slope, optimiser_state)
         moved = _gaussian(actor.layers[0].bias[0] + change, std)
-        kept = reference_after(choice.policy, used, actor, choice.rate)
-        assert kept is not None
-        return (moved, kept, optimiser_state), moved.layers[0].bias[0]
+        return (moved, algorithm.reference_after(used, actor), optimiser_state), moved.layers[0].bias[0]
 
     first = _gaussian(jnp.zeros(()), std)
     return jax.lax.scan(update, (first, first, optimiser.init(jnp.zeros(()))), jnp.arange(updates))[1]
@@ -247,8 +251,7 @@ def main() -> None:
 
 
 def _name(choice: Choice) -> str:
-    number = {"periodic": f" {choice.period}", "average": f" {choice.rate}"}.get(choice.policy, "")
-    return choice.policy + number
+    return f"{choice.policy} {choice.period if choice.policy == 'periodic' else choice.rate:g}"
 
 
 def _print_by_reference(values: Callable[[Choice, float], tuple[float, float]], decimals: int) -> None:

@@ -1,9 +1,9 @@
 """Fill in the tables of the pages in results/ and of docs/relative-entropy.md, and draw their pictures: `make results`.
 
 A page says in a comment what stands below it: `<!-- table`, lines of TOML, `-->`, and at the end `<!-- end -->`. Their
-`kind` is a function in KINDS, the others are its arguments. Each folder has `runs.csv`, a row for each run, and
-`evaluations.csv`, a row for each evaluation, which is the mean over its episodes. Runs that differ in their seed alone
-are an arm.
+`kind` is a function in KINDS, the others are its arguments. Each folder has `runs.csv`, a row for each run,
+`evaluations.csv`, a row for each evaluation, which is the mean over its episodes, and `configs.json`, the settings that
+the column `config` names. Runs that differ in their seed alone are an arm.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What is learnt. To add an algorithm, write its file and announce it here."""
 
 from csac.algorithms.csac import CSAC
-from csac.algorithms.names import names_checked
+from csac.algorithms.hyperparameters import names_checked
 from csac.algorithms.ppo import PPO
 from csac.algorithms.sac import SAC
 from csac.algorithms.sd3 import SD3

@@ -1,16 +1,16 @@
-"""Two critics Q(s, a) that learn side by side: how they are made, what they say and what they descend."""
+"""Two critics Q(s, a) that learn side by side: how they are made, what they say and what they gradient_step."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms.networks import MLP, copy_tree, descend, make_mlp
+from csac.algorithms.networks import MLP, gradient_step, make_mlp
 from csac.algorithms.normalisation import Moments, fold, normalised_pass
-from csac.algorithms.shapes import Action, Key, Observation, Scalar
+from csac.algorithms.shapes import Action, Actions, Key, Observation, Scalar
 from csac.types import Metrics, Spec, Transition
 
 if TYPE_CHECKING:
@@ -19,16 +19,6 @@ if TYPE_CHECKING:
     import optax
 
 Critics: TypeAlias = tuple[MLP, MLP]
-Normalisation: TypeAlias = Literal["none", "batch"]
-
-
-class UpdatedCritics(NamedTuple):
-    """The critics after a step of theirs."""
-
-    critics: Critics
-    optimiser: Any
-    folded: Critics  # as the actor's loss sees them, their normalisation folded in
-    metrics: Metrics
 
 
 def make_critic(key: Key, spec: Spec, hidden_sizes: Sequence[int]) -> MLP:
@@ -42,11 +32,6 @@ def make_critics(key: Key, spec: Spec, hidden_sizes: Sequence[int]) -> Critics:
     return make_critic(first_key, spec, hidden_sizes), make_critic(second_key, spec, hidden_sizes)
 
 
-def make_targets(critics: Critics, normalisation: Normalisation) -> Critics | None:
-    """Return the target critics, copies to begin with; critics that are normalised do without (CrossQ)."""
-    return copy_tree(critics) if normalisation == "none" else None
-
-
 def q_value(critic: MLP, observation: Observation, action: Action) -> Scalar:
     """Return one critic's value of one pair."""
     return critic(jnp.concatenate([observation, action]))[0]
@@ -58,7 +43,7 @@ def q_values(critics: Critics, observation: Observation, action: Action) -> tupl
     return q_value(first, observation, action), q_value(second, observation, action)
 
 
-def least_q_value(critics: Critics, observation: Observation, action: Action) -> Scalar:
+def min_q(critics: Critics, observation: Observation, action: Action) -> Scalar:
     """Return min(Q₁(s, a), Q₂(s, a)), which promises less than either of them where they err."""
     return jnp.minimum(*q_values(critics, observation, action))
 
@@ -77,34 +62,35 @@ def squared_errors(values: tuple[Scalar, Scalar], target: Scalar) -> tuple[Scala
 
 def update_critics(
     optimiser: optax.GradientTransformation,
-    critics: Critics,
-    targets: Critics | None,
-    optimiser_state: Any,
+    state: Any,
     batch: Transition,
-    noise: Action,
-    *,
+    noise: Actions,
     critic_target: Callable[..., Scalar],
     next_action: Callable[[Observation, Action], Action],
-) -> UpdatedCritics:
-    """Return the critics after one gradient step towards their targets on a batch.
+) -> tuple[Any, Critics, Metrics]:
+    """Return the state after one gradient step of its critics, these critics as plain MLPs, and what to log.
 
     Args:
-        optimiser: what makes a step of a gradient.
-        critics: those that learn.
-        targets: the target critics, or None where the critics are normalised and are their own targets.
-        optimiser_state: that of the optimiser for the critics.
+        optimiser: makes a step of a gradient.
+        state: has `critics`, `critic_optimiser` and `target_critics`; None where the critics are normalised over the
+            batch, and are their own targets.
         batch: transitions with a leading axis.
-        noise: for the next actions, [batch, action].
-        critic_target: `critic_target(transition, noise, target_critics=...)`, of one example.
-        next_action: `next_action(next_observation, noise)`, at which the target asks the critics.
+        noise: of the next actions.
+        critic_target: `critic_target(transition, noise, targets=...)`, for one example.
+        next_action: `next_action(next_observation, noise)`, at which the target evaluates the critics.
     """
+    critics, optimiser_state, targets = state.critics, state.critic_optimiser, state.target_critics
     if targets is not None:
-        goals = jax.vmap(partial(critic_target, target_critics=targets))(batch, noise)
-        critics, optimiser_state, metrics = descend(optimiser, critic_loss, critics, optimiser_state, batch, goals)
-        return UpdatedCritics(critics, optimiser_state, critics, metrics)
-    loss = partial(normalised_critic_loss, critic_target=critic_target, next_action=next_action)
-    critics, optimiser_state, metrics = descend(optimiser, loss, critics, optimiser_state, batch, noise)
-    return UpdatedCritics(critics, optimiser_state, fold_critics(critics, metrics.pop("moments")), metrics)
+        goals = jax.vmap(partial(critic_target, targets=targets))(batch, noise)
+        critics, optimiser_state, metrics = gradient_step(
+            optimiser, critic_loss, critics, optimiser_state, batch, goals
+        )
+        folded = critics
+    else:
+        loss = partial(normalised_critic_loss, critic_target=critic_target, next_action=next_action)
+        critics, optimiser_state, metrics = gradient_step(optimiser, loss, critics, optimiser_state, batch, noise)
+        folded = fold_critics(critics, metrics.pop("moments"))
+    return state._replace(critics=critics, critic_optimiser=optimiser_state), folded, metrics
 
 
 def normalised_critic_loss(
@@ -126,7 +112,7 @@ def normalised_critic_loss(
     )
     first, second = (normalised_pass(critic, pairs) for critic in critics)
     # What the target asks these critics was computed in that pass: XLA finds the same products, and makes them once.
-    target = critic_target(transition, noise, target_critics=jax.lax.stop_gradient((first.folded, second.folded)))
+    target = critic_target(transition, noise, targets=jax.lax.stop_gradient((first.folded, second.folded)))
     values = first.outputs[0][0], second.outputs[0][0]
     loss, metrics = squared_errors(values, jax.lax.stop_gradient(target))
     return loss, {**metrics, "moments": (first.moments, second.moments)}

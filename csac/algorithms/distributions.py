@@ -19,7 +19,6 @@ GAUSSIAN_ENTROPY = 1.4189385332046727  # of N(0, 1), log(2πe) / 2
 
 # The clipping bounds of PARL, which the paper builds on; SB3 and the authors of SAC use the same.
 MINIMUM_LOG_STD, MAXIMUM_LOG_STD = -20.0, 2.0
-MOST_ACTION = 1.0 - 1e-6
 
 
 class Gaussian(NamedTuple):
@@ -45,8 +44,8 @@ class Gaussian(NamedTuple):
 class TanhGaussian(NamedTuple):
     """The distribution of tanh(u), u ~ N(mean, exp(log_std)²) (the paper's Eq. actor).
 
-    An action is named by the noise ξ ~ N(0, I) that it comes of, u = mean + std ξ. Only `log_prob_of` seeks ξ in the
-    action: atanh of a saturated action is infinite, and of u - mean rounding leaves little where std is small.
+    An action is named by the noise ξ ~ N(0, I) that it comes of, u = mean + std ξ: atanh of a saturated action is
+    infinite, and of u - mean rounding leaves little where std is small.
     """
 
     mean: Action
@@ -70,11 +69,6 @@ class TanhGaussian(NamedTuple):
         """Return the log-density of the action tanh(mean + std ξ)."""
         log_gaussian = -0.5 * noise**2 - self.log_std - HALF_LOG_TWO_PI
         return jnp.sum(log_gaussian - log_tanh_derivative(self.pre_tanh(noise)))
-
-    def log_prob_of(self, action: Action) -> Scalar:
-        """Return the log-density of an action that another policy took; a saturated one is moved inside by 1e-6."""
-        pre_tanh = jnp.arctanh(jnp.clip(action, -MOST_ACTION, MOST_ACTION))
-        return self.log_prob((pre_tanh - self.mean) * jnp.exp(-self.log_std))
 
     def mode(self) -> Action:
         """Return tanh(mean), the deterministic action."""
@@ -101,10 +95,7 @@ def kl(policy: TanhGaussian, reference: TanhGaussian) -> Scalar:
 
 
 def bounded(value: Scalar, bound: float) -> Scalar:
-    """Return a log-density, KL or log-ratio, clipped to ± bound nats where that is more than 0.
-
-    All three are sums over the action dimensions: the more of these there are, the tighter is the same bound on each.
-    """
+    """Return a log-density, KL or log-ratio of a whole action, clipped to ± bound nats where that is more than 0."""
     return jnp.clip(value, -bound, bound) if bound > 0 else value
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from csac.algorithms.shapes import Count, Key
-from csac.types import Cadence, Transition
+from csac.types import Transition
 
 if TYPE_CHECKING:
     from csac.types import Spec
@@ -62,11 +62,6 @@ class Rollout(NamedTuple):
     def draw(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
         """Return all of it: transitions with a leading axis of time."""
         return jax.vmap(unpack, in_axes=(0, None))(self.rows, spec)
-
-
-def replay_cadence(warmup_steps: int, update_interval: int, updates_per_step: int, transitions: int) -> Cadence:
-    """Return when an algorithm learns that draws `transitions` from a replay for each of its updates."""
-    return Cadence(warmup_steps, update_interval, updates_per_step * update_interval, transitions)
 
 
 def row_width(spec: Spec) -> int:

@@ -95,13 +95,13 @@ def init_optimiser(optimiser: optax.GradientTransformation, parameters: Any) -> 
     return optimiser.init(parameters)
 
 
-def descend(
+def gradient_step(
     optimiser: optax.GradientTransformation, loss: Callable, parameters: Any, optimiser_state: Any, *examples: Any
 ) -> tuple[Any, Any, Metrics]:
     """Return (parameters, optimiser state, mean metrics) after one step down the mean of a loss over examples.
 
     Args:
-        optimiser: what makes a step of a gradient.
+        optimiser: makes a step of a gradient.
         loss: `loss(parameters, *example) -> (scalar, metrics)`, of one example. Examples lie along the axis `BATCH`.
         parameters: a tree of arrays.
         optimiser_state: that of the optimiser for these parameters.

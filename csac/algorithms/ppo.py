@@ -22,14 +22,15 @@ from csac.algorithms.hyperparameters import (
     check_hyperparameters,
 )
 from csac.algorithms.memory import Rollout
-from csac.algorithms.networks import MLP, descend, init_optimiser, make_optimiser, make_orthogonal_mlp
+from csac.algorithms.networks import MLP, gradient_step, init_optimiser, make_optimiser, make_orthogonal_mlp
+from csac.algorithms.returns import advantages_of, discounted_returns, explained_variance
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar, Scalars
 from csac.algorithms.statistics import EPSILON, Statistics, normalise
 from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
 
 
 class Parameters(NamedTuple):
-    """What descends, all by one optimiser."""
+    """What gradient_steps, all by one optimiser."""
 
     actor: MLP  # [observation] -> mean [action]
     critic: MLP  # [observation] -> [1]
@@ -104,41 +105,9 @@ class PPO:
     def __post_init__(self) -> None:
         check_hyperparameters(self)
         if self.rollout_steps % self.minibatches:
-            raise InputError(
-                f"minibatches must divide rollout_steps into equal parts: {self.rollout_steps} steps make no "
-                f"{self.minibatches} minibatches"
-            )
+            raise InputError(f"minibatches must divide rollout_steps, {self.rollout_steps}, not {self.minibatches}")
         if self.normalise_advantages and self.minibatches == self.rollout_steps:
-            raise InputError(
-                "minibatches of one transition have no spread to normalise advantages by: give fewer minibatches than "
-                "rollout_steps, or normalise_advantages=False"
-            )
-
-    def discounted_returns(self, start: Scalar, batch: Transition) -> tuple[Scalars, Scalar]:
-        """Return R_t = r_t + γ R_{t-1}, from 0 in each episode, and what the next rollout goes on from."""
-
-        def advance(running: Scalar, transition: Transition) -> tuple[Scalar, Scalar]:
-            running = self.discount * running + transition.reward
-            return running * _goes_on(transition), running
-
-        last, returns = jax.lax.scan(advance, start, batch)
-        return returns, last
-
-    def advantages(self, batch: Transition, values: Scalars, next_values: Scalars) -> Scalars:
-        """Return the generalised advantages of a rollout (GAE, Eq. 16; PPO, Eq. 11).
-
-        A_t = δ_t + γ λ A_{t+1} with δ_t = r_t + γ (1 - terminated_t) V(s_{t+1}) - V(s_t), where s_{t+1} is what step t
-        led to. Nothing is carried back over the end of an episode, of whichever kind, nor from beyond the rollout.
-        """
-        errors = batch.reward + self.discount * (1.0 - batch.terminated) * next_values - values
-        decays = self.discount * self.trace_decay * _goes_on(batch)
-
-        def step_back(advantage: Scalar, step: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
-            error, decay = step
-            advantage = error + decay * advantage
-            return advantage, advantage
-
-        return jax.lax.scan(step_back, jnp.zeros(()), (errors, decays), reverse=True)[1]
+            raise InputError("normalise_advantages needs fewer minibatches than rollout_steps")
 
     def policy_loss(self, log_ratio: Scalar, advantage: Scalar) -> Scalar:
         """Return -min(ρ A, clip(ρ, 1 - ε, 1 + ε) A) with ρ = π(a|s) / π_old(a|s) (PPO, Eq. 7)."""
@@ -171,10 +140,10 @@ class PPO:
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Absorb the rollout into the statistics, then take `epochs` times `minibatches` gradient steps on it."""
-        discounted_returns, discounted_return = self.discounted_returns(state.discounted_return, batch)
+        returns, discounted_return = discounted_returns(state.discounted_return, batch, self.discount)
         absorbed = state._replace(
             observations=state.observations.absorb(batch.observation),
-            returns=state.returns.absorb(discounted_returns),
+            returns=state.returns.absorb(returns),
             discounted_return=discounted_return,
         )
         samples = self.samples(state, absorbed, batch)
@@ -183,7 +152,7 @@ class PPO:
 
         def learn(learnt: tuple[Parameters, Any], minibatch: Sample) -> tuple[tuple[Parameters, Any], Metrics]:
             minibatch = minibatch._replace(advantage=self.normal_advantages(minibatch.advantage))
-            parameters, optimiser_state, metrics = descend(optimiser, self.loss, *learnt, minibatch)
+            parameters, optimiser_state, metrics = gradient_step(optimiser, self.loss, *learnt, minibatch)
             return (parameters, optimiser_state), metrics
 
         def pass_over(learnt: tuple[Parameters, Any], key: Key) -> tuple[tuple[Parameters, Any], Metrics]:
@@ -208,7 +177,7 @@ class PPO:
         value = jax.vmap(partial(value_at, state.parameters))
         values, next_values = value(observations), value(next_observations)
         scaled = batch._replace(reward=self.scale(absorbed.returns, batch.reward))
-        advantages = self.advantages(scaled, values, next_values)
+        advantages = advantages_of(scaled, values, next_values, self.discount, self.trace_decay)
         log_probs = jax.vmap(log_prob)(batch.observation, batch.action)
         return Sample(observations, batch.action, log_probs, values, advantages, values + advantages)
 
@@ -303,15 +272,3 @@ def policy_at(parameters: Parameters, observation: Observation) -> Gaussian:
 def value_at(parameters: Parameters, observation: Observation) -> Scalar:
     """Return the critic's value of one normalised observation."""
     return parameters.critic(observation)[0]
-
-
-def explained_variance(values: Scalars, targets: Scalars) -> Scalar:
-    """Return 1 - Var[target - value] / Var[target]; 0 where the targets do not vary."""
-    variance = jnp.var(targets)
-    explained = 1.0 - jnp.var(targets - values) / jnp.where(variance > 0, variance, 1.0)
-    return jnp.where(variance > 0, explained, 0.0)
-
-
-def _goes_on(transition: Transition) -> Float[Array, "..."]:
-    """Return 0 where the episode ended, of whichever kind, else 1."""
-    return (1.0 - transition.terminated) * (1.0 - transition.truncated)

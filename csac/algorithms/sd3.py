@@ -8,15 +8,14 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float
 
-from csac.algorithms.critics import Critics, least_q_value, make_critic, q_value
-from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, check_hyperparameters
-from csac.algorithms.memory import Replay, replay_cadence
-from csac.algorithms.networks import MLP, copy_tree, descend, init_optimiser, make_mlp, make_optimiser, polyak
+from csac.algorithms.critics import Critics, make_critic, min_q, q_value
+from csac.algorithms.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE
+from csac.algorithms.networks import MLP, copy_tree, gradient_step, init_optimiser, make_mlp, polyak
+from csac.algorithms.off_policy import OffPolicy
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
-from csac.types import Cadence, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
+from csac.types import Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 # Targets computed at once. The activations of a whole batch's samples leave the processor's caches: in groups of this
 # many examples an update takes 40 % less time on a CPU.
@@ -42,7 +41,7 @@ class State(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SD3:
+class SD3(OffPolicy):
     """Softmax Deep Double Deterministic policy gradients (its Algorithm 1)."""
 
     inverse_temperature: Annotated[float, NOT_NEGATIVE] = 0.05
@@ -57,35 +56,13 @@ class SD3:
     """Standard deviation of the noise on the target actors' actions (the paper's sigma)."""
     target_noise_clip: Annotated[float, NOT_NEGATIVE] = 0.5
     """Bound on that noise (the paper's c)."""
-    discount: Annotated[float, DISCOUNT] = 0.99
-    """Discount factor (gamma)."""
-    target_rate: Annotated[float, RATE] = 0.005
-    """Soft update rate of the targets (the paper's tau)."""
     actor_learning_rate: Annotated[float, POSITIVE] = 1e-3
     """Learning rate of the actors."""
     critic_learning_rate: Annotated[float, POSITIVE] = 1e-3
     """Learning rate of the critics."""
-    actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
-    """Widths of each actor's hidden layers."""
-    critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
-    """Widths of each critic's hidden layers."""
-    batch_size: Annotated[int, COUNT] = 256
-    """Transitions for each of the two pairs in one update."""
-    replay_size: Annotated[int, COUNT] = 1_000_000
-    """Transitions that the replay keeps."""
-    warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
-    """Environment steps with uniform random actions before learning starts."""
-    updates_per_step: Annotated[int, COUNT] = 1
-    """Updates per environment step."""
-    update_interval: Annotated[int, COUNT] = 1
-    """Environment steps between rounds of updates; 1 is strict order, larger is faster."""
-    max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on the global norm of each network's gradient; 0 is no bound."""
 
     name: ClassVar[str] = "sd3"
-
-    def __post_init__(self) -> None:
-        check_hyperparameters(self)
+    batches_per_update: ClassVar[int] = 2
 
     def critic_target(
         self,
@@ -93,7 +70,7 @@ class SD3:
         noise: Float[Array, "sample action"],
         *,
         target_actor: MLP,
-        target_critics: Critics,
+        targets: Critics,
     ) -> Scalar:
         """Return y = r + γ softmax of min Q'(s', ãₖ) at ãₖ = clip(π'(s') + clip(σ ξₖ, -c, c), -1, 1) (Algorithm 1).
 
@@ -104,7 +81,7 @@ class SD3:
 
         def value(noise: Action) -> Scalar:
             noise = jnp.clip(self.target_noise * noise, -self.target_noise_clip, self.target_noise_clip)
-            return least_q_value(target_critics, observation, jnp.clip(mean + noise, -1.0, 1.0))
+            return min_q(targets, observation, jnp.clip(mean + noise, -1.0, 1.0))
 
         log_weights = -log_density(noise) if self.importance_sampling else jnp.zeros(len(noise))
         softmax_value = softmax_operator(jax.vmap(value)(noise), self.inverse_temperature, log_weights)
@@ -125,15 +102,15 @@ class SD3:
         critic_target = partial(
             self.critic_target,
             target_actor=pair.target_actor,
-            target_critics=(pair.target_critic, other_target_critic),
+            targets=(pair.target_critic, other_target_critic),
         )
         targets = jax.lax.map(lambda example: critic_target(*example), (batch, noise), batch_size=EXAMPLES_AT_ONCE)
-        optimiser = self._optimiser(self.critic_learning_rate)
-        critic, critic_optimiser, critic_metrics = descend(
+        optimiser = self.optimiser(self.critic_learning_rate)
+        critic, critic_optimiser, critic_metrics = gradient_step(
             optimiser, critic_loss, pair.critic, pair.critic_optimiser, batch, targets
         )
-        optimiser = self._optimiser(self.actor_learning_rate)
-        actor, actor_optimiser, actor_metrics = descend(
+        optimiser = self.optimiser(self.actor_learning_rate)
+        actor, actor_optimiser, actor_metrics = gradient_step(
             optimiser, partial(actor_loss, critic=critic), pair.actor, pair.actor_optimiser, batch.observation
         )
         new_pair = Pair(
@@ -145,15 +122,6 @@ class SD3:
             critic_optimiser=critic_optimiser,
         )
         return new_pair, {**critic_metrics, **actor_metrics}
-
-    @property
-    def cadence(self) -> Cadence:
-        """When it learns; one update takes a mini-batch for each pair."""
-        return replay_cadence(self.warmup_steps, self.update_interval, self.updates_per_step, 2 * self.batch_size)
-
-    def memory(self, spec: Spec, steps: int) -> Replay:
-        """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
-        return Replay.create(min(self.replay_size, steps), spec, self.update_interval)
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return two pairs of random networks; the targets are copies."""
@@ -169,8 +137,8 @@ class SD3:
             critic=critic,
             target_actor=copy_tree(actor),
             target_critic=copy_tree(critic),
-            actor_optimiser=init_optimiser(self._optimiser(self.actor_learning_rate), actor),
-            critic_optimiser=init_optimiser(self._optimiser(self.critic_learning_rate), critic),
+            actor_optimiser=init_optimiser(self.optimiser(self.actor_learning_rate), actor),
+            critic_optimiser=init_optimiser(self.optimiser(self.critic_learning_rate), critic),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
@@ -191,9 +159,6 @@ class SD3:
             tuple(actor.layers for actor in actors), tuple(critic.layers for critic in critics)
         )
         return PolicyNetwork(parameters, head="tanh")
-
-    def _optimiser(self, learning_rate: float) -> optax.GradientTransformation:
-        return make_optimiser(learning_rate, self.max_gradient_norm)
 
 
 def softmax_operator(

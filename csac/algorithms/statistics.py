@@ -42,11 +42,6 @@ class Statistics(NamedTuple):
         return Statistics(count, self.mean + shares[1] * shift, variance, jnp.sqrt(variance + EPSILON))
 
 
-def make_statistics(size: int, wanted: bool) -> Statistics | None:
-    """Return the statistics of no observations, or None where none are wanted."""
-    return Statistics.create((size,)) if wanted else None
-
-
 def normalise(statistics: Statistics | None, observation: Observation, limit: float = LIMIT) -> Observation:
     """Return (observation - mean) / std within ± limit, or the observation as it is where there are no statistics."""
     if statistics is None:

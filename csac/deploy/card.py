@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from csac.deploy.templates import template
+from csac.deploy.templates import render
 from csac.record.rendering import SMALL, number
 
-if TYPE_CHECKING:
-    from csac.deploy.artefact_contract import ArtefactContract
+CARD = "README.md"
+CURVE = "curve.png"
 
 
-def model_card(contract: ArtefactContract, curve: str | None) -> str:
+def model_card(fields: dict[str, Any], has_curve: bool) -> str:
     """Return the card of an artefact: what it does, how well, how it was made, how to run it.
 
-    `curve` is the name of a picture beside it.
+    Args:
+        fields: what its contract.json holds.
+        has_curve: whether `curve.png` lies beside it.
     """
-    fields = contract.fields()
-    returns = contract.verification.get("returns") or contract.provenance["evaluation"]
-    return template("card.md.jinja").render(
+    return render(
+        "card.md.jinja",
         **fields,
-        contract=contract,
-        curve=curve,
-        returns=returns,
-        has_fresh_returns="returns" in contract.verification,
+        has_curve=has_curve,
+        returns=fields["verification"].get("returns") or fields["provenance"]["evaluation"],
         quoted=json.dumps,  # what JSON writes, YAML reads
         with_deviation=_with_deviation,
         with_interval=_with_interval,
@@ -33,23 +32,18 @@ def model_card(contract: ArtefactContract, curve: str | None) -> str:
 
 
 def _with_deviation(returns: dict[str, Any]) -> str:
-    """Return a mean and the standard deviation, as cards on the Hub have them."""
+    """Return a mean and the standard deviation, as cards on the Hub have them: without commas."""
     mean, deviation = returns["mean_return"], returns["standard_deviation"] or 0.0
-    return f"{mean:{_form(mean)}} +/- {deviation:{_form(mean)}}"
+    form = ".3g" if 0 < abs(mean) < SMALL else ".2f"
+    return f"{mean:{form}} +/- {deviation:{form}}"
 
 
 def _with_interval(returns: dict[str, Any]) -> str:
-    """Return a mean, and its interval where there is one."""
     mean = returns["mean_return"]
     if returns["interval_95"] is None:
         return f"{number(mean)} (too few for an interval)"
     low, high = (number(end, mean) for end in returns["interval_95"])
     return f"{number(mean)} (95 % t-interval {low} to {high})"
-
-
-def _form(mean: float) -> str:
-    """Return the format of a mean and its deviation, without commas: other programs read it."""
-    return ".3g" if 0 < abs(mean) < SMALL else ".2f"
 
 
 def _code(value: Any) -> str:

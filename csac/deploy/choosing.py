@@ -11,15 +11,12 @@ from typing import get_args
 import numpy as np
 
 from csac.checks import check_path
-from csac.deploy.artefact_contract import ArtefactContract, artefacts_below, is_artefact
-from csac.deploy.contract import Contract, read_json
-from csac.deploy.policy import CONTRACT, SAVED, Policy
-from csac.record.run import RunDirectory, Which, is_run
+from csac.deploy.contract import CONTRACT, read_json
+from csac.deploy.policy import POLICY, Policy
+from csac.record.run import RunDirectory, Which
 from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
 from csac.types import InputError
-
-_OPENED = "open it with csac.deploy.artefact.open_artefact, or load its run"
 
 
 def load(directory: str | Path, seed: int | None = None, which: Which = "last") -> Policy:
@@ -42,10 +39,13 @@ def load(directory: str | Path, seed: int | None = None, which: Which = "last") 
         raise InputError(f"which={which!r}: choose 'last' or 'best'")
     check_path("a run directory", directory)
     folder = Path(directory)
-    if os.path.exists(folder / SAVED):
-        return _saved(folder, seed, which)
-    if folder.is_dir() and not is_run(folder):
-        _refuse_artefacts(folder)
+    if os.path.exists(folder / POLICY):
+        if seed is not None or which != "last":
+            raise InputError(f"{folder} holds one policy and no run: leave out seed and which")
+        fields = read_json(folder / CONTRACT)
+        if isinstance(fields, dict) and fields.get("guards", {}).get("fallback") is not None:
+            raise InputError(f"{folder} is an artefact with guards: csac.deploy.artefact.open_artefact keeps them")
+        return Policy.load(folder / POLICY)
     return load_run(choose_run(RunSet.open(directory), seed), which)
 
 
@@ -53,33 +53,7 @@ def load_run(run: RunDirectory, which: Which = "last") -> Policy:
     """Return a policy of one run. Raises InputError where it has none, or a damaged file."""
     if not has_policy(run, which):
         raise InputError(f"{run.path} has no {which} policy yet: its first evaluation writes it")
-    return Policy.load(run.policy_file(which), Contract.load(run.policies / CONTRACT))
-
-
-def _saved(folder: Path, seed: int | None, which: Which) -> Policy:
-    """Return the policy that was saved by itself, or has left as an artefact without guards or noise."""
-    if seed is not None or which != "last":
-        raise InputError(f"{folder} holds one policy and no run: leave out seed and which")
-    fields = read_json(folder / CONTRACT)
-    if not isinstance(fields, dict) or "artefact_version" not in fields:
-        return Policy.load(folder / SAVED, Contract.of_fields(fields, folder / CONTRACT))
-    artefact = ArtefactContract.load(folder)
-    if artefact.guards.is_any:
-        raise InputError(f"{folder} is an artefact with guards: csac.deploy.artefact.open_artefact keeps them")
-    if artefact.noise_seed is not None:
-        raise InputError(f"{folder} is an artefact that samples: csac.deploy.artefact.open_artefact keeps its noise")
-    if artefact.file != SAVED:
-        raise InputError(f"{folder} is an artefact of the format {artefact.format}: {_OPENED}")
-    return Policy.load(folder / SAVED, artefact.policy)
-
-
-def _refuse_artefacts(folder: Path) -> None:
-    """Raise InputError where a folder holds what `csac export` has written, in a format that is no `Policy`."""
-    if is_artefact(folder):
-        kind = ArtefactContract.load(folder).format
-        raise InputError(f"{folder} is an exported artefact of the format {kind}: {_OPENED}")
-    if below := artefacts_below(folder):
-        raise InputError(f"{folder} holds no run, and exported artefacts in {', '.join(map(str, below))}: {_OPENED}")
+    return Policy.load(run.policy_file(which))
 
 
 def has_policy(run: RunDirectory, which: Which) -> bool:
@@ -108,9 +82,3 @@ def choose_run(runs: RunSet, seed: int | None = None) -> RunDirectory:
 
 def _listed(seeds: list[int]) -> str:
     return ", ".join(str(seed) for seed in seeds)
-
-
-def step_of_policy(run: RunDirectory, which: Which) -> int:
-    """Return how many environment steps a run had made when its last or best policy was taken. Raises InputError."""
-    step = load_run(run, which).step
-    return run.manifest.steps_done if step is None else step

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,8 +19,8 @@ from csac.types import InputError, Spec
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-SCHEMA_VERSION = 1
-MOST_AXES = 31  # of a shape; a batch has one more, and NumPy 1 holds 32
+CONTRACT = "contract.json"
+SCHEMA_VERSION = 2
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 BOUNDS_ROUNDING = 1e-6  # of a bound: a few times what float32 rounds by
 
@@ -32,12 +34,12 @@ class ActionBounds:
     def __init__(self, low: np.ndarray, high: np.ndarray) -> None:
         self._low, self._high = low, high
         # Halved first, so that a wide range does not overflow.
-        self._half, self._centre = 0.5 * high - 0.5 * low, 0.5 * high + 0.5 * low
+        self.half, self.centre = 0.5 * high - 0.5 * low, 0.5 * high + 0.5 * low
 
     def scale(self, action: np.ndarray) -> np.ndarray:
         """Return a new array of actions [..., action], clipped so that rounding does not leave the bounds."""
-        scaled = action * self._half
-        scaled += self._centre
+        scaled = action * self.half
+        scaled += self.centre
         np.maximum(scaled, self._low, out=scaled)
         return np.minimum(scaled, self._high, out=scaled)
 
@@ -66,6 +68,11 @@ class Contract:
         observation_size = sum(math.prod(shape) for _, shape in self.observation_parts)
         return Spec(observation_size, math.prod(self.action_shape))
 
+    @cached_property
+    def bounds(self) -> ActionBounds:
+        """The map from [-1, 1] to the environment's actions."""
+        return ActionBounds(self.action_low, self.action_high)
+
     def flatten(self, observation: Any) -> np.ndarray:
         """Return `observation` as float32 [observation], or a batch of them as [n, observation].
 
@@ -74,24 +81,19 @@ class Contract:
         Raises:
             InputError: keys or shapes that the task does not have.
         """
-        size = self.spec.observation_size
         if isinstance(observation, dict):
             return self._flatten_dict(observation)
         array = _as_float32(observation, "the observation")
         key, shape = self.observation_parts[0]
-        if key is None:
-            if array.shape == shape:
-                return array.reshape(size)
-            if array.shape[1:] == shape and array.ndim:
-                return array.reshape(len(array), size)
-        if array.ndim in (1, 2) and array.shape[-1] == size:
-            return array
-        expected = shape if key is None else f"a dict of {self._keys()}"
-        raise InputError(f"the observation has shape {array.shape}; the policy takes {expected}, or a batch of it")
+        for expected in [shape] * (key is None) + [(self.spec.observation_size,)]:
+            if (flat := _flat(array, expected)) is not None:
+                return flat
+        taken = shape if key is None else f"a dict of {[key for key, _ in self.observation_parts]}"
+        raise InputError(f"the observation has shape {array.shape}; the policy takes {taken}, or a batch of it")
 
     def to_environment(self, action: np.ndarray) -> np.ndarray:
         """Return actions of [-1, 1], [..., action], on the environment's scale: float32 [..., *action_shape]."""
-        return self._bounds.scale(action).reshape(action.shape[:-1] + self.action_shape)
+        return self.bounds.scale(action).reshape(action.shape[:-1] + self.action_shape)
 
     def fields(self) -> dict[str, Any]:
         """Return what its JSON holds."""
@@ -107,10 +109,6 @@ class Contract:
             "action_high": self.action_high.tolist(),
         }
 
-    def save(self, path: str | Path) -> None:
-        """Write the contract as JSON, whole or not at all."""
-        write_atomically(Path(path), (json.dumps(self.fields(), indent=2) + "\n").encode())
-
     @staticmethod
     def load(path: str | Path) -> Contract:
         """Read a contract.
@@ -122,56 +120,54 @@ class Contract:
 
     @staticmethod
     def of_fields(fields: Any, path: str | Path) -> Contract:
-        """Return the contract that `fields` made these of, whatever else there is. Raises InputError for others."""
+        """Return the contract with these `fields`. Raises InputError, which names `path`, if they are invalid."""
         try:
             return _contract(fields)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else error
             raise InputError(f"{path} is not a policy contract ({reason}): restore it from a copy") from error
 
-    @cached_property
-    def _bounds(self) -> ActionBounds:
-        return ActionBounds(self.action_low, self.action_high)
-
     def _flatten_dict(self, observation: Mapping[str | None, Any]) -> np.ndarray:
-        if set(observation) != {key for key, _ in self.observation_parts}:
-            raise InputError(
-                f"the observation has the keys {sorted(observation, key=str)}; the policy takes {self._keys()}"
-            )
-        flat = []
+        keys = [key for key, _ in self.observation_parts]
+        if (given := sorted(observation, key=str)) != keys:
+            taken = "one array and no dict" if keys == [None] else keys
+            raise InputError(f"the observation has the keys {given}; the policy takes {taken}")
+        parts = []
         for key, shape in self.observation_parts:
             array = _as_float32(observation[key], f"observation[{key!r}]")
-            lead = array.shape[: array.ndim - len(shape)]
-            if array.ndim - len(shape) not in (0, 1) or array.shape != lead + shape:
+            if (flat := _flat(array, shape)) is None:
                 raise InputError(f"observation[{key!r}] has shape {array.shape}; the policy takes {shape}, or a batch")
-            flat.append(array.reshape((*lead, math.prod(shape))))
-        if len({part.shape[:-1] for part in flat}) > 1:
+            parts.append(flat)
+        if len({part.shape[:-1] for part in parts}) > 1:
             raise InputError("the parts of the observation differ in batch size: give every key as many rows")
-        return np.concatenate(flat, axis=-1)
+        return np.concatenate(parts, axis=-1)
 
-    def _keys(self) -> list[str] | str:
-        keys = [key for key, _ in self.observation_parts if key is not None]
-        return keys or "one array and no dict"
+
+def _flat(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Return an array of this shape as [size], a batch of them as [n, size], and None for any other."""
+    if array.shape != shape and (array.ndim == 0 or array.shape[1:] != shape):
+        return None
+    return array.reshape((*array.shape[: array.ndim - len(shape)], math.prod(shape)))
 
 
 def _contract(fields: Any) -> Contract:
     if fields["schema_version"] != SCHEMA_VERSION:
         raise ValueError(f"schema_version {fields['schema_version']!r} where this csac reads {SCHEMA_VERSION}")
+    names = {"activation": get_args(Activation), "head": get_args(Head)}
+    for name, known in names.items():
+        if fields[name] not in known:
+            raise ValueError(f"{name} {fields[name]!r} is not known")
     parts = tuple((part["key"], _shape(part["shape"])) for part in fields["observation_parts"])
-    action_shape = _shape(fields["action_shape"])
-    low, high = _bounds(fields["action_low"]), _bounds(fields["action_high"])
     keys = [key for key, _ in parts]
-    named = all(isinstance(key, str) for key in keys) and keys == sorted(set(keys))
-    if keys != [None] and not (keys and named):
+    if keys != [None] and not (keys and all(isinstance(key, str) for key in keys) and keys == sorted(set(keys))):
         raise ValueError("observation_parts are not one plain part or sorted, distinct keys")
-    if low.shape != (math.prod(action_shape),) or high.shape != low.shape:
+    action_shape = _shape(fields["action_shape"])
+    with np.errstate(over="ignore"):  # becomes infinite, which is refused
+        low, high = (np.array(fields[name], np.float32) for name in ("action_low", "action_high"))
+    if not low.shape == high.shape == (math.prod(action_shape),):
         raise ValueError("action bounds and action_shape disagree")
-    if not (low <= high).all():
-        raise ValueError("action bounds are not in order")
-    if fields["activation"] not in get_args(Activation) or fields["head"] not in get_args(Head):
-        raise ValueError(f"activation {fields['activation']!r} or head {fields['head']!r} is not known")
-    if not isinstance(fields["algorithm"], str) or not isinstance(fields["task"], str | None):
-        raise TypeError("task or algorithm is not a name")
+    if not (np.isfinite([low, high]).all() and (low <= high).all()):
+        raise ValueError("action bounds are not finite or not in order")
     return Contract(
         fields["task"], fields["algorithm"], fields["activation"], fields["head"], parts, action_shape, low, high
     )
@@ -179,19 +175,8 @@ def _contract(fields: Any) -> Contract:
 
 def _shape(numbers: Any) -> tuple[int, ...]:
     if not isinstance(numbers, list) or not all(type(number) is int and number > 0 for number in numbers):
-        raise ValueError(f"{numbers!r} is not a shape")
-    if len(numbers) > MOST_AXES:
-        raise ValueError(f"a shape of {len(numbers)} axes")
+        raise ValueError(f"{numbers!r:.40} is not a shape")
     return tuple(numbers)
-
-
-def _bounds(numbers: Any) -> np.ndarray:
-    """Return float32 [action]. Raises ValueError where a number is none, or more than float32 can hold."""
-    if not isinstance(numbers, list) or not all(type(number) in (int, float) for number in numbers):
-        raise ValueError("action bounds are not lists of numbers")
-    if not all(abs(number) <= FLOAT32_MAX for number in numbers):
-        raise ValueError("action bounds are not finite")
-    return np.array(numbers, np.float32)
 
 
 def _as_float32(value: Any, name: str) -> np.ndarray:
@@ -203,8 +188,46 @@ def _as_float32(value: Any, name: str) -> np.ndarray:
         raise InputError(f"{name} is not an array of numbers: {error}") from error
 
 
+def write_with_checksum(path: Path, content: bytes, fields: Mapping[str, Any] | None = None) -> None:
+    """Write a file, and its SHA-256 into `contract.json` beside it. Raises OSError.
+
+    Meanwhile the contract has the checksums of both the old and the new file, so that a kill leaves files that match.
+    With `fields` these are the contract's, and checksums of files of another contract go.
+    """
+    place, before = path.with_name(CONTRACT), {}
+    with suppress(InputError):  # none there, or a damaged one
+        before |= read_json(place)
+    checksums = before.pop("sha256", {})
+    if fields is not None and before != {**fields}:
+        before, checksums = {**fields}, {}
+    old, new = checksums.get(path.name, ""), hashlib.sha256(content).hexdigest()
+
+    def write_contract(known: str) -> None:
+        write_json(place, {**before, "sha256": dict(sorted({**checksums, path.name: known}.items()))})
+
+    there = sha256_of(path) if path.exists() else ""
+    write_contract(f"{new} {there}" if there in old else new)
+    write_atomically(path, content)
+    write_contract(new)
+
+
+def check_checksum(path: Path, fields: Any) -> None:
+    """Raise InputError if the contract's `fields` hold no checksum of a file, or another one."""
+    checksums = fields.get("sha256") if isinstance(fields, dict) else None
+    known = checksums.get(path.name) if isinstance(checksums, dict) else None
+    if not isinstance(known, str):
+        raise InputError(f"{path.with_name(CONTRACT)} has no checksum of {path.name}: restore both from a copy")
+    if sha256_of(path) not in known:
+        raise InputError(f"{path} does not match its checksum in {CONTRACT}: restore it from a copy")
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal digits. Raises InputError if it cannot be read."""
+    return hashlib.sha256(read_file(path)).hexdigest()
+
+
 def read_file(path: Path) -> bytes:
-    """Return a file's content. Raises InputError where it cannot be read."""
+    """Return a file's content. Raises InputError if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -213,9 +236,14 @@ def read_file(path: Path) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """Return what a JSON file holds. Raises InputError where it cannot be read, or is none."""
+    """Return what a JSON file holds. Raises InputError if it cannot be read, or is none."""
     content = read_file(path)
     try:
         return json.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid JSON ({error}): restore it from a copy") from error
+
+
+def write_json(path: Path, fields: Mapping[str, Any]) -> None:
+    """Write `fields` as JSON, whole or not at all."""
+    write_atomically(path, (json.dumps(fields, indent=2, allow_nan=False) + "\n").encode())

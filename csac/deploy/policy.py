@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import safetensors.numpy
 
 from csac.checks import check_flag, check_path
-from csac.deploy import tensors
-from csac.deploy.contract import Activation, Contract, read_file
-from csac.deploy.parameters import check_network, copied, from_tensors, to_tensors
-from csac.record.files import write_atomically
+from csac.deploy.contract import CONTRACT, Contract, check_checksum, read_json, write_with_checksum
+from csac.deploy.parameters import copied, from_tensors, to_tensors
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork
 
-CONTRACT, SAVED = "contract.json", "policy.safetensors"  # in the folder of a policy that was saved by itself
+if TYPE_CHECKING:
+    from csac.deploy.contract import Activation
+
+POLICY = "policy.safetensors"  # in the folder of a policy that was saved by itself, and of an artefact
 LOG_STD_RANGE = (-20.0, 2.0)
 
-_STEP = "step"  # of a file's metadata: what a run before this had not got
 _STREAM = 0x706F6C69  # far from what a task that spawns generators of its own would use: 0, 1, 2, ...
 
 
 def noise_generator(seed: int) -> np.random.Generator:
-    """Return what the stochastic actions of `seed` are drawn from.
+    """Return the generator of the stochastic actions of `seed`.
 
     Gymnasium gives `default_rng(seed)` to a task that is reset with `seed`. This is another stream: actions drawn from
     the same numbers as the task's own chances would foresee them.
@@ -37,8 +37,8 @@ class Policy:
     Args:
         network: the layers; copied, so that the caller may donate or change them afterwards.
         contract: how observations become flat and actions leave [-1, 1].
-        seed: of the generator that stochastic actions draw from.
-        step: how many environment steps of its own its seed had made when it was taken, where that is known.
+        seed: of the generator of stochastic actions.
+        step: how many environment steps its seed had made when it was taken, if that is known.
 
     Raises:
         InputError: layers that do not fit each other or the contract.
@@ -47,16 +47,29 @@ class Policy:
     def __init__(self, network: PolicyNetwork, contract: Contract, seed: int = 0, step: int | None = None) -> None:
         self.network = network._replace(parameters=copied(network.parameters))
         self.contract, self.step = contract, step
-        check_network(self.network, contract)
         self._generator = noise_generator(seed)
         self._actors = [_split_actor(actor, contract) for actor in self.network.parameters.actors]
+        self._check()
+
+    def _check(self) -> None:
+        """Raise InputError if the layers do not fit each other or the contract."""
+        (observation_size, action_size), network = self.contract.spec, self.network
+        if (network.activation, network.head) != (self.contract.activation, self.contract.head):
+            raise InputError(f"the policy is {network.activation}/{network.head}, not as its contract says")
+        try:
+            given = np.zeros((1, observation_size), np.float32), False, np.zeros((1, action_size), np.float32)
+            fits = self.act(*given).shape == (1, action_size)
+        except (ValueError, TypeError, IndexError):
+            fits = False
+        if not fits:
+            raise InputError(f"the policy's layers do not take {observation_size} numbers and give {action_size}")
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, Any]:
         """Return the action on the environment's scale, and `state` as it came.
 
-        Deterministic unless told otherwise, as a controller is; Stable-Baselines3's `predict` draws unless told.
+        Deterministic unless told otherwise, as a controller is; Stable-Baselines3's `predict` samples unless told.
         One observation gives float32 [*action_shape], a batch of n (or a dict of such batches) [n, *action_shape].
         One that is not finite gives an action that is not: `csac export` builds in guards that replace it.
 
@@ -72,7 +85,7 @@ class Policy:
         """Return actions in [-1, 1], [n, action], for flat float32 observations [n, observation].
 
         A stochastic action adds std * noise to the mean before the head's tanh or clip; `noise`, standard normal
-        [n, action], is drawn where not given. The head `tanh` has no spread: it gives the same action either way.
+        [n, action], is drawn if not given. The head `tanh` has no spread: it gives the same action either way.
         """
         if not deterministic and noise is None:
             noise = self._generator.standard_normal(
@@ -84,9 +97,9 @@ class Policy:
         return actions[np.argmax(values, axis=0), np.arange(len(observations))]
 
     def candidates(self, observations: np.ndarray, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return each actor's actions in [-1, 1], [actor, n, action], and what its own critic values them, [actor, n].
+        """Return each actor's actions in [-1, 1], [actor, n, action], and its own critic's values, [actor, n].
 
-        A single actor's action is valued by nobody. `act` takes row by row the one that is valued most, the first of
+        The values are None for a single actor. `act` takes row by row the action with the highest value, the first of
         equals. Observations in float64 are computed on in float64.
         """
         normaliser = self.network.parameters.normaliser
@@ -105,71 +118,60 @@ class Policy:
         hidden = _hidden(actor.hidden, inputs, self.network.activation)
         action = hidden @ actor.mean.weight
         action += actor.mean.bias
-        if noise is not None and self.network.head == "tanh_gaussian":
-            log_std = hidden @ actor.log_std.weight + actor.log_std.bias
-            action += np.exp(np.clip(log_std, *LOG_STD_RANGE)) * noise
-        if (log_std := self.network.parameters.log_std) is not None:
-            action += 0.0 if noise is None else np.exp(log_std) * noise
+        if noise is not None and self.network.head != "tanh":
+            log_std: Any = self.network.parameters.log_std
+            if self.network.head == "tanh_gaussian":
+                log_std = np.clip(hidden @ actor.log_std.weight + actor.log_std.bias, *LOG_STD_RANGE)
+            action += np.exp(log_std) * noise
+        if self.network.head == "clipped_gaussian":
             return np.clip(action, -1.0, 1.0, out=action)
         return np.tanh(action, out=action)
 
     def save(self, directory: str | Path) -> None:
-        """Write the policy and its contract into a folder, made where it is not there; `csac.load` reads it.
+        """Write the policy and its contract into a folder, made if needed; `csac.load` reads it.
 
         Raises:
             InputError: the folder holds a run or an artefact, or cannot be written.
         """
         check_path("the folder of a policy", directory)
         folder = Path(directory)
-        strangers = {"manifest.json", "policy.py", "policy.onnx", "policy.h"}
         try:
-            if folder.is_dir() and strangers & {path.name for path in folder.iterdir()}:
-                raise InputError(f"{folder} holds a run or an artefact: choose another folder for the policy")
             folder.mkdir(parents=True, exist_ok=True)
-            self.contract.save(folder / CONTRACT)
-            self.save_layers(folder / SAVED)
+            if {"manifest.json", "policy.py", "policy.onnx", "policy.h"} & {path.name for path in folder.iterdir()}:
+                raise InputError(f"{folder} holds a run or an artefact: choose another folder for the policy")
+            self.write(folder / POLICY)
         except OSError as error:
             raise InputError(f"{folder} cannot be written: {error.strerror}") from error
 
-    def save_in(self, folder: Path, names: tuple[str, ...]) -> None:
-        """Stand-in."""
-        folder.mkdir(exist_ok=True)
-        self.contract.save(folder / CONTRACT)
-        for name in names:
-            self.save_layers(folder / f"{name}.safetensors")
+    def write(self, path: Path) -> None:
+        """Write the policy's file, and its contract with the file's checksum beside it. Raises OSError."""
+        path.parent.mkdir(exist_ok=True)
+        write_with_checksum(path, self.encode(), self.contract.fields())
 
-    def save_layers(self, path: str | Path) -> None:
-        """Write the layers alone as safetensors, and the step, whole or not at all; a contract belongs to them."""
-        metadata = {} if self.step is None else {_STEP: str(self.step)}
-        write_atomically(Path(path), tensors.encode(to_tensors(self.network.parameters), metadata))
+    def encode(self) -> bytes:
+        """Return the content of its safetensors file: the layers, and the step as metadata."""
+        metadata = None if self.step is None else {"step": str(self.step)}
+        return safetensors.numpy.save(to_tensors(self.network.parameters), metadata)
 
     @staticmethod
-    def load(path: str | Path, contract: Contract, seed: int = 0) -> Policy:
-        """Read a policy.
+    def load(path: str | Path, contract: str | Path | None = None, seed: int = 0) -> Policy:
+        """Read a policy's file and its contract, by default `contract.json` beside it.
 
         Raises:
-            InputError: no such file, a damaged one, or one that does not fit the contract.
+            InputError: a file that is missing or damaged, or a policy that the contract does not belong to.
         """
-        content = read_file(Path(path))
+        path = Path(path)
+        place = Path(contract or path.with_name(CONTRACT))
+        agreement = Contract.of_fields(fields := read_json(place), place)
+        check_checksum(path, fields)
         try:
-            arrays, step = tensors.decode(content), _step_in(content)
-        except ValueError as error:
-            raise InputError(f"{path} is damaged ({error}): restore it from a copy") from error
-        try:
-            network = PolicyNetwork(from_tensors(arrays), contract.activation, contract.head)
-            return Policy(network, contract, seed, step)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-
-
-def _step_in(content: bytes) -> int | None:
-    """Return the step in a policy's file, or None where it has none. Raises ValueError for one that is no number."""
-    step = tensors.metadata_of(content).get(_STEP)
-    if step is None:
-        return None
-    if not re.fullmatch(r"\d{1,15}", step, re.ASCII):
-        raise ValueError(f"its step is {step!r:.40}")
-    return int(step)
+            with safetensors.safe_open(path, "numpy") as file:
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                step = (file.metadata() or {}).get("step")
+            network = PolicyNetwork(from_tensors(tensors), agreement.activation, agreement.head)
+            return Policy(network, agreement, seed, None if step is None else int(step))
+        except (safetensors.SafetensorError, ValueError) as error:  # InputError is a ValueError
+            raise InputError(f"{path} is not a policy of {place.name} ({error}): restore both from a copy") from error
 
 
 class _Actor(NamedTuple):

@@ -248,6 +248,8 @@ def _filming(environment: Environment, task: str, video: str | Path | None) -> I
         aside.touch()
         yield film
         film.close()
+        if not aside.stat().st_size:  # it may end before anybody writes to it
+            raise OSError("ffmpeg failed")
         aside.replace(path)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or 'ffmpeg failed'}; choose another place") from error

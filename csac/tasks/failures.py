@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sysconfig
 from pathlib import Path
 from traceback import walk_tb
@@ -10,7 +11,8 @@ from traceback import walk_tb
 from csac.types import Failure
 
 _CSAC = f"{Path(__file__).parents[1]}{os.sep}"
-_LIBRARIES = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"), "<frozen")
+_PACKAGES = re.compile(r"\b(site|dist)-packages\b")
+_PASSED_OVER = (sysconfig.get_path("stdlib"), "<frozen")
 
 
 class EnvironmentFailure(Failure):
@@ -39,8 +41,9 @@ def raised(error: BaseException) -> str:
     while origin.__cause__:  # Gymnasium raises another one from what a constructor raised
         origin = origin.__cause__
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(origin.__traceback__)]
-    foreign = [place for place in places if not place[0].startswith(_CSAC)]
-    own = [place for place in foreign if not any(library in place[0] for library in _LIBRARIES)]
+    foreign = [place for place in places if _PACKAGES.search(place[0]) or not place[0].startswith(_PASSED_OVER)]
+    foreign = [place for place in foreign if not place[0].startswith(_CSAC)]
+    own = [place for place in foreign if not _PACKAGES.search(place[0])]
     where = "".join(f" ({Path(path).name}:{line})" for path, line in (own or foreign)[-1:])
     return one_line(error) + where
 

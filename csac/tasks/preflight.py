@@ -39,7 +39,7 @@ def _as_json(value: Any, name: str) -> Any:
     raise InputError(f"{name} cannot be kept in a file: JSON has no {type(value).__name__} such as {value!r:.40}")
 
 
-def try_task(environment: Environment) -> None:
+def try_task(environment: Environment, arguments: Mapping[str, Any] | None = None) -> None:
     """Reset a task and make one step, so that one of another API, or an argument of a wrong type, is told at once.
 
     Any other failure is left to the run, whose log has the traceback.
@@ -52,7 +52,8 @@ def try_task(environment: Environment) -> None:
         environment.step(np.zeros(environment.spec.action_size, np.float32))
     except EnvironmentFailure as error:
         if isinstance(error.__cause__, TypeError | ValueError):
-            raise InputError(f"{environment.task_name} does not work: {error}") from error
+            given = f" with the arguments {dict(arguments)}" if arguments else ""
+            raise InputError(f"{environment.task_name} does not work{given}: {error}") from error
 
 
 def seed_warning(environment: Environment) -> str | None:

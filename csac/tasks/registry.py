@@ -65,7 +65,7 @@ def registered(task: str) -> str:
     """Return the registered id of a task, after importing its module where one is named. Raises InputError."""
     module, _, name = task.rpartition(":")
     if module:
-        import_module(module)
+        _import_module(task, module)
     _register_known(name)
     if name in gymnasium.registry:
         return name
@@ -75,7 +75,7 @@ def registered(task: str) -> str:
     raise InputError(f"no task is called {task}: {hint}")
 
 
-def import_module(module: str) -> None:
+def _import_module(task: str, module: str) -> None:
     """Import the module of a task, which the user has named. Raises InputError.
 
     The working directory is searched last, and stays on the path for what the module imports later. What the user has
@@ -88,7 +88,7 @@ def import_module(module: str) -> None:
         importlib.import_module(module)
     except BaseException as error:
         raise_interrupt(error)
-        raise InputError(f"the module {module} cannot be imported: {raised(error)}") from error
+        raise InputError(f"{task}: the module {module} cannot be imported: {raised(error)}") from error
 
 
 def adapter_of(task: object) -> Adapter | None:

@@ -282,7 +282,9 @@ class Loop:
         mean = float(np.mean([episode.episode_return for episode in episodes]))
         is_best = mean > recorder.best
         recorder.best = max(mean, recorder.best)
-        policy.save_in(run.policies, ("last", "best") if is_best else ("last",))
+        policy.write(run.policy_file("last"))
+        if is_best:
+            policy.write(run.policy_file("best"))
         run.log(f"step {step}: mean return {mean:.1f}")
         run.update_manifest(steps_done=max(step, run.manifest.steps_done))
         if any(episode.length >= LONGEST_EPISODE for episode in episodes):
@@ -326,7 +328,7 @@ class Loop:
     def _save_policy(self, index: int) -> None:
         network = self.learner.networks()[index]
         if _is_finite(network):
-            Policy(network, self._contract, step=self.step).save_in(self.runs[index].policies, ("last",))
+            Policy(network, self._contract, step=self.step).write(self.runs[index].policy_file("last"))
 
     def _record_metrics(self) -> None:
         for index, metrics in enumerate(self.learner.metrics()):

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equations import ONE, batch_of, linear, transition
+from equations import SPEC, assert_close, batch_of, begin, linear, transition, transitions, update
 
 from csac.algorithms import CSAC, SAC, TD3
 from csac.algorithms.critics import (
     Critics,
-    least_q_value,
     make_critics,
+    min_q,
     normalised_critic_loss,
     q_value,
     q_values,
@@ -25,7 +25,7 @@ from csac.algorithms.critics import (
 from csac.algorithms.distributions import policy_at
 from csac.algorithms.networks import BATCH, init_optimiser, make_optimiser
 from csac.algorithms.normalisation import EPSILON, Moments, fold, fold_layer, moments_of, normalised_pass
-from csac.types import Layer, Spec, Transition
+from csac.types import Layer, Transition
 
 SMALL: dict[str, Any] = {"actor_hidden_sizes": (5,), "critic_hidden_sizes": (8, 8), "batch_size": 16}
 NORMALISED = [
@@ -34,17 +34,10 @@ NORMALISED = [
     TD3(critic_normalisation="batch", policy_delay=1, **SMALL),
 ]
 NAMES = [algorithm.name for algorithm in NORMALISED]
-SPEC = Spec(3, 2)
-NOISE = jax.random.normal(jax.random.key(4), (16, 2))
+NOISE = jnp.asarray(np.random.default_rng(4).normal(size=(16, 2)), jnp.float32)
 
 
-def transitions(key: int) -> Transition:
-    """Sixteen of them, none like another, one of them terminal; their states lie far from zero."""
-    keys = jax.random.split(jax.random.key(key), 4)
-    states = 3.0 + 2.0 * jax.random.normal(keys[0], (2, 16, 3))
-    actions = jnp.tanh(jax.random.normal(keys[1], (16, 2)))
-    terminated = jnp.zeros(16).at[3].set(1.0)
-    return Transition(states[0], actions, jax.random.normal(keys[2], (16,)), states[1], terminated, jnp.zeros(16))
+FAR = transitions(16, shift=3.0, scale=2.0)
 
 
 def test_the_moments_are_those_of_all_inputs_of_all_examples():
@@ -91,7 +84,7 @@ def pairs_of(batch: Transition, next_actions: Any) -> Any:
 
 
 def test_a_network_with_the_moments_folded_in_says_what_the_normalised_one_does():
-    (critic, _), batch = make_critics(jax.random.key(0), SPEC, (8, 8)), transitions(1)
+    (critic, _), batch = make_critics(jax.random.key(0), SPEC, (8, 8)), FAR
     inputs = pairs_of(batch, jnp.tanh(NOISE))
     ours = jax.vmap(partial(normalised_pass, critic), axis_name=BATCH)([inputs[:16], inputs[16:]])
     moments, folded = jax.tree.map(lambda leaf: leaf[0], (ours.moments, ours.folded))
@@ -101,9 +94,9 @@ def test_a_network_with_the_moments_folded_in_says_what_the_normalised_one_does(
     jax.tree.map(close, fold(critic, moments), folded)
 
 
-def soft_target(transition: Transition, noise: Any, *, target_critics: Critics) -> Any:
+def soft_target(transition: Transition, noise: Any, *, targets: Critics) -> Any:
     """A target that asks the critics at the next action."""
-    values = q_values(target_critics, transition.next_observation, jnp.tanh(noise))
+    values = q_values(targets, transition.next_observation, jnp.tanh(noise))
     return transition.reward + 0.9 * (1.0 - transition.terminated) * (jnp.minimum(*values) - noise.sum())
 
 
@@ -112,7 +105,7 @@ def next_action(observation: Any, noise: Any) -> Any:
 
 
 def test_loss_and_gradient_are_those_of_one_pass_over_both_batches():
-    critics, batch = make_critics(jax.random.key(0), SPEC, (8, 8)), transitions(1)
+    critics, batch = make_critics(jax.random.key(0), SPEC, (8, 8)), FAR
 
     def ours(critics):
         loss = partial(normalised_critic_loss, critic_target=soft_target, next_action=next_action)
@@ -133,43 +126,44 @@ def test_loss_and_gradient_are_those_of_one_pass_over_both_batches():
     jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-3, atol=2e-5), our_gradient, their_gradient)
 
 
+class Learning(NamedTuple):
+    critics: Critics
+    target_critics: Critics | None
+    critic_optimiser: Any
+
+
 def test_the_critics_of_the_actors_loss_are_the_new_ones_by_the_moments_of_the_step():
-    optimiser, batch = make_optimiser(0.1), transitions(1)
+    optimiser, batch = make_optimiser(0.1), FAR
     critics = make_critics(jax.random.key(0), SPEC, (8, 8))
-    given = (optimiser, critics, None, init_optimiser(optimiser, critics), batch, NOISE)
-    learnt = update_critics(*given, critic_target=soft_target, next_action=next_action)
-    assert set(learnt.metrics) == {"critic_loss", "q_mean"}
+    state = Learning(critics, None, init_optimiser(optimiser, critics))
+    learnt, folded, metrics = update_critics(optimiser, state, batch, NOISE, soft_target, next_action)
+    assert set(metrics) == {"critic_loss", "q_mean"}
 
     inputs = pairs_of(batch, jnp.tanh(NOISE))
-    for old, new, folded in zip(critics, learnt.critics, learnt.folded, strict=True):
+    for old, new, plain in zip(critics, learnt.critics, folded, strict=True):
         seen = jax.vmap(partial(normalised_pass, old), axis_name=BATCH)([inputs[:16], inputs[16:]])
         expected = fold(new, jax.tree.map(lambda leaf: leaf[0], seen.moments))
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), folded, expected)
+        assert_close(plain, expected)
         assert not np.allclose(new.layers[1].weight, old.layers[1].weight)
 
 
 def products(**changes: Any) -> float:
     """Operations of one compiled update of SAC, as XLA counts them: nearly all of them are matrix products."""
     algorithm = SAC(actor_hidden_sizes=(64, 64), critic_hidden_sizes=(64, 64), **changes)
-    state, batch = algorithm.init(jax.random.key(0), SPEC, 100), transitions(1)
+    state, batch = begin(algorithm, SPEC), FAR
     counted: Any = jax.jit(algorithm.update).lower(state, batch, jax.random.key(0), 0).compile().cost_analysis()
     return counted["flops"]
 
 
 def test_one_pass_gives_values_targets_and_moments():
-    # In products of a hidden layer SAC needs 16 (benchmarks/operations.py). Normalised critics need 2 + 2 forward and
+    # In products of a hidden layer SAC needs 16 (benchmarks/products.py). Normalised critics need 2 + 2 forward and
     # twice as many backward, where plain ones with targets have 2 + 2 and 4: 20. Each further pass would cost 2 or 4.
     assert 1.2 < products(critic_normalisation="batch") / products() < 1.4
 
 
-@partial(jax.jit, static_argnums=0)
-def update(algorithm, state, batch: Transition, key: int = 0):
-    return algorithm.update(state, batch, jax.random.key(key), 0)
-
-
 @pytest.mark.parametrize("algorithm", NORMALISED, ids=NAMES)
 def test_an_actor_climbs_the_new_critics_by_the_moments_of_the_step(algorithm):
-    state, batch, key = algorithm.init(jax.random.key(0), SPEC, 100), transitions(1), jax.random.key(7)
+    state, batch, key = begin(algorithm, SPEC), FAR, jax.random.key(7)
     after, metrics = update(algorithm, state, batch, 7)
     noises = jax.random.normal(key, batch.action.shape if isinstance(algorithm, TD3) else (2, *batch.action.shape))
     noise, actor_noise = (noises, noises) if isinstance(algorithm, TD3) else noises
@@ -191,9 +185,7 @@ def test_an_actor_climbs_the_new_critics_by_the_moments_of_the_step(algorithm):
             return -q_value(critics[0], observation, jnp.tanh(state.actor(observation)))
         policy = policy_at(state.actor, observation)  # CSAC's reference as well, so far
         weight = 1.0 if isinstance(algorithm, SAC) else algorithm.entropy_weight
-        return weight * policy.log_prob(noise) - least_q_value(
-            (critics[0], critics[1]), observation, policy.sample(noise)
-        )
+        return weight * policy.log_prob(noise) - min_q((critics[0], critics[1]), observation, policy.sample(noise))
 
     expected = jax.vmap(loss)(batch.observation, actor_noise).mean()
     np.testing.assert_allclose(metrics["actor_loss"], expected, rtol=1e-4, atol=1e-5)
@@ -210,7 +202,7 @@ def test_a_linear_critic_by_hand():
         critic_normalisation="batch", target_noise=0.0, discount=0.5, actor_hidden_sizes=(), critic_hidden_sizes=()
     )
     still = linear([[0.0]], [0.0])
-    state = algorithm.init(jax.random.key(0), ONE, 100)
+    state = begin(algorithm)
     state = state._replace(critics=(critic, critic), actor=linear([[0.0]], [1.0]), target_actor=still)
     batch = batch_of(
         transition(observation=1.0, action=0.5, next_observation=1.0),
@@ -223,21 +215,20 @@ def test_a_linear_critic_by_hand():
 
 @pytest.mark.parametrize("algorithm", NORMALISED, ids=NAMES)
 def test_normalised_critics_have_no_targets_and_keep_no_statistics(algorithm):
-    state = algorithm.init(jax.random.key(0), SPEC, 100)
+    state = begin(algorithm, SPEC)
     assert state.target_critics is None
-    state, metrics = update(algorithm, state, transitions(1))
+    state, metrics = update(algorithm, state, FAR)
     assert state.target_critics is None
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, metrics)))
     plain = type(algorithm)(**{**vars(algorithm), "critic_normalisation": "none"}).init(jax.random.key(0), SPEC, 100)
-    jax.tree.map(np.testing.assert_array_equal, plain.critics, algorithm.init(jax.random.key(0), SPEC, 100).critics)
+    jax.tree.map(np.testing.assert_array_equal, plain.critics, begin(algorithm, SPEC).critics)
     assert plain.target_critics is not None
 
 
-@pytest.mark.parametrize("algorithm", NORMALISED, ids=NAMES)
-def test_seeds_side_by_side_are_normalised_apart(algorithm):
-    keys = jax.random.split(jax.random.key(0), 2)
-    states = [algorithm.init(key, SPEC, 100) for key in keys]
-    batches = [transitions(1), jax.tree.map(lambda leaf: 5.0 * leaf, transitions(2))]
+def test_seeds_side_by_side_are_normalised_apart():
+    algorithm = NORMALISED[0]
+    states = [begin(algorithm, SPEC), update(algorithm, begin(algorithm, SPEC), FAR, 1)[0]]
+    batches = [FAR, transitions(16, 2, shift=15.0, scale=10.0)]
     together = jax.jit(jax.vmap(partial(update, algorithm)))
     _, metrics = together(*(jax.tree.map(lambda *x: jnp.stack(x), *both) for both in (states, batches)))
     for seed in (0, 1):

@@ -9,18 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equations import CLOSED_FORM, REFERENCES, SPEC, assert_close
 from scipy.optimize import minimize
 from scipy.special import logsumexp, softmax
 
 from csac.algorithms import CSAC, SAC
 from csac.algorithms import csac as csac_file
-from csac.algorithms.adaptation import current_weights
-from csac.types import Spec, Transition
+from csac.algorithms.adaptation import Weights
+from csac.types import Transition
 
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(80)
 WEIGHTS = WEIGHTS / WEIGHTS.sum()  # the mean over ξ ~ N(0, 1) of f(ξ) is WEIGHTS @ f(NODES)
 ONE_OBSERVATION = jnp.zeros(1)
-REFERENCE_POLICIES = ["algorithm1", "previous", "periodic", "average"]
 ESTIMATORS = ["sampled", "closed_form"]
 
 
@@ -35,7 +35,7 @@ def critic(inputs: jax.Array) -> jax.Array:
 
 
 def weights_of(algorithm):
-    return current_weights((algorithm.entropy_weight, algorithm.relative_entropy_weight), None)
+    return Weights(algorithm.entropy_weight, algorithm.relative_entropy_weight)
 
 
 def actor_losses(algorithm, parameters, reference, noises):
@@ -49,7 +49,7 @@ def actor_losses(algorithm, parameters, reference, noises):
     return jax.vmap(loss)(noises)
 
 
-def test_algorithm1_has_no_expected_gradient_of_the_relative_entropy():
+def test_the_actor_as_its_own_reference_has_no_expected_gradient_of_the_relative_entropy():
     # With π̃ = π at u = mean + std ξ, log π(u) does not move with the mean, and -log π̃(u) has the slope ξ / std there;
     # in log_std the slopes are -1 and ξ². So the gradient of τ (log π - log π̃) is τ [ξ / std, ξ² - 1]: its mean over
     # ξ ~ N(0, 1) is 0, but at one noise it is not.
@@ -67,14 +67,13 @@ def test_algorithm1_has_no_expected_gradient_of_the_relative_entropy():
     assert np.abs(part[likely]).max() > 1.0
 
 
-SPEC = Spec(3, 2)
 SMALL = {
     "discount": 0.9,
     "target_rate": 0.05,
     "actor_learning_rate": 3e-3,
     "critic_learning_rate": 3e-3,
-    "actor_hidden_sizes": (16, 16),
-    "critic_hidden_sizes": (16, 16),
+    "actor_hidden_sizes": (8,),
+    "critic_hidden_sizes": (8,),
     "entropy_weight": 0.2,
 }
 
@@ -96,55 +95,38 @@ def after_updates(algorithm, updates=50):
 
 @pytest.fixture(scope="module")
 def sac_state():
-    return after_updates(SAC(temperature="fixed", **SMALL))
+    return after_updates(SAC(**SMALL))
 
 
 def assert_equals_sac(state, sac_state):
     for name in ("actor", "critics", "target_critics", "actor_optimiser", "critic_optimiser"):
-        ours, theirs = jax.tree.leaves(getattr(state, name)), jax.tree.leaves(getattr(sac_state, name))
-        for our, their in zip(ours, theirs, strict=True):
-            np.testing.assert_allclose(our, their, rtol=1e-4, atol=1e-5, err_msg=name)
+        assert_close(getattr(state, name), getattr(sac_state, name))
 
 
-@pytest.mark.parametrize("reference_policy", REFERENCE_POLICIES)
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_without_relative_entropy_csac_is_sac(reference_policy, estimator, sac_state):
-    algorithm = CSAC(
-        relative_entropy_weight=0.0,
-        reference_policy=reference_policy,
-        reference_period=7,
-        relative_entropy_estimator=estimator,
-        **SMALL,
-    )
-    assert_equals_sac(after_updates(algorithm), sac_state)
+@pytest.mark.parametrize(
+    ("reference", "estimator"), [("average", "closed_form"), *((reference, "sampled") for reference in REFERENCES)]
+)
+def test_without_relative_entropy_csac_is_sac(reference, estimator, sac_state):
+    options = {**REFERENCES[reference], "relative_entropy_estimator": estimator}
+    assert_equals_sac(after_updates(CSAC(relative_entropy_weight=0.0, **options, **SMALL)), sac_state)
 
 
-def test_algorithm1_with_the_closed_form_is_sac(sac_state):
-    algorithm = CSAC(
-        relative_entropy_weight=0.5, reference_policy="algorithm1", relative_entropy_estimator="closed_form", **SMALL
-    )
-    assert_equals_sac(after_updates(algorithm), sac_state)
+@pytest.mark.parametrize("reference", REFERENCES)
+def test_with_the_closed_form_csac_is_sac_where_the_actor_is_its_own_reference_alone(reference, sac_state):
+    state = after_updates(CSAC(relative_entropy_weight=0.5, **REFERENCES[reference], **CLOSED_FORM, **SMALL))
+    if reference == "the actor itself":
+        assert_equals_sac(state, sac_state)
+    else:
+        with pytest.raises(AssertionError):
+            assert_equals_sac(state, sac_state)
 
 
-def test_an_adaptive_entropy_weight_is_sac_s_automatic_temperature():
+def test_a_learnt_entropy_weight_is_sac_s_learnt_temperature():
     settings = {**SMALL, "entropy_weight": "auto", "weight_learning_rate": 3e-3}
-    ours = after_updates(CSAC(relative_entropy_weight=0.0, **settings))
-    theirs = after_updates(SAC(**{**SMALL, "entropy_weight": 1.0, "temperature_learning_rate": 3e-3}))
+    ours, theirs = after_updates(CSAC(relative_entropy_weight=0.0, **settings)), after_updates(SAC(**settings))
     assert_equals_sac(ours, theirs)
-    assert abs(float(theirs.log_temperature)) > 0.05
-    assert float(ours.learnt_weights.entropy.log_weight) == pytest.approx(float(theirs.log_temperature), abs=1e-5)
-
-
-@pytest.mark.parametrize("reference_policy", ["previous", "periodic", "average"])
-def test_every_other_reference_policy_changes_what_is_learnt(reference_policy, sac_state):
-    algorithm = CSAC(
-        relative_entropy_weight=0.5,
-        reference_policy=reference_policy,
-        relative_entropy_estimator="closed_form",
-        **SMALL,
-    )
-    with pytest.raises(AssertionError, match="actor"):
-        assert_equals_sac(after_updates(algorithm), sac_state)
+    assert abs(float(theirs.temperature.log_weight)) > 0.05
+    assert_close(ours.learnt_weights.entropy.log_weight, theirs.temperature.log_weight)
 
 
 def best_tanh_gaussian(sigma, tau, mean, log_std):
@@ -209,9 +191,6 @@ class Table(NamedTuple):
     def log_prob(self, noise):
         return self.log_probs[choice(noise)]
 
-    def log_prob_of(self, action):
-        return self.log_probs[choice(jnp.arctanh(action))]
-
 
 def choice(pre_tanh):
     """Which of the actions lies here."""
@@ -239,8 +218,8 @@ def tables(monkeypatch):
 
 
 def actor_of(log_policy):
-    """A network whose outputs are those of this table [state, action]; no network for none."""
-    return log_policy if log_policy is None else lambda observation: log_policy[observation[0].astype(int)]
+    """A network whose outputs are those of this table [state, action]."""
+    return lambda observation: log_policy[observation[0].astype(int)]
 
 
 def critics_of(q):
@@ -274,7 +253,7 @@ def expected_target(algorithm, log_policy, log_reference, q):
             noise[None],
             actor=actor_of(log_policy),
             reference=actor_of(log_reference),
-            target_critics=critics_of(q),
+            targets=critics_of(q),
             weights=weights_of(algorithm),
         )
 
@@ -305,8 +284,6 @@ def iteration(algorithm):
 
     @jax.jit
     def step(q, log_before):
-        if algorithm.relative_entropy_form == "implicit":
-            log_before = None
         log_policy = improve(algorithm, log_before, q)
         value = -expected_loss(algorithm, log_policy, log_before, q)
         return log_policy, value, expected_target(algorithm, log_policy, log_before, q)
@@ -314,11 +291,11 @@ def iteration(algorithm):
     return step
 
 
-def iterate(sigma, tau, iterations, estimator: Any = "sampled", first_q=FIRST_Q, **options):
+def iterate(sigma, tau, iterations, estimator: Any = "sampled", **options):
     """CSAC's own equations, exactly: yields (Q_k, log π_k, V_k).
 
     The actor descends towards π_k with π_(k-1) as its reference, and the critic's target is taken with π_k against
-    π_(k-1). Without a reference, in the implicit form, what is yielded as Q_k is P_k.
+    π_(k-1).
     """
     algorithm = CSAC(
         entropy_weight=sigma,
@@ -330,7 +307,7 @@ def iterate(sigma, tau, iterations, estimator: Any = "sampled", first_q=FIRST_Q,
     step = iteration(algorithm)
     iterates = []  # and not one by one: between two of a generator's, float64 would stay on for everybody
     with jax.enable_x64(True):
-        q, log_policy = jnp.array(first_q), jnp.array(FIRST_POLICY)
+        q, log_policy = jnp.array(FIRST_Q), jnp.array(FIRST_POLICY)
         for _ in range(iterations):
             before = q
             log_policy, value, q = step(q, log_policy)
@@ -387,33 +364,6 @@ def test_in_the_actor_alone_the_relative_entropy_ends_there_too_by_another_way(t
     np.testing.assert_allclose(np.exp(restrained[-1][1]), softmax(expected / sigma, axis=1), atol=1e-8)
     both = iterate(sigma, tau, 3, "closed_form")
     assert np.all(restrained[1][0] > both[1][0] + 1e-3), "the first value has no penalty"
-
-
-@pytest.mark.usefixtures("tables")
-@pytest.mark.parametrize(("sigma", "tau"), [(0.2, 0.5), (0.2, 5.0), (0.0, 0.5), (0.2, 0.0)])
-def test_the_implicit_form_goes_the_same_way_without_a_reference(sigma, tau):
-    # Its critics learn the preference P_k = Q_k + τ log π_(k-1) (Eq. actor_update_3). From Q_(k+1)'s target,
-    #   P_(k+1) = r + τ log π_k(a|s) + γ E[P_k - (σ + τ) log π_k],
-    # which is M-RL (Vieillard et al. 2020) with the temperature τ + σ and α = τ / (τ + σ).
-    explicit = iterate(sigma, tau, 40)
-    first = FIRST_Q + tau * FIRST_POLICY
-    implicit = iterate(sigma, tau, 40, relative_entropy_form="implicit", first_q=first)
-    log_before = FIRST_POLICY
-    for (q, log_policy, value), (preference, same_policy, same_value) in zip(explicit, implicit, strict=True):
-        np.testing.assert_allclose(preference, q + tau * log_before, atol=1e-8)
-        np.testing.assert_allclose(np.exp(same_policy), np.exp(log_policy), atol=1e-8)
-        np.testing.assert_allclose(same_value, value, atol=1e-8)
-        log_before = log_policy
-
-
-@pytest.mark.usefixtures("tables")
-@pytest.mark.parametrize("tau", [0.05, 0.5, 5.0])
-def test_the_implicit_fixed_point_is_that_of_sac(tau):
-    sigma = 0.2
-    *_, (preference, log_policy, _) = iterate(sigma, tau, 1000, relative_entropy_form="implicit")
-    expected = soft_value_iteration(sigma)
-    np.testing.assert_allclose(np.exp(log_policy), softmax(expected / sigma, axis=1), atol=1e-8)
-    np.testing.assert_allclose(preference - tau * log_policy, expected, atol=1e-8)
 
 
 @pytest.mark.usefixtures("tables")

@@ -42,22 +42,6 @@ def test_log_prob_is_the_change_of_variables():
     assert float(POLICY.log_prob(noise_of(POLICY, pre_tanh))) == pytest.approx(float(expected), abs=1e-5)
 
 
-def test_log_prob_of_an_action_is_that_of_the_noise_it_comes_of():
-    noise = jnp.array([0.7, -1.1, 0.4])
-    assert float(POLICY.log_prob_of(POLICY.sample(noise))) == pytest.approx(float(POLICY.log_prob(noise)), abs=1e-3)
-
-
-@pytest.mark.parametrize("action", [-1.0, 1.0])
-def test_log_prob_of_a_saturated_action_is_finite_and_so_is_its_slope(action):
-    # atanh(1 - 1e-6) = 7.254: the slope of log N(7.254; 0, 1) in the mean is that.
-    def log_prob(mean):
-        return TanhGaussian(mean, jnp.zeros(1)).log_prob_of(jnp.array([action]))
-
-    value, slope = jax.value_and_grad(log_prob)(jnp.zeros(1))
-    assert np.isfinite(value)
-    assert float(slope[0]) == pytest.approx(7.254 * action, abs=0.05)
-
-
 @pytest.mark.parametrize("policy", [NARROW, WIDE])
 def test_the_density_of_the_action_integrates_to_one(policy):
     assert np.exp(log_density(policy)) @ WIDTHS == pytest.approx(1.0, abs=1e-4)

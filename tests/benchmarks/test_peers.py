@@ -103,8 +103,9 @@ needs_peers = pytest.mark.skipif(not Path(peers.PYTHON).exists(), reason="the pe
 @pytest.mark.slow
 @needs_peers
 @pytest.mark.parametrize("library", ["sb3", "sbx"])
-def test_a_peer_is_measured(library):
-    case = next(case for case in CASES if case.library == library and case.algorithm == "sac")
+def test_a_peer_is_measured(library, monkeypatch):
+    monkeypatch.delenv("JAX_NUMPY_RANK_PROMOTION")  # the peers promote
+    case = next(case for case in CASES if case.library == library and case.cores == 1)
     (row,) = measure(case, Options(quick=True))
     assert row["steps"] >= 50
     assert row["steps_per_second"] > 0

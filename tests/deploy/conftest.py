@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from artefacts import FORMATS, HAS_COMPILER
 
-from csac.deploy.artefact_contract import Format
+from csac.deploy.artefact import Format
 
 
 @pytest.fixture(params=FORMATS)

@@ -7,28 +7,20 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from artefacts import WITHOUT_ABSOLUTE_SLEEP
+from artefacts import leave
 from policies import algorithm_policy, contract, random_policy
 
-from csac.deploy.artefact_contract import ArtefactContract
 from csac.deploy.guards import make_guards
-from csac.deploy.writing import write_artefact
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "deploy"
 
 
-def leave(folder, policy, format):
-    folder.mkdir()
-    guards = make_guards(policy.contract, fallback="zero")
-    write_artefact(
-        folder, policy.network, ArtefactContract(policy.contract, format, control_rate=1000.0, guards=guards)
-    )
-    return folder
+def left(folder, policy, format):
+    return leave(folder, policy, format, make_guards(policy.contract, fallback="zero"), control_rate_hz=1000.0)
 
 
 def check_loop(command, policy):
@@ -48,28 +40,15 @@ def check_loop(command, policy):
 @pytest.mark.parametrize("algorithm", ["csac", "sd3", "ppo"])
 def test_the_loop_in_c(tmp_path, algorithm):
     policy = algorithm_policy(algorithm)
-    folder, program = leave(tmp_path / "c", policy, "c"), tmp_path / "control_loop"
+    folder, program = left(tmp_path / "c", policy, "c"), tmp_path / "control_loop"
     strict = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
     subprocess.run(["cc", *strict, "-I", folder, EXAMPLES / "control_loop.c", "-o", program, "-lm"], check=True)
     check_loop([program], policy)
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
-def test_the_loop_in_c_sleeps_where_nobody_can_sleep_until_a_time(tmp_path):
-    """As on macOS."""
-    policy = algorithm_policy("csac")
-    folder, program, source = leave(tmp_path / "c", policy, "c"), tmp_path / "control_loop", tmp_path / "loop.c"
-    source.write_text(WITHOUT_ABSOLUTE_SLEEP + (EXAMPLES / "control_loop.c").read_text())
-    strict = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
-    subprocess.run(["cc", *strict, "-I", folder, source, "-o", program, "-lm"], check=True)
-    began = time.perf_counter()
-    check_loop([program], policy)
-    assert time.perf_counter() - began > 0.019  # 20 steps at 1,000 Hz
-
-
 def test_the_loop_in_python(tmp_path):
     policy = algorithm_policy("csac")
-    folder = leave(tmp_path / "numpy", policy, "numpy")
+    folder = left(tmp_path / "numpy", policy, "numpy")
     alone = [sys.executable, "-I", "-c", "import sys, runpy; sys.modules['csac'] = sys.modules['jax'] = None; "]
     alone[-1] += f"sys.argv = ['control_loop.py', {str(folder)!r}]; "
     alone[-1] += f"runpy.run_path({str(EXAMPLES / 'control_loop.py')!r}, run_name='__main__')"
@@ -79,10 +58,8 @@ def test_the_loop_in_python(tmp_path):
 def test_the_node_without_ros(tmp_path):
     """Its robot's sensors fall silent after half of the time; two tenths of a second later the fallback stands in."""
     agreement = dataclasses.replace(contract(((None, (3,)),), (1,), -2.0, 2.0), task="Pendulum-v1")
-    folder = tmp_path / "numpy"
-    folder.mkdir()
-    guards, policy = make_guards(agreement, fallback="1.5"), random_policy(agreement)
-    write_artefact(folder, policy.network, ArtefactContract(agreement, "numpy", control_rate=20.0, guards=guards))
+    guards = make_guards(agreement, fallback="1.5")
+    folder = leave(tmp_path / "numpy", random_policy(agreement), "numpy", guards, control_rate_hz=20.0, provenance={})
     command = [sys.executable, EXAMPLES / "ros2_node.py", folder, "--seconds", "1"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -93,13 +70,11 @@ def test_the_node_without_ros(tmp_path):
 
 
 def test_the_node_s_robot_is_the_task_with_its_arguments_and_all_parts_of_its_observation(tmp_path):
-    parts, folder = (("angle", (2,)), ("speed", (1,))), tmp_path / "numpy"
+    parts = (("angle", (2,)), ("speed", (1,)))
     agreement = dataclasses.replace(contract(parts, (1,), -2.0, 2.0), task="node_task:Parts-v0")
-    folder.mkdir()
     guards, policy = make_guards(agreement, fallback="1.5"), random_policy(agreement)
-    told = {"environment_arguments": {"angle": 0.25}}
-    artefact = ArtefactContract(agreement, "numpy", control_rate=20.0, guards=guards, provenance=told)
-    write_artefact(folder, policy.network, artefact)
+    facts = {"control_rate_hz": 20.0, "provenance": {"environment_arguments": {"angle": 0.25}}}
+    folder = leave(tmp_path / "numpy", policy, "numpy", guards, **facts)
     (tmp_path / "node_task.py").write_text(
         "import gymnasium, numpy as np\n"
         "class Parts(gymnasium.Env):\n"
@@ -120,9 +95,7 @@ def test_the_node_s_robot_is_the_task_with_its_arguments_and_all_parts_of_its_ob
 
 
 def test_the_node_wants_a_fallback(tmp_path):
-    agreement, folder = contract(), tmp_path / "numpy"
-    folder.mkdir()
-    write_artefact(folder, random_policy(agreement).network, ArtefactContract(agreement, "numpy"))
+    folder = leave(tmp_path / "numpy", random_policy(contract()), "numpy")
     done = subprocess.run([sys.executable, EXAMPLES / "ros2_node.py", folder], capture_output=True, text=True)
     assert done.returncode == 1
     assert done.stderr == "export the policy with --fallback: a topic that falls silent has to mean something\n"

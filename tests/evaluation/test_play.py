@@ -17,7 +17,7 @@ from csac.cli import main
 from csac.deploy.contract import Contract
 from csac.evaluation import play as playing
 from csac.evaluation.play import evaluate_run, play
-from csac.record.tables import read_rows
+from csac.record.csv_tables import read_rows
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.types import InputError
@@ -63,9 +63,7 @@ def run_of(tmp_path):
         if task not in gymnasium.registry:
             gymnasium.register(task, entry_point=f"{__name__}:Stripes", max_episode_steps=steps)
         run = RunDirectory.create(tmp_path / "run", Manifest(task=task, algorithm="csac", seeds=(0,), steps=9))
-        run.contract.parent.mkdir()
-        agreement.save(run.contract)
-        random_policy(agreement).save_layers(run.policy(0))
+        random_policy(agreement).write(run.policy(0))
         return run
 
     return make
@@ -91,22 +89,9 @@ def test_play_breaks_off_an_episode_that_never_ends(run_of, tmp_path, monkeypatc
     assert told[-1] == (5, 5)
 
 
-@pytest.mark.parametrize(
-    ("agreement", "message"),
-    [
-        (
-            contract(((None, (3,)),)),
-            r"trained on observations \(3,\) and actions \(1,\); Stripes-v3 has \(2,\) and \(1,\)",
-        ),
-        (
-            contract(action_shape=(2,)),
-            r"trained on observations \(2,\) and actions \(2,\); Stripes-v3 has \(2,\) and \(1,\)",
-        ),
-    ],
-)
-def test_a_task_whose_spaces_have_changed_is_not_played(run_of, tmp_path, agreement, message):
-    with pytest.raises(InputError, match=message):
-        list(play(run_of(3, agreement).path, video=tmp_path / "film.mp4"))
+def test_a_task_whose_spaces_have_changed_is_not_played(run_of, tmp_path):
+    with pytest.raises(InputError, match=r"trained on observations \(2,\) and actions \(2,\); Stripes-v3 has"):
+        list(play(run_of(3, contract(action_shape=(2,))).path, video=tmp_path / "film.mp4"))
     assert not (tmp_path / "film.mp4").exists()
 
 
@@ -123,16 +108,14 @@ def test_what_is_played_is_what_is_evaluated(run_of, tmp_path):
     assert expected == pytest.approx(0.125 + 0.375 * inside[0])
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"), [("x" * 251 + ".mp4", "File name too long"), ("file/film.mp4", "Not a directory")]
-)
-def test_a_video_that_cannot_be_is_refused_before_the_episodes(run_of, tmp_path, name, reason):
+@pytest.mark.parametrize("name", ["x" * 251 + ".mp4", "file/film.mp4", "film.avi"])
+def test_a_video_that_cannot_be_is_refused_before_the_episodes(run_of, tmp_path, name):
     """The first has a name that is short enough, but for what is put before it until the video is whole."""
     (tmp_path / "file").touch()
     del ACTIONS[:]
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=name) as caught:
         list(play(run_of(3).path, video=tmp_path / name))
-    assert str(caught.value) == f"cannot write {tmp_path / name}: {reason}; choose another place or name"
+    assert "\n" not in str(caught.value)
     assert ACTIONS == []
 
 
@@ -149,34 +132,26 @@ def test_a_folder_that_goes_meanwhile_is_told_in_one_line(run_of, tmp_path):
     gc.collect()
 
 
-@pytest.mark.parametrize(
-    ("folder_goes", "reason"),
-    [(True, "No such file or directory"), (False, "ffmpeg broke off, for the reason that it gave above")],
-)
-def test_an_ffmpeg_that_ends_is_told_in_one_line(run_of, tmp_path, monkeypatch, folder_goes, reason):
-    def broken(path, shape, frames_per_second):
-        def frames():
-            yield
-            if folder_goes:
-                path.parent.rmdir()
-            raise OSError("[Errno 32] Broken pipe\n\nFFMPEG COMMAND:\nffmpeg -y\n\nFFMPEG STDERR OUTPUT:\n")
+@pytest.mark.parametrize("breaks", [True, False])
+def test_an_ffmpeg_that_ends_is_told_in_one_line(run_of, tmp_path, monkeypatch, breaks):
+    def write_frames(*_, **__):
+        while True:
+            if (yield) is not None and breaks:
+                raise OSError("[Errno 32] Broken pipe\n\nFFMPEG COMMAND:\nffmpeg -y\n\nFFMPEG STDERR OUTPUT:\n")
 
-        writer = frames()
-        next(writer)
-        return writer
-
-    monkeypatch.setattr(playing, "_open_video", broken)
-    film = tmp_path / "films" / "film.mp4"
+    monkeypatch.setattr("imageio_ffmpeg.write_frames", write_frames)
+    film = tmp_path / "film.mp4"
     with pytest.raises(InputError) as caught:
         list(play(run_of(3).path, video=film))
-    assert str(caught.value) == f"cannot write {film}: {reason}; choose another place"
+    assert str(caught.value) == f"cannot write {film}: ffmpeg failed; choose another place"
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 def test_the_policy_of_the_best_evaluation_can_be_tested_and_watched(run_of, tmp_path, monkeypatch):
     """Its rows are of the step at which it was saved."""
     run = run_of(3)
-    best = random_policy(contract(), 5)
-    best.save_layers(run.policy(0, "best"))
+    best = random_policy(contract(), 5, step=6)
+    best.write(run.policy(0, "best"))
     run.append("evaluations", [evaluation(step, value) for step, value in ((3, 1.0), (6, 8.0), (9, 2.0))])
     (expected,) = best.contract.to_environment(best.act(np.zeros((1, 2), np.float32)))[0]
     monkeypatch.chdir(tmp_path)
@@ -204,8 +179,8 @@ def test_the_best_policies_of_a_run_are_those_of_the_seeds_that_were_evaluated(r
         list(evaluate_run(run.path, episodes=1, processes=1, which="best"))
     run.update_manifest(seeds=(0, 1), failures={1: "step 5: it broke"})
     for which in ("last", "best"):
-        random_policy(contract()).save_layers(run.policy(0, which))
-    random_policy(contract()).save_layers(run.policy(1))
+        random_policy(contract()).write(run.policy(0, which))
+    random_policy(contract()).write(run.policy(1))
     run.append("evaluations", [{"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 3}])
     assert [seed for seed, _ in evaluate_run(run.path, episodes=1, processes=1, which="best")] == [0]
     assert main(["evaluate", str(run.path), "--checkpoint", "best", "--episodes", "1", "--processes", "1"]) == 0

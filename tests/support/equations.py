@@ -15,7 +15,7 @@ from csac.algorithms.adaptation import Weights
 from csac.algorithms.networks import MLP
 from csac.types import Layer, Spec, Transition
 
-ONE = Spec(1, 1)
+ONE, SPEC = Spec(1, 1), Spec(3, 2)
 
 
 def linear(weight: list[list[float]], bias: list[float]) -> MLP:
@@ -37,9 +37,42 @@ def batch_of(*transitions: Transition) -> Transition:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *transitions)
 
 
+def transitions(size: int, key: int = 0, shift: float = 0.0, scale: float = 1.0) -> Transition:
+    """Random ones of SPEC, one of them terminal, whose states have this mean and standard deviation."""
+    draw = np.random.default_rng(key)
+    states = (shift + scale * draw.normal(size=(2, size, 3))).astype(np.float32)
+    actions, rewards = np.tanh(draw.normal(size=(size, 2))), draw.normal(size=size)
+    terminated = np.arange(size) == 3
+    floats = (array.astype(np.float32) for array in (actions, rewards, terminated))
+    action, reward, terminated = floats
+    return Transition(states[0], action, reward, states[1], terminated, np.zeros(size, np.float32))
+
+
 @partial(jax.jit, static_argnums=0)
 def update(algorithm, state, batch: Transition, step: int = 0):
     return algorithm.update(state, batch, jax.random.key(step), step)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def begin(algorithm, spec: Spec = ONE):
+    return algorithm.init(jax.random.key(0), spec, 1000)
+
+
+def assert_equal(one: Any, other: Any) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def assert_close(one: Any, other: Any, rtol: float = 1e-4, atol: float = 1e-5) -> None:
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=rtol, atol=atol), one, other)
+
+
+def differ(one: Any, other: Any) -> bool:
+    return any(not np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (one, other)), strict=True))
+
+
+def share_no_buffer(state: Any) -> bool:
+    pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state)]
+    return len(set(pointers)) == len(pointers)
 
 
 # Policy tanh(N(0, 1)), reference tanh(N(1, 2²)), noise 0.5, so u = 0.5, a = tanh 0.5 = 0.4621172, 1 - a² = 0.7864477.
@@ -54,6 +87,13 @@ CRITICS = (linear([[1.0], [2.0]], [0.0]), linear([[0.0], [-1.0]], [3.0]))
 
 CLOSED_FORM: dict[str, Any] = {"relative_entropy_estimator": "closed_form"}
 PERIODIC: dict[str, Any] = {"reference_policy": "periodic", **CLOSED_FORM}
+PREVIOUS: dict[str, Any] = {"reference_policy": "average", "reference_rate": 1.0, **CLOSED_FORM}  # one update ago
+REFERENCES: dict[str, dict[str, Any]] = {
+    "the actor itself": {"reference_policy": "periodic", "reference_period": 1},
+    "one update ago": {"reference_policy": "average", "reference_rate": 1.0},
+    "periodic": {"reference_policy": "periodic", "reference_period": 3},
+    "average": {"reference_policy": "average", "reference_rate": 0.25},
+}
 
 
 def csac(**settings) -> CSAC:

@@ -43,8 +43,8 @@ def random_network(spec: Spec, width: int = 8, seed: int = 0) -> PolicyNetwork:
     return PolicyNetwork(PolicyParameters((layers,)))
 
 
-def random_policy(contract: Contract, seed: int = 0) -> Policy:
-    return Policy(random_network(contract.spec, seed=seed), contract)
+def random_policy(contract: Contract, seed: int = 0, step: int | None = None) -> Policy:
+    return Policy(random_network(contract.spec, seed=seed), contract, step=step)
 
 
 ALGORITHMS = ("csac", "sac", "td3", "sd3", "ppo")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import os
 import re
 import subprocess
 import sys
@@ -22,9 +22,9 @@ from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED, SeedEnviron
 from csac.types import InputError, Spec
 
 UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)
-NUMBERED: Any = {1: UNIT, 2: UNIT}
-PARTLY_NUMBERED: Any = {"a": UNIT, 1: UNIT}
+NUMBERED: Any = {"a": UNIT, 1: UNIT}
 DISORDERED = spaces.Dict(OrderedDict(z=UNIT, a=spaces.Box(-9, 9, (1, 2)), m=spaces.Box(-9, 9, ())))
+NAN, INF = float("nan"), float("inf")
 
 
 class Scripted(gymnasium.Env):
@@ -59,84 +59,36 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
 
 
 @pytest.mark.parametrize(
-    ("task", "message"),
-    [
-        ("HalfCheeta-v4", "no task is called HalfCheeta-v4: did you mean HalfCheetah-v4"),
-        ("halfcheetah-V4", "did you mean HalfCheetah-v4"),
-        ("HalfCheetah", r"did you mean HalfCheetah-v4 or HalfCheetah-v5\?"),
-        ("HalfCheetah-v3", r"did you mean HalfCheetah-v4 or HalfCheetah-v5\?"),
-        ("Nothing/Like-this-v7", "write module:Id"),
-        ("", "write module:Id"),
-        ("no_such_module:Task-v0", "the module no_such_module cannot be imported: ModuleNotFoundError"),
-        ("probes:ConstantRewards-v0", "did you mean probes:ConstantReward-v0"),
-        ("probes:Endless", r"did you mean probes:Endless-v0\?"),
-        ("probes:Xyzzy-v0", r"probes registers probes:ConstantReward-v0, (probes:\w+-v0, ){4}\.\.\."),
-        ("os:Pendulm-v1", "did you mean Pendulum-v1 or"),
-        ("CartPole-v1", r"CartPole-v1: the action space is Discrete\(2\)"),
-        (lambda: 3, "returned 3: a task's callable returns a gymnasium.Env"),
-        (probes.Endless(), r"already made \(Endless\).*a function that makes one"),
-        (gymnasium.wrappers.TimeLimit(probes.Endless(), 3), r"already made \(TimeLimit\)"),
-        (5, "a Gymnasium id or a function that makes an environment, not 5"),
-        (None, "a Gymnasium id or a function"),
-        (gymnasium.wrappers.TimeLimit, "TimeLimit could not be made: TypeError"),
-    ],
-)
-def test_a_task_that_cannot_be_learnt_is_refused(task, message):
-    with pytest.raises(InputError, match=message) as refusal:
-        Environment(task)
-    assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize(
     ("name", "space", "message"),
     [
         ("action_space", spaces.Box(-np.inf, np.inf, (2,)), "infinite bounds"),
         ("action_space", spaces.Box(-1e300, 1e300, (2,), np.float64), "infinite bounds"),
-        ("action_space", spaces.Box(np.array([-1.0, -np.inf]), np.ones(2), dtype=np.float64), "infinite bounds"),
         ("action_space", spaces.Box(0, 5, (2,), np.int64), "continuous"),
         ("action_space", spaces.MultiDiscrete([2, 3]), "continuous"),
-        ("action_space", spaces.Tuple([UNIT]), "continuous"),
-        ("action_space", spaces.Box(-1.0, 1.0, (0,)), "empty"),
-        ("observation_space", spaces.Discrete(4), "a Discrete and csac takes Boxes.*FlattenObservation"),
-        ("observation_space", spaces.Tuple([UNIT]), "a Tuple"),
-        ("observation_space", spaces.Dict(a=spaces.Dict(b=UNIT)), r"observation\['a'\] is a Dict"),
-        ("observation_space", spaces.Dict(a=spaces.Text(3)), r"observation\['a'\] is a Text"),
+        ("action_space", spaces.Box(-1.0, 1.0, (0,)), "continuous"),
+        ("action_space", None, "continuous"),
+        ("observation_space", spaces.Discrete(4), "Discrete.*FlattenObservation"),
+        ("observation_space", spaces.Dict(a=spaces.Dict(b=UNIT)), r"observation\['a'\] is a .*Dict"),
         ("observation_space", spaces.Box(0, 255, (8, 8, 3), np.uint8), "image"),
-        ("observation_space", spaces.Dict(camera=spaces.Box(0, 255, (8, 8, 3), np.uint8)), "camera.*image"),
         ("observation_space", spaces.Dict(), "empty"),
         ("observation_space", spaces.Box(-1.0, 1.0, (0,)), "empty"),
-        ("observation_space", spaces.Dict(a=UNIT, b=spaces.Box(-1.0, 1.0, (0,))), r"observation\['b'\] is empty"),
-        ("observation_space", spaces.Dict(NUMBERED), "the key 1, which is no text"),
-        ("observation_space", spaces.Dict(PARTLY_NUMBERED), "the key 1, which is no text"),
+        ("observation_space", spaces.Dict(NUMBERED), r"observation\[1\]"),
+        ("observation_space", type("Box", (), {"__module__": "gym.spaces.box"})(), r"gym\.spaces\.box\.Box"),
     ],
 )
 def test_a_space_that_cannot_be_learnt_is_refused(name, space, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=f"Scripted: .*{message}"):
         scripted(**{name: space})
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({}, "gives no observation_space: AttributeError"),
-        ({"observation_space": UNIT}, "gives no action_space: AttributeError"),
-        ({"observation_space": UNIT, "action_space": None}, "action_space is a NoneType of the module builtins"),
-        (
-            {"observation_space": type("Box", (), {"__module__": "gym.spaces.box"})()},
-            "observation_space is a Box of the module gym.spaces.box, and csac takes spaces of gymnasium",
-        ),
-    ],
-)
-def test_an_environment_without_a_space_of_gymnasium_is_refused_and_closed(given, message):
+def test_an_environment_without_a_space_is_refused_and_closed():
     closed = []
 
     class Bare(gymnasium.Env):
         def close(self):
             closed.append(True)
 
-    for name, space in given.items():
-        setattr(Bare, name, space)
-    with pytest.raises(InputError, match=f"Bare: .*{message}"):
+    with pytest.raises(InputError, match=r"Bare: .*observation_space"):
         Environment(Bare)
     assert closed
 
@@ -154,56 +106,13 @@ def test_the_advice_for_actions_without_bounds_works():
     np.testing.assert_array_equal(bounded.raw.unwrapped.actions, [[0.5, -1.0]])  # pyright: ignore
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [({"colour": "red"}, "unexpected keyword argument 'colour'"), ({"at": 1, "where": []}, "unhashable")],
-)
-def test_arguments_that_the_environment_refuses(arguments, message):
-    class Choosy(probes.Failing):
-        def __init__(self, at: int = 1, where: Any = "step") -> None:
-            super().__init__(at=at, where=where)
-            self.count[where] = 0
-
-    with pytest.raises(InputError, match=f"Choosy could not be made with the arguments.*{message}"):
-        Environment(Choosy, arguments)
-
-
 def test_a_render_mode_that_the_task_lacks_is_refused():
-    with pytest.raises(InputError, match="no render mode 'hologram': it has human, rgb_array"):
+    with pytest.raises(InputError, match="'hologram': it has human, rgb_array"):
         Environment("Pendulum-v1", render_mode="hologram")
     assert Environment("Pendulum-v1", render_mode="rgb_array").raw.render_mode == "rgb_array"
 
 
-def test_a_module_that_breaks_is_an_input_error(tmp_path, monkeypatch):
-    (tmp_path / "broken_tasks.py").write_text("1 / 0\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(InputError, match="broken_tasks cannot be imported: ZeroDivisionError: division by zero"):
-        Environment("broken_tasks:Task-v0")
-
-
 # What an environment is
-
-
-@pytest.mark.parametrize(
-    ("task", "name"),
-    [
-        ("Pendulum-v1", "Pendulum-v1"),
-        ("probes:Endless-v0", "probes:Endless-v0"),
-        (probes.Endless, "Endless"),
-        (functools.partial(gymnasium.make, "Pendulum-v1"), "Pendulum-v1"),
-        (lambda: probes.Endless(), "Endless"),
-    ],
-)
-def test_every_task_has_a_name(task, name):
-    assert Environment(task).task_name == name
-
-
-def test_a_module_is_imported_for_its_tasks(tmp_path, monkeypatch):
-    (tmp_path / "my_tasks.py").write_text(
-        "import gymnasium, probes\ngymnasium.register('Mine-v3', entry_point=probes.Endless, max_episode_steps=2)\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    assert Environment("my_tasks:Mine-v3", {"length": 7}).raw.unwrapped.length == 7  # pyright: ignore
 
 
 @pytest.mark.parametrize(
@@ -218,11 +127,9 @@ def test_the_paper_tasks_have_the_paper_sizes(task, spec):
     ("space", "observation", "flat"),
     [
         (spaces.Box(-9, 9, (2,), np.float64), np.array([1.0, 2.0]), [1, 2]),
-        (spaces.Box(-9, 9, (2,), np.float32), [1, 2.5], [1, 2.5]),
         (spaces.Box(-9, 9, (), np.float32), 3.5, [3.5]),
         (spaces.Box(-9, 9, (2, 2), np.float16), np.array([[1, 2], [3, 4]], np.float16), [1, 2, 3, 4]),
         (spaces.Box(0, 255, (2,), np.uint8), np.array([255, 255], np.uint8), [255, 255]),
-        (spaces.Box(-9, 9, (2,), np.int64), np.array([3, -4]), [3, -4]),
         (spaces.Box(-np.inf, np.inf, (2,), np.float64), np.array([1e30, -1e30]), [1e30, -1e30]),
         (DISORDERED, {"m": 4.0, "z": [1.0], "a": [[2.0, 3.0]]}, [2, 3, 4, 1]),
     ],
@@ -246,13 +153,13 @@ def test_an_array_that_the_environment_reuses_is_copied():
     assert first[0] == 1.0
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (6,), (2, 3)])
+@pytest.mark.parametrize("shape", [(), (6,), (2, 3)])
 def test_actions_reach_the_environment_in_its_shape_and_bounds(shape):
     low, high = np.full(shape, -1.0, np.float32), np.full(shape, 3.0, np.float32)
     environment = scripted(action_space=spaces.Box(low, high))
     environment.step(np.linspace(-1, 1, max(1, int(np.prod(shape))), dtype=np.float32))
     (action,) = environment.raw.unwrapped.actions  # pyright: ignore
-    expected = np.linspace(-1, 3, 6).reshape(shape) if shape in ((6,), (2, 3)) else np.full(shape, -1.0)
+    expected = np.linspace(-1, 3, 6).reshape(shape) if shape else -1.0
     np.testing.assert_allclose(action, expected, rtol=1e-6)
     assert action.shape == shape
     assert action.dtype == np.float32
@@ -276,15 +183,7 @@ def test_bounds_between_which_no_float32_lies_are_the_nearest(width):
     np.testing.assert_array_equal(parts.action_high, np.array([0.1, 1.0], np.float32))
 
 
-def test_both_scales_are_one_environment():
-    one, other = Environment("Pendulum-v1"), Environment("Pendulum-v1")
-    np.testing.assert_array_equal(one.reset(3), other.reset(3))
-    inside, outside = one.step(np.array([0.25])), other.step_environment_scale(np.array([0.5]))
-    np.testing.assert_array_equal(inside[0], outside[0])
-    assert inside[1:4] == outside[1:4]
-
-
-@pytest.mark.parametrize("reward", [2, 2.0, np.float32(2), np.float64(2), np.array(2.0), np.int64(2)])
+@pytest.mark.parametrize("reward", [2, np.float32(2), np.array(2.0), np.int64(2)])
 def test_rewards_become_floats_and_flags_bools(reward):
     environment = scripted(ending=(np.bool_(True), 1))
     environment.raw.unwrapped.reward = reward  # pyright: ignore
@@ -296,19 +195,14 @@ def test_rewards_become_floats_and_flags_bools(reward):
     assert info == {"note": 1}
 
 
-def test_a_time_limit_can_fall_on_the_terminal_step():
-    arguments = {"max_episode_steps": 1}
-    environment = Environment("probes:ConstantReward-v0", arguments)
+@pytest.mark.parametrize(("task", "ends"), [("ConstantReward", (True, True)), ("DelayedReward", (False, True))])
+def test_a_time_limit_can_fall_on_the_terminal_step(task, ends):
+    environment = Environment(f"probes:{task}-v0", {"max_episode_steps": 1})
     environment.reset(0)
-    assert environment.step(np.zeros(1, np.float32))[2:4] == (True, True)
-    environment = Environment("probes:DelayedReward-v0", arguments)
-    environment.reset(0)
-    assert environment.step(np.zeros(1, np.float32))[2:4] == (False, True)
+    assert environment.step(np.zeros(1, np.float32))[2:4] == ends
 
 
 # What fails
-
-NAN, INF = float("nan"), float("inf")
 
 
 @pytest.mark.parametrize(
@@ -318,9 +212,7 @@ NAN, INF = float("nan"), float("inf")
         (spaces.Box(-9, 9, (2, 2)), np.array([[0, 1], [-INF, 1]]), "observation[1, 0] is -inf"),
         (spaces.Box(-9, 9, ()), np.array(INF), "observation is inf"),
         (spaces.Box(-9, 9, (1,), np.float64), np.array([1e39]), "observation[0] is inf"),
-        (spaces.Box(-9, 9, (3,)), np.zeros(2), "observation has shape (2,) where its space has (3,)"),
         (spaces.Box(-9, 9, (3,)), np.zeros((1, 3)), "observation has shape (1, 3) where its space has (3,)"),
-        (spaces.Box(-9, 9, (3,)), None, "observation has shape () where its space has (3,)"),
         (spaces.Box(-9, 9, (3,)), ["a", "b", "c"], "observation is not an array of numbers"),
         (spaces.Box(-9, 9, (2,)), [[1], [1, 2]], "observation is not an array of numbers"),
         (UNIT, [10**400], "observation is not an array of numbers"),
@@ -338,29 +230,16 @@ def test_a_bad_observation_is_named(space, observation, message):
         environment.reset(0)
 
 
-@pytest.mark.parametrize(
-    ("reward", "message"),
-    [
-        (NAN, "reward is nan"),
-        (-INF, "reward is -inf"),
-        (1e39, r"reward is 1e\+39"),
-        (np.float32(NAN), "reward is nan"),
-        (np.ones(1), r"reward has shape \(1,\)"),
-        (None, "reward is a NoneType"),
-        ("high", "reward is a str"),
-        (10**400, "reward is a whole number that no float can hold"),
-    ],
-)
-def test_a_bad_reward_is_named(reward, message):
+@pytest.mark.parametrize("reward", [NAN, -INF, 1e39, np.ones(1), None, "high", 10**400])
+def test_a_bad_reward_is_named(reward):
     environment = scripted()
     environment.raw.unwrapped.reward = reward  # pyright: ignore
-    with pytest.raises(EnvironmentFailure, match=message):
+    with pytest.raises(EnvironmentFailure, match=r"^reward "):
         environment.step(np.zeros(1, np.float32))
 
 
 @pytest.mark.parametrize(
-    ("action", "message"),
-    [([NAN], r"action\[0\] is nan"), ([0.0, 0.0], r"action has shape \(2,\)"), ([[0.0]], r"shape \(1, 1\)")],
+    ("action", "message"), [([NAN], r"action\[0\] is nan"), ([0.0, 0.0], r"shape \(2,\)"), ([[0.0]], r"shape \(1, 1\)")]
 )
 def test_a_bad_action_never_reaches_the_environment(action, message):
     environment = scripted()
@@ -369,90 +248,28 @@ def test_a_bad_action_never_reaches_the_environment(action, message):
     assert environment.raw.unwrapped.actions == []  # pyright: ignore
 
 
-# What old Gym had, and what is forgotten easily.
-
-
-@pytest.mark.parametrize("wrapped", [False, True])
-@pytest.mark.parametrize(
-    ("given", "told"),
-    [
-        (([0.0], 1.0, False, {}), "not 4: the one `done` of old Gym is terminated or truncated"),
-        (([0.0], 1.0), "not 2"),
-        (None, "not None"),
-    ],
-)
-def test_a_step_that_gives_no_five_values_is_told_what_is_missing(wrapped, given, told):
+@pytest.mark.parametrize("given", [([0.0], 1.0, False, {}), ([0.0], 1.0, False, False, {}, "more"), None])
+def test_a_step_of_another_api_is_a_failure(given):
     class Old(Scripted):
         def step(self, action):
             return given
 
-    environment = Environment(lambda: gymnasium.wrappers.TimeLimit(Old(), 9) if wrapped else Old())
+    environment = Environment(lambda: gymnasium.wrappers.TimeLimit(Old(), 9))
     environment.reset(0)
-    with pytest.raises(EnvironmentFailure) as failure:
+    with pytest.raises(EnvironmentFailure, match=r"^step raised .*unpack"):
         environment.step(np.zeros(1, np.float32))
-    expected = "step must return five values (observation, reward, terminated, truncated, info), "
-    assert str(failure.value) == expected + told
-
-
-def test_more_than_five_values_are_told_as_well():
-    class Generous(Scripted):
-        def step(self, action):
-            return (*super().step(action), "and one more")
-
-    with pytest.raises(EnvironmentFailure, match="step must return five values"):
-        Environment(Generous).step(np.zeros(1, np.float32))
 
 
 @pytest.mark.parametrize(
-    ("space", "given", "told"),
-    [
-        (spaces.Box(-9, 9, (3,)), np.zeros(3), "an array of shape (3,)"),
-        (spaces.Box(-9, 9, (2,)), np.zeros(2), "an array of shape (2,)"),
-        (spaces.Box(-9, 9, (2,)), [0.0, 0.0], "a list of 2"),
-        (spaces.Box(-9, 9, (2,)), (0.0, 0.0), "(float, float)"),
-        (spaces.Dict(a=UNIT, b=UNIT), {"a": [0.0], "b": [0.0]}, "a dict"),
-        (UNIT, None, "None"),
-    ],
+    ("space", "given"), [(spaces.Box(-9, 9, (3,)), np.zeros(3)), (spaces.Box(-9, 9, (2,)), np.zeros(2)), (UNIT, None)]
 )
-def test_a_reset_that_gives_the_observation_alone_is_told(space, given, told):
+def test_a_reset_that_gives_the_observation_alone_is_a_failure(space, given):
     class Old(Scripted):
         def reset(self, *, seed=None, options=None):
             return given
 
-    environment = Environment(lambda: gymnasium.wrappers.TimeLimit(Old(space), 9))
-    with pytest.raises(EnvironmentFailure) as failure:
-        environment.reset(0)
-    expected = f"reset must return (observation, info), not {told}: in old Gym it was the observation alone"
-    assert str(failure.value) == expected
-    statistics = Environment(lambda: gymnasium.wrappers.RecordEpisodeStatistics(Old(UNIT)))  # takes the pair apart
-    with pytest.raises(EnvironmentFailure, match=r"^reset must return \(observation, info\)"):
-        statistics.reset(0)
-
-
-def test_a_reset_that_takes_no_seed_is_refused_before_anything_is_reset():
-    class Seedless(Scripted):
-        def reset(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-            raise AssertionError
-
-    class Optionless(Scripted):
-        def reset(self, seed=None):  # pyright: ignore[reportIncompatibleMethodOverride]
-            return super().reset(seed=seed)
-
-    class Adapter(gymnasium.Wrapper):
-        def reset(self, **_):
-            return [0.0], {}
-
-    hint = r"write it as def reset\(self, \*, seed=None, options=None\)"
-    for task in (Seedless, lambda: gymnasium.wrappers.TimeLimit(Seedless(), 9)):
-        with pytest.raises(InputError, match=f"Seedless: reset takes no seed: {hint}"):
-            Environment(task)
-    with pytest.raises(InputError, match=f"reset takes no options: {hint}"):  # which Gymnasium's wrappers hand on
-        Environment(lambda: gymnasium.wrappers.TimeLimit(Optionless(), 9))
-    for task in (Optionless, lambda: gymnasium.wrappers.TimeLimit(Adapter(Seedless()), 9)):
-        np.testing.assert_array_equal(Environment(task).reset(0), [0.0])
-
-
-# Where it was raised.
+    with pytest.raises(EnvironmentFailure, match="reset"):
+        Environment(lambda: Old(space)).reset(0)
 
 
 @pytest.fixture
@@ -460,7 +277,6 @@ def module(tmp_path, monkeypatch):
     """A user's module, whose environment divides by zero in a helper's function and raises in a library below it."""
     (tmp_path / "divides.py").write_text(
         "import json\n"
-        "import numpy as np\n"
         "import probes\n"
         "class Task(probes.Endless):\n"
         "    def step(self, action):\n"
@@ -469,11 +285,6 @@ def module(tmp_path, monkeypatch):
         "        return 1 / by\n"
         "    def reset(self, *, seed=None, options=None):\n"
         "        json.loads('{')\n"
-        "class Stacks(probes.Endless):\n"
-        "    def step(self, action):\n"
-        "        np.concatenate(\n"
-        "            [np.zeros(1), np.zeros((1, 1))]\n"
-        "        )\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     import divides  # pyright: ignore[reportMissingImports]
@@ -483,22 +294,29 @@ def module(tmp_path, monkeypatch):
 
 
 def test_an_error_is_told_with_its_place_in_the_users_own_code(module):
-    task = Environment(lambda: gymnasium.wrappers.TimeLimit(module.Task(), 9))
-    with pytest.raises(EnvironmentFailure, match=r"^reset raised JSONDecodeError: .* \(divides\.py, line 10\)$"):
+    task = Environment(module.Task)
+    with pytest.raises(EnvironmentFailure, match=r"^reset raised JSONDecodeError: .* \(divides\.py:9\)$"):
         task.reset(0)
-    task.raw._has_reset = True  # pyright: ignore[reportAttributeAccessIssue]
-    task.raw._elapsed_steps = 0  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(EnvironmentFailure) as failure:
+    with pytest.raises(EnvironmentFailure, match=r"^step raised ZeroDivisionError: .* \(divides\.py:7\)$"):
         task.step(np.zeros(1, np.float32))
-    assert str(failure.value) == "step raised ZeroDivisionError: division by zero (divides.py, line 8)"
-    with pytest.raises(EnvironmentFailure, match=r"^step raised ValueError: .* \(divides\.py, line 13\)$"):
-        Environment(module.Stacks).step(np.zeros(1, np.float32))
 
 
-def test_an_error_of_a_library_alone_has_no_place():
-    environment = Environment(lambda: gymnasium.make("Pendulum-v1"))
-    with pytest.raises(EnvironmentFailure, match=r"before calling env\.reset\(\)$"):
-        environment.step(np.zeros(1, np.float32))
+class Unsaid(Exception):
+    def __str__(self) -> str:
+        raise ValueError("nothing")
+
+
+@pytest.mark.parametrize(
+    ("error", "start"),
+    [
+        (RuntimeError("no file \udcff\nhere"), "RuntimeError: no file \\udcff here"),
+        (Unsaid(), "Unsaid: ("),
+        (RuntimeError(), "RuntimeError"),
+    ],
+)
+def test_whatever_an_error_says_can_be_written_down(error, start):
+    assert one_line(error).startswith(start)
+    assert one_line(error).encode()
 
 
 # Several seeds
@@ -509,7 +327,7 @@ def test_each_episode_has_a_reset_seed_of_its_own():
     assert len(set(seeds)) == len(seeds)
     assert min(seeds) > max(EVALUATION_SEED, FRESH_EVALUATION_SEED) + 1_000_000
     assert max(seeds) < 2**31
-    assert training_seed(3, 4) == training_seed(3, 4)
+    assert seeds[:2] == [1_895_069_886, 1_817_441_348]  # for good: an old run resumes with them
 
 
 def test_steps_keep_the_true_final_observation_and_both_flags():
@@ -557,7 +375,7 @@ def test_a_seed_steps_the_same_alone_and_beside_others():
     alone = SeedEnvironments("Hopper-v4", None, [5])
     beside = SeedEnvironments("Hopper-v4", None, [4, 5, 6])
     np.testing.assert_array_equal(alone.reset()[0], beside.reset()[1])
-    actions = np.random.default_rng(0).uniform(-1, 1, (200, 1, 3)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-1, 1, (100, 1, 3)).astype(np.float32)
     for action in actions:
         one, other = alone.step(action), beside.step(np.repeat(action, 3, axis=0))
         np.testing.assert_array_equal(one.next_observation[0], other.next_observation[1])
@@ -572,12 +390,48 @@ def test_a_seed_that_breaks_fails_alone_and_is_not_stepped_again():
     assert before.failures == last.failures == after.failures == []
     ((index, reason, details),) = broken.failures
     assert index == 1
-    assert re.fullmatch(r"step raised RuntimeError: the simulator broke \(probes\.py, line \d+\)", reason)
+    assert re.fullmatch(r"step raised RuntimeError: the simulator broke \(probes\.py:\d+\)", reason)
     assert "maybe_fail" in details
     assert environments.alive.tolist() == [True, False, True]
     raws = [environment.raw.unwrapped for environment in environments.environments]
     assert [raw.count["step"] for raw in raws] == [4, 3, 4]  # pyright: ignore
     assert [episode.place for episode in broken.episodes] == [0, 2]
+
+
+class Panic(BaseException):
+    """What an extension written in Rust raises."""
+
+
+class Panicking(probes.Failing):
+    error: BaseException = Panic("index out of bounds")
+
+    def maybe_fail(self, where: str) -> None:
+        try:
+            super().maybe_fail(where)
+        except RuntimeError:
+            raise self.error from None
+
+
+@pytest.mark.parametrize("where", ["step", "reset"])
+@pytest.mark.parametrize("error", [Panic("index out of bounds"), SystemExit(7)])
+def test_a_panic_and_an_exit_fail_their_seed_alone(monkeypatch, where, error):
+    monkeypatch.setattr(Panicking, "error", error)
+    arguments = {"where": where, "seeds": [training_seed(0, 0)]}
+    environments = SeedEnvironments(Panicking, arguments, [0, 1])
+    environments.reset()
+    failures = [failure for step in steps_of(environments, 2) for failure in step.failures]
+    assert [(failure.place, failure.reason.partition(":")[0]) for failure in failures] == [
+        (0, f"{where} raised {type(error).__name__}")
+    ]
+    assert environments.alive.tolist() == [False, True]
+
+
+def test_a_keyboard_interrupt_is_nobodys_failure(monkeypatch):
+    monkeypatch.setattr(Panicking, "error", KeyboardInterrupt())
+    environments = SeedEnvironments(Panicking, {}, [0])
+    environments.reset()
+    with pytest.raises(KeyboardInterrupt):
+        steps_of(environments, 1)
 
 
 @pytest.mark.parametrize(
@@ -601,12 +455,9 @@ def test_a_seed_that_fails_in_its_first_reset_is_reported_by_the_first_step():
     environments.reset()
     assert environments.alive.all()
     first, second = steps_of(environments, 2)
-    assert [(failure.place, failure.reason.partition(" (")[0]) for failure in first.failures] == [
-        (0, "reset raised RuntimeError: the simulator broke"),
-        (1, "reset raised RuntimeError: the simulator broke"),
-    ]
+    assert [failure.place for failure in first.failures] == [0, 1]
     assert second.failures == []
-    assert not environments.alive.any()
+    assert not environments.is_any_alive
 
 
 def test_a_seed_that_fails_in_a_later_reset_has_finished_its_episode():
@@ -614,8 +465,7 @@ def test_a_seed_that_fails_in_a_later_reset_has_finished_its_episode():
     environments.reset()
     *_, last = steps_of(environments, 3)
     assert last.episodes == [(0, 3.0, 3)]
-    (failure,) = last.failures
-    assert failure.reason.startswith("reset raised RuntimeError: the simulator broke")
+    assert [failure.place for failure in last.failures] == [0]
     assert environments.alive.tolist() == [False]
 
 
@@ -628,22 +478,26 @@ def test_a_stopped_seed_steps_no_more():
     assert [failure.place for failure in second.failures] == [1]
 
 
-@pytest.mark.parametrize("wrapper", ["NormalizeObservation", "NormalizeReward"])
-def test_a_wrapper_that_learns_by_itself_is_told_once(wrapper, caplog, monkeypatch):
-    monkeypatch.setattr("csac.tasks.environment._said", set())
+# What an environment does to the process that it is in
 
-    def wrapped() -> gymnasium.Env:
-        environment = getattr(gymnasium.wrappers, wrapper)(probes.Endless())
-        return gymnasium.wrappers.TimeLimit(environment, 9)
 
-    for _ in range(3):
-        Environment(wrapped).close()
-    Environment(lambda: gymnasium.wrappers.RecordEpisodeStatistics(probes.Endless()))
+@pytest.mark.parametrize("exits", [False, True])
+def test_an_error_while_closing_is_logged_and_keeps_nobody(caplog, exits):
+    Environment("probes:Failing-v0", {"where": "close", "exits": exits}).close()
     (message,) = caplog.messages
-    assert message.startswith(f"note: wrapped: {wrapper} keeps statistics of its own")
+    assert message.startswith("probes:Failing-v0: close raised ")
 
 
-# What is printed
+def test_the_working_directory_stays_where_it_was(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def task() -> gymnasium.Env:
+        os.chdir("/")
+        return probes.Endless()
+
+    Environment(task)
+    assert Path.cwd() == tmp_path
+
 
 RUN = """
 import numpy as np
@@ -659,35 +513,11 @@ environments.close()
 """
 
 
-def run_python(code: str, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, *options, "-c", code], cwd=folder, capture_output=True, text=True, check=False
-    )
-
-
-@pytest.mark.parametrize("options", [(), ("-W", "always")])
-def test_nothing_is_printed_and_no_file_is_left(tmp_path, options):
-    ended = run_python(RUN, tmp_path, *options)
+def test_nothing_is_printed_and_no_file_is_left(tmp_path):
+    command = [sys.executable, "-W", "always", "-c", RUN]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_missing_mujoco_is_told_with_what_to_install(tmp_path):
-    code = """
-import sys
-sys.modules["mujoco"] = None
-from csac.tasks.environment import Environment
-from csac.types import InputError
-Environment("Pendulum-v1")
-try:
-    Environment("HalfCheetah-v4")
-except InputError as error:
-    print(error)
-"""
-    ended = run_python(code, tmp_path)
-    assert ended.stdout.startswith("HalfCheetah-v4 needs a package that is not installed: MuJoCo")
-    assert 'pip install "gymnasium[mujoco]"' in ended.stdout
-    assert ended.stderr == ""
 
 
 def test_warnings_of_the_users_own_environment_are_shown():
@@ -701,65 +531,3 @@ def test_warnings_of_the_users_own_environment_are_shown():
     with pytest.warns(UserWarning, match="the user's own") as shown:
         Environment(task)
     assert len(shown) == 1
-
-
-# What an environment does to the process that it is in.
-
-
-@pytest.mark.parametrize("where", ["step", "reset"])
-def test_an_environment_that_exits_has_failed_like_one_that_raises(where):
-    environments = SeedEnvironments(probes.Failing, {"where": where, "exits": True, "at": 2}, [0, 1])
-    environments.reset()
-    steps = [environments.step(np.zeros((2, 1), np.float32)) for _ in range(4)]
-    failures = [failure.reason.partition(" (")[0] for step in steps for failure in step.failures]
-    assert failures == [f"{where} raised SystemExit: 7"] * 2
-    assert not environments.is_any_alive
-
-
-def test_a_task_that_exits_while_it_is_made_is_refused():
-    with pytest.raises(InputError, match="could not be made: SystemExit: 7"):
-        Environment(lambda: sys.exit(7))
-
-
-@pytest.mark.parametrize(("exits", "error"), [(False, "RuntimeError: the simulator broke"), (True, "SystemExit: 7")])
-def test_an_error_while_closing_is_logged_and_keeps_nobody(caplog, exits, error):
-    Environment("probes:Failing-v0", {"where": "close", "exits": exits}).close()
-    assert caplog.messages == [f"probes:Failing-v0: close raised {error}"]
-
-
-@pytest.mark.parametrize(
-    ("gives", "problem"),
-    [
-        ("error", "get_snapshot raised KeyError: 'position'"),
-        ("exit", "get_snapshot raised SystemExit: 7"),
-        ("nothing", "get_snapshot raised TypeError"),
-        ("objects", "get_snapshot gave 'bodies', which is no array of numbers"),
-        ("values", "get_snapshot gave values that JSON cannot hold: TypeError"),
-    ],
-)
-def test_an_episode_that_cannot_be_saved_says_why_and_begins_anew(gives, problem):
-    first, second = (SeedEnvironments(probes.Unsavable, {"gives": gives}, [3]) for _ in range(2))
-    first.reset()
-    first.step(np.zeros((1, 1), np.float32))
-    saved = first.save(0)
-    assert saved.values["problem"].startswith(problem)
-    assert second.take_back(0, saved) is False
-    np.testing.assert_array_equal(second.observations, SeedEnvironments(probes.Unsavable, {}, [3]).reset())
-
-
-class Unsaid(Exception):
-    def __str__(self) -> str:
-        raise ValueError("nothing")
-
-
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [
-        (RuntimeError("no file \udcff here"), "RuntimeError: no file \\udcff here"),
-        (Unsaid(), "Unsaid: (saying what it is raised ValueError)"),
-        (RuntimeError(), "RuntimeError"),
-    ],
-)
-def test_whatever_an_error_says_can_be_written_down(error, said):
-    assert one_line(error) == said
-    assert one_line(error).encode()

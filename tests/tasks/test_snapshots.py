@@ -16,7 +16,7 @@ from csac.tasks.seeds import SeedEnvironments
 from csac.types import Snapshot
 
 PAPER_TASKS = ["HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"]
-OTHERS = ["Ant-v5", "Humanoid-v5", "Reacher-v5", "Pusher-v5", "InvertedDoublePendulum-v5"]
+OTHERS = ["Ant-v5", "Humanoid-v5", "Pusher-v5"]
 
 
 def actions(environment: Environment, count: int) -> np.ndarray:
@@ -122,7 +122,7 @@ def test_seeds_go_on_with_their_episodes_and_their_counts():
     first.reset()
     steps_of(first, 90)
     for index in range(2):
-        second.take_back(index, through_json(first.save(index)))
+        second.restore(index, through_json(first.save(index)))
     np.testing.assert_array_equal(second.observations, first.observations)
     after = steps_of(first, 120)
     assert sum(len(episodes) for _, _, episodes in after) > 3
@@ -135,7 +135,7 @@ def test_an_episode_that_cannot_be_saved_starts_anew_with_its_own_seed():
     steps_of(first, 3)  # an episode of two steps, and one step of the second episode
     saved = through_json(first.save(0))
     assert not saved.values["exact"]
-    second.take_back(0, saved)
+    second.restore(0, saved)
     assert second.observations[0, 0] == first.observations[0, 0]  # the reset seed
     assert second.observations[0, 2] == 0  # the step
 
@@ -147,7 +147,7 @@ def test_an_episode_that_is_not_taken_back_starts_anew_with_its_own_seed():
     steps_of(first, 5)
     saved = through_json(first.save(0))
     del saved.arrays["mujoco.qpos"]
-    assert second.take_back(0, saved) is False
+    assert second.restore(0, saved) is False
     assert "has other arrays" in second.refused[0]
     np.testing.assert_array_equal(second.observations[0], began)
     third.reset()
@@ -159,7 +159,7 @@ def test_an_episode_that_has_one_time_limit_more_starts_anew():
     second = SeedEnvironments(lambda: gymnasium.wrappers.TimeLimit(Counting(20), 7), None, (4,))
     first.reset()
     steps_of(first, 5)
-    assert second.take_back(0, through_json(first.save(0))) is False
+    assert second.restore(0, through_json(first.save(0))) is False
     episodes = [episode for _, _, episodes in steps_of(second, 7) for episode in episodes]
     assert [(length, reward) for _, reward, length in episodes] == [(7, 1 + 2 + 3 + 4 + 5 + 6 + 7)]
 
@@ -168,10 +168,30 @@ def test_a_seed_that_neither_takes_its_episode_back_nor_can_be_reset_has_failed(
     first = SeedEnvironments(probes.Unsavable, {"gives": "one way"}, (4,))
     second = SeedEnvironments(probes.Failing, {"where": "reset"}, (4,))
     first.reset()
-    assert second.take_back(0, first.save(0)) is False
+    assert second.restore(0, first.save(0)) is False
     outcome = second.step(np.zeros((1, 1), np.float32))
     (failure,) = outcome.failures
     assert failure.reason.startswith("reset raised RuntimeError: the simulator broke")
+
+
+@pytest.mark.parametrize(
+    ("gives", "problem"),
+    [
+        ("error", "get_snapshot raised KeyError: 'position'"),
+        ("exit", "get_snapshot raised SystemExit: 7"),
+        ("nothing", "get_snapshot raised TypeError"),
+        ("objects", "get_snapshot gave 'bodies', which is no array of numbers"),
+        ("values", "get_snapshot gave values that JSON cannot hold: TypeError"),
+    ],
+)
+def test_an_episode_that_cannot_be_saved_says_why_and_begins_anew(gives, problem):
+    first, second = (SeedEnvironments(probes.Unsavable, {"gives": gives}, [3]) for _ in range(2))
+    first.reset()
+    first.step(np.zeros((1, 1), np.float32))
+    saved = first.save(0)
+    assert saved.values["problem"].startswith(problem)
+    assert second.restore(0, saved) is False
+    np.testing.assert_array_equal(second.observations, SeedEnvironments(probes.Unsavable, {}, [3]).reset())
 
 
 def test_a_seed_that_has_failed_stays_so():
@@ -180,6 +200,6 @@ def test_a_seed_that_has_failed_stays_so():
     steps_of(first, 3)
     first.stop(1)
     for index in range(2):
-        second.take_back(index, first.save(index))
+        second.restore(index, first.save(index))
     assert second.alive.tolist() == [True, False]
     assert steps_of(second, 5) == steps_of(first, 5)

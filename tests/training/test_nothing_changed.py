@@ -33,7 +33,7 @@ SMALL: dict[str, Any] = {
 }
 LEARNERS = {
     "csac": CSAC(reference_policy="periodic", reference_period=50, relative_entropy_estimator="closed_form", **SMALL),
-    "csac, paper": CSAC(reference_policy="algorithm1", relative_entropy_estimator="sampled", **SMALL),
+    "csac, paper": CSAC(**hyperparameters("paper", "csac", "Hopper-v4") | SMALL),
     "csac, strong": CSAC(**hyperparameters("strong", "csac", "Hopper-v4") | SMALL),
     "csac, average": CSAC(**SMALL),
     "csac, learnt": CSAC(

@@ -36,7 +36,7 @@ NOISY: dict[str, Any] = {**COMMON, "exploration_noise": 0.5}
 @pytest.fixture(params=["csac", "sac", "csac-periodic", "csac-average", "td3", "sd3"])
 def algorithm(request):
     if request.param == "sac":
-        return SAC(temperature="fixed", **SETTINGS)
+        return SAC(**SETTINGS)
     if request.param == "td3":
         return TD3(**NOISY)
     if request.param == "sd3":
@@ -115,12 +115,7 @@ def test_a_truncated_episode_goes_on_in_its_value(algorithm):
 def test_entropy_has_its_weight_in_the_value(algorithm):
     # Every action is as good as another, so the policy spreads out and Q = (r + γ σ H) / (1 - γ) with its entropy H,
     # nearly log 2: with σ = 1 about 10 + 6.2. The relative entropy is zero once nothing moves.
-    fixed: dict[str, Any] = (
-        {"temperature": "fixed"}
-        if algorithm is SAC
-        else {"reference_policy": "average", "relative_entropy_estimator": "closed_form"}
-    )
-    state = run(algorithm(**{**SETTINGS, **fixed, "entropy_weight": 1.0}), probes.Endless, 2500).states[0]
+    state = run(algorithm(**{**SETTINGS, "entropy_weight": 1.0}), probes.Endless, 2500).states[0]
     policy_entropy = entropy(policy_at(state.actor, jnp.zeros(1)))
     assert np.log(2) - 0.1 < policy_entropy < np.log(2)
     np.testing.assert_allclose(values(state, 0.0), (1 + DISCOUNT * policy_entropy) / (1 - DISCOUNT), atol=0.6)

@@ -1,26 +1,22 @@
-"""What artefacts are made of: the C header, the model card, the loader that leaves as it is, what times a header."""
+"""Files that leave with a policy: the NumPy loader as it is, the C header and the model card as templates."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-if TYPE_CHECKING:
-    from jinja2 import Template
-
-LOADER = Path(__file__).parent / "policy.py"
-LATENCY = Path(__file__).parent / "latency.c"
+FOLDER = Path(__file__).parent
 
 
-def template(name: str) -> Template:
-    """Return a template of this folder."""
+def render(name: str, **values: Any) -> str:
+    """Return the text of a template of this folder with these values."""
     import jinja2
 
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        loader=jinja2.FileSystemLoader(FOLDER),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    return environment.get_template(name)
+    return environment.get_template(name).render(values)

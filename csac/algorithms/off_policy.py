@@ -1,0 +1,134 @@
+"""What off-policy algorithms share: hyperparameters, and the cadence, memory and optimisers that follow from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from csac.algorithms.critics import make_critics
+from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, check_hyperparameters
+from csac.algorithms.memory import Replay
+from csac.algorithms.networks import MLP, copy_tree, init_optimiser, make_mlp, make_optimiser
+from csac.algorithms.shapes import Count, Key
+from csac.algorithms.statistics import Statistics, normaliser_of
+from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+
+@dataclass(frozen=True)
+class OffPolicy:
+    """What CSAC, SAC, TD3 and SD3 share."""
+
+    discount: Annotated[float, DISCOUNT] = 0.99
+    """Discount factor (gamma)."""
+    target_rate: Annotated[float, RATE] = 0.005
+    """Soft update rate of the target networks (rho of CSAC's paper, tau of the others')."""
+    actor_learning_rate: Annotated[float, POSITIVE] = 3e-4
+    """Learning rate of the actor."""
+    critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
+    """Learning rate of the critics."""
+    actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
+    """Widths of the actor's hidden layers."""
+    critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
+    """Widths of each critic's hidden layers."""
+    batch_size: Annotated[int, COUNT] = 256
+    """Transitions in one update (the paper's M); SD3 takes as many for each of its two pairs."""
+    replay_size: Annotated[int, COUNT] = 1_000_000
+    """Transitions that the replay keeps."""
+    warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
+    """Environment steps with uniform random actions before learning starts (the paper's T_initial)."""
+    updates_per_step: Annotated[int, COUNT] = 1
+    """Updates per environment step."""
+    update_interval: Annotated[int, COUNT] = 1
+    """Environment steps between rounds of updates; 1 is strict order, larger is faster."""
+    adam_momentum: Annotated[float, DISCOUNT] = 0.9
+    """Decay of the average gradient in the networks' Adam (its beta1)."""
+    max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Bound on the global norm of each gradient (that of both critics counts as one); 0 is no bound."""
+
+    batches_per_update: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        check_hyperparameters(self)
+        if self.replay_size < self.batch_size:
+            raise InputError(f"replay_size must be at least batch_size, {self.batch_size:,}, not {self.replay_size:,}")
+
+    @property
+    def cadence(self) -> Cadence:
+        """When it learns, and from how much."""
+        return Cadence(
+            warmup_steps=self.warmup_steps,
+            update_interval=self.update_interval,
+            updates_per_interval=self.updates_per_step * self.update_interval,
+            transitions_per_update=self.batch_size * self.batches_per_update,
+        )
+
+    def memory(self, spec: Spec, steps: int) -> Replay:
+        """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
+        return Replay.create(min(self.replay_size, steps), spec, self.update_interval)
+
+    def optimiser(self, learning_rate: float) -> optax.GradientTransformation:
+        """Return the networks' Adam."""
+        return make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)
+
+
+@dataclass(frozen=True)
+class TwinCritics(OffPolicy):
+    """What CSAC, SAC and TD3 share besides: options of one actor and two critics (docs/algorithms/critics.md)."""
+
+    critic_normalisation: Literal["none", "batch"] = "none"
+    """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
+    normalise_observations: bool = False
+    """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
+    policy_delay: Annotated[int, COUNT] = 1
+    """Critic updates per update of the actor and of learnt weights (TD3's d)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.critic_normalisation == "batch" and self.batch_size == 1:
+            raise InputError("critic_normalisation batch needs a batch_size of at least 2")
+
+    def first_networks(self, key: Key, spec: Spec, actor_outputs: int) -> dict[str, Any]:
+        """Return the fields of a first state that the three share: random networks, targets that are copies."""
+        actor_key, critics_key = jax.random.split(key)
+        actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, actor_outputs)
+        critics = make_critics(critics_key, spec, self.critic_hidden_sizes)
+        return {
+            "actor": actor,
+            "critics": critics,
+            "target_critics": copy_tree(critics) if self.critic_normalisation == "none" else None,
+            "actor_optimiser": init_optimiser(self.optimiser(self.actor_learning_rate), actor),
+            "critic_optimiser": init_optimiser(self.optimiser(self.critic_learning_rate), critics),
+            "observations": Statistics.create((spec.observation_size,)) if self.normalise_observations else None,
+        }
+
+
+def first_metrics(names: Iterable[str], policy_delay: int) -> Metrics | None:
+    """Return the metrics of an actor that waits and has not moved yet, 0 each; None where it moves at every update."""
+    return None if policy_delay == 1 else {name: jnp.zeros(()) for name in names}
+
+
+def improve_delayed(
+    policy_delay: int, step: Count, improve: Callable[..., tuple[Any, Metrics]], state: Any, *given: Any
+) -> tuple[Any, Metrics]:
+    """Return `improve(state, *given)` at every `policy_delay`-th update, the last of each (TD3's Algorithm 1).
+
+    Any other update computes nothing: it returns the state as it is and `state.actor_metrics`, those of the last
+    improvement. `step` counts the updates before this one.
+    """
+    if policy_delay == 1:
+        return improve(state, *given)
+    is_due = (step + 1) % policy_delay == 0
+    state, metrics = jax.lax.cond(is_due, improve, lambda state, *_: (state, state.actor_metrics), state, *given)
+    return state._replace(actor_metrics=metrics), metrics
+
+
+def policy_network(actor: MLP, statistics: Statistics | None, head: Literal["tanh_gaussian", "tanh"]) -> PolicyNetwork:
+    """Return the actor's layers, and what it sees observations by."""
+    return PolicyNetwork(PolicyParameters((actor.layers,), normaliser=normaliser_of(statistics)), head=head)

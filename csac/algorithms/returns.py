@@ -1,0 +1,52 @@
+"""Returns and advantages of a rollout: transitions of one seed, in order, with a leading axis of time."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from csac.algorithms.shapes import Scalar, Scalars
+from csac.types import Transition
+
+
+def discounted_returns(start: Scalar, batch: Transition, discount: float) -> tuple[Scalars, Scalar]:
+    """Return R_t = r_t + γ R_{t-1}, from 0 in each episode, and what the next rollout goes on from."""
+
+    def advance(running: Scalar, transition: Transition) -> tuple[Scalar, Scalar]:
+        running = discount * running + transition.reward
+        return running * _goes_on(transition), running
+
+    last, returns = jax.lax.scan(advance, start, batch)
+    return returns, last
+
+
+def advantages_of(
+    batch: Transition, values: Scalars, next_values: Scalars, discount: float, trace_decay: float
+) -> Scalars:
+    """Return the generalised advantages of a rollout (GAE, Eq. 16; PPO, Eq. 11).
+
+    A_t = δ_t + γ λ A_{t+1} with δ_t = r_t + γ (1 - terminated_t) V(s_{t+1}) - V(s_t), where s_{t+1} is what step t
+    led to. Nothing is carried back over the end of an episode, of whichever kind, nor from beyond the rollout.
+    """
+    errors = batch.reward + discount * (1.0 - batch.terminated) * next_values - values
+    decays = discount * trace_decay * _goes_on(batch)
+
+    def step_back(advantage: Scalar, step: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+        error, decay = step
+        advantage = error + decay * advantage
+        return advantage, advantage
+
+    return jax.lax.scan(step_back, jnp.zeros(()), (errors, decays), reverse=True)[1]
+
+
+def explained_variance(values: Scalars, targets: Scalars) -> Scalar:
+    """Return 1 - Var[target - value] / Var[target]; 0 where the targets do not vary."""
+    variance = jnp.var(targets)
+    explained = 1.0 - jnp.var(targets - values) / jnp.where(variance > 0, variance, 1.0)
+    return jnp.where(variance > 0, explained, 0.0)
+
+
+def _goes_on(transition: Transition) -> Float[Array, "..."]:
+    """Return 0 where the episode ended, of whichever kind, else 1."""
+    return (1.0 - transition.terminated) * (1.0 - transition.truncated)

@@ -1,0 +1,157 @@
+"""A policy as one C99 header: `templates/policy.h.jinja` with the arrays of its layers."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import re
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from csac.deploy.contract import read_file
+from csac.deploy.parameters import deterministic, to_tensors
+from csac.deploy.templates import render
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from csac.deploy.guards import Guards
+    from csac.deploy.policy import Policy
+
+BLOCK = 16  # outputs of a layer that are summed side by side: as many as the registers of a Cortex-M4 hold well
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+
+_WIDTH = 120
+_LIBRARY = """\
+#define _POSIX_C_SOURCE 200112L
+#include <time.h>
+#include "policy.h"
+static csac_state state = CSAC_INITIAL;
+void artefact_reset(void) { csac_reset(&state); }
+int64_t artefact_step(const float *observation, float *action)
+{
+    struct timespec began, ended;
+    clock_gettime(CLOCK_MONOTONIC, &began);
+    csac_step(&state, observation, action);
+    clock_gettime(CLOCK_MONOTONIC, &ended);
+    return (int64_t)(ended.tv_sec - began.tv_sec) * 1000000000 + (ended.tv_nsec - began.tv_nsec);
+}
+"""
+
+
+def header(policy: Policy, guards: Guards, control_rate: float | None) -> str:
+    """Return the header that runs a policy."""
+    contract, (observation_size, action_size) = policy.contract, policy.contract.spec
+    parameters = deterministic(policy.network.parameters, action_size)
+    tensors = to_tensors(parameters) | {
+        "low": contract.action_low,
+        "high": contract.action_high,
+        "half": contract.bounds.half,
+        "centre": contract.bounds.centre,
+    }
+    if guards.fallback is not None:
+        tensors["fallback"] = guards.fallback
+    if guards.largest_change is not None:
+        tensors["change"] = guards.largest_change
+    return render(
+        "policy.h.jinja",
+        task=_in_comment(contract.task or "a task of its own"),
+        algorithm=_in_comment(contract.algorithm),
+        guards=guards,
+        observations=observation_size,
+        actions=action_size,
+        control_rate=None if control_rate is None else _number(control_rate),
+        block=BLOCK,
+        arrays=[_array(name.replace(".", "_"), array) for name, array in tensors.items()],
+        actors=parameters.actors,
+        critics=parameters.critics,
+        activation=contract.activation,
+        activations=sorted({contract.activation, "relu"} if parameters.critics else {contract.activation}),
+        is_clipped=contract.head == "clipped_gaussian",
+        has_normaliser=parameters.normaliser is not None,
+    )
+
+
+def _array(name: str, array: np.ndarray) -> str:
+    """Return the definition of a constant array."""
+    numbers = _in_blocks(array) if array.ndim == 2 else np.atleast_1d(array)
+    lines, line = [], "   "
+    for word in (f" {_number(number)}f," for number in numbers):
+        if len(line) + len(word) > _WIDTH:
+            lines.append(line)
+            line = "   "
+        line += word
+    return "\n".join([f"static const float csac_{name}[{len(numbers)}] = {{", *lines, line, "};"])
+
+
+def _in_blocks(weight: np.ndarray) -> np.ndarray:
+    """Return weights [in, out] in the order in which csac_layer reads them."""
+    whole = weight.shape[1] - weight.shape[1] % BLOCK
+    blocks = [weight[:, first : first + BLOCK].reshape(-1) for first in range(0, whole, BLOCK)]
+    return np.concatenate([*blocks, weight[:, whole:].T.reshape(-1)])
+
+
+def _number(number: float) -> str:
+    """Return a float32 number so that C reads the same one."""
+    if not math.isfinite(number):
+        raise InputError(f"the policy has a number {number}, which cannot be written in C")
+    text = f"{number:.9g}"
+    return text if "." in text or "e" in text else text + ".0"
+
+
+def _in_comment(text: str) -> str:
+    """Return a text that cannot end the comment that it stands in: a contract may be anybody's."""
+    return re.sub(r"[^\w.:/ -]", "_", text)
+
+
+def compile_c(*arguments: str | Path, program: str = "cc") -> None:
+    """Run a C compiler. Raises InputError if there is none, or with its first error."""
+    if shutil.which(program) is None:
+        raise InputError(f"an artefact in C needs a C compiler, and {program} is not found: install gcc or clang")
+    result = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
+    if result.returncode:
+        complaint = next((line for line in result.stderr.splitlines() if "error" in line), result.stderr)
+        raise InputError(f"{program} does not compile the policy: {' '.join(complaint.split())}")
+
+
+class Library:
+    """Runs a header, compiled into a shared library.
+
+    Raises:
+        InputError: the header is not what csac writes for the policy, or it cannot be compiled.
+    """
+
+    def __init__(self, path: Path, policy: Policy, guards: Guards, control_rate: float | None, optimise: bool) -> None:
+        text = header(policy, guards, control_rate)
+        if read_file(path) != text.encode():
+            raise InputError(f"{path} is not the header of this csac, which compiles no other code: export it again")
+        # In a folder of its own: next to the artefact, a stranger's math.h would be taken for the system's.
+        with tempfile.TemporaryDirectory(prefix="csac-") as name:
+            source, library = Path(name, "artefact.c"), Path(name, "artefact.so")
+            Path(name, "policy.h").write_text(text)
+            source.write_text(_LIBRARY)
+            native = ("-march=native",) if optimise else ()
+            compile_c(*STRICT, "-fPIC", "-shared", "-O3", *native, source, "-o", library, "-lm")
+            self._library = ctypes.CDLL(str(library))  # stays in memory without its file
+        self._step = self._library.artefact_step
+        self._step.restype = ctypes.c_int64
+        self._action_size = policy.contract.spec.action_size
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action for an observation."""
+        action = np.empty(self._action_size, np.float32)
+        self._step(ctypes.c_void_p(observation.ctypes.data), ctypes.c_void_p(action.ctypes.data))
+        return action
+
+    def time(self, observation: np.ndarray) -> int:
+        """Return the nanoseconds of a step, by a clock read inside the library."""
+        action = np.empty(self._action_size, np.float32)
+        return self._step(ctypes.c_void_p(observation.ctypes.data), ctypes.c_void_p(action.ctypes.data))
+
+    def reset(self) -> None:
+        """Forget the action before."""
+        self._library.artefact_reset()

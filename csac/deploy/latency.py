@@ -1,0 +1,96 @@
+"""How long an artefact takes for one action, call by call: one after the other, and at the rate of a controller."""
+
+from __future__ import annotations
+
+import gc
+import time
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from csac.deploy.c import Library
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from csac.deploy.artefact import Artefact
+
+USUAL_RATE = 100.0  # Hz, if neither the contract nor the user says one
+MOST_CALLS = 10_000_000  # of one measurement
+
+_OBSERVATIONS = 1_024  # random ones, used in turn
+_WARM_UP = 1_000  # calls that are not counted
+
+
+class Latency(NamedTuple):
+    """What was measured of single calls, in nanoseconds."""
+
+    durations: np.ndarray
+    """From right before a call to right after it, int64 [calls]."""
+    lateness: np.ndarray | None = None
+    """How long after it was due a call began, int64 [calls]; None if calls followed each other at once."""
+    rate: float | None = None
+    """Calls per second that were due."""
+
+
+def measure(
+    artefact: Artefact, calls: int = 100_000, rate: float | None = None, seconds: float = 10.0
+) -> tuple[Latency, ...]:
+    """Return what an artefact takes for `calls` one after the other, and then for `seconds` at a rate.
+
+    An artefact in C is timed inside its compiled library, one in Python around `act`, with the garbage collector off.
+    Observations are standard normal.
+
+    Args:
+        artefact: opened with `optimise`, to time C as it would be compiled for this machine.
+        calls: at least 1.
+        rate: Hz; by default the control rate of the task, or 100 if it is not known.
+        seconds: 0 leaves the second measurement out.
+
+    Raises:
+        InputError: arguments out of their range.
+    """
+    rate = float((artefact.fields["control_rate_hz"] or USUAL_RATE) if rate is None else rate)
+    paced = rate * seconds
+    if not (1 <= calls <= MOST_CALLS and rate > 0 and seconds >= 0 and (paced == 0 or 1 <= paced <= MOST_CALLS)):
+        raise InputError(
+            f"{calls} calls, and {seconds:g} seconds at {rate:g} Hz: both take from 1 to {MOST_CALLS:,} calls"
+        )
+    size = artefact.contract.spec.observation_size
+    observations = list(np.random.default_rng(0).standard_normal((_OBSERVATIONS, size), np.float32))
+    time_call = artefact.runner.time if isinstance(artefact.runner, Library) else _timed(artefact)
+    time_calls(time_call, observations, _WARM_UP)
+    measured = [Latency(time_calls(time_call, observations, calls)[0])]
+    if seconds:
+        measured.append(Latency(*time_calls(time_call, observations, round(paced), round(1e9 / rate)), rate))
+    return tuple(measured)
+
+
+def _timed(artefact: Artefact) -> Callable[[np.ndarray], int]:
+    def time_call(observation: np.ndarray) -> int:
+        began = time.perf_counter_ns()
+        artefact.act(observation)
+        return time.perf_counter_ns() - began
+
+    return time_call
+
+
+def time_calls(
+    time_call: Callable[[np.ndarray], int], observations: list[np.ndarray], calls: int, period: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nanoseconds of each call and how late it began, int64 [calls]; each is due `period` after another."""
+    durations, lateness = np.zeros((2, calls), np.int64)
+    due, is_collecting = time.perf_counter_ns(), gc.isenabled()
+    gc.disable()
+    try:
+        for call in range(calls):
+            due += period
+            if period and (wait := due - time.perf_counter_ns()) > 0:
+                time.sleep(wait / 1e9)
+            lateness[call] = time.perf_counter_ns() - due if period else 0
+            durations[call] = time_call(observations[call % len(observations)])
+    finally:
+        if is_collecting:
+            gc.enable()
+    return durations, lateness

@@ -1,0 +1,185 @@
+"""A policy as an ONNX graph, from the raw observation to the environment's action, built node by node."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from csac.deploy.parameters import deterministic
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from csac.deploy.contract import Contract
+    from csac.deploy.guards import Guards
+    from csac.deploy.policy import Policy
+    from csac.types import Layer
+
+OPSET = 17  # of 2022: every runtime in use has it
+IR_VERSION = 8  # the oldest that goes with it
+
+
+def model(policy: Policy, guards: Guards, fields: dict[str, Any]) -> bytes:
+    """Return the file of an ONNX model, with the contract as metadata. Everything in it is float32.
+
+    Inputs: `observation` [n, observation]; `state` [n, action + 1] if the guards remember the action before: zeros at
+    first and after a reset, then what `next_state` gave. Outputs: `action` [n, action] on the environment's scale, and
+    `next_state`.
+
+    Raises:
+        InputError: the package onnx, or onnxruntime, is not installed.
+    """
+    for package in ("onnx", "onnxruntime"):  # the one writes the graph, the other runs it to verify it
+        if importlib.util.find_spec(package) is None:
+            raise _missing(package)
+    import onnx
+    from onnx import TensorProto, checker, helper
+
+    graph, (observation_size, action_size) = _Graph(), policy.contract.spec
+    inputs, outputs = {"observation": observation_size}, {"action": action_size}
+    if guards.has_state:
+        inputs["state"] = outputs["next_state"] = action_size + 1
+    graph.add("Identity", [_guarded(graph, guards, policy.contract, _action(graph, policy))], "action")
+
+    def values(sizes: dict[str, int]) -> list[Any]:
+        return [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", size]) for name, size in sizes.items()]
+
+    nodes = [helper.make_node(kind, names, [output], output, **options) for kind, names, output, options in graph.nodes]
+    constants = [onnx.numpy_helper.from_array(array, name) for name, array in graph.constants.items()]
+    built = helper.make_graph(nodes, "policy", values(inputs), values(outputs), constants)
+    made = helper.make_model(
+        built, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="csac"
+    )
+    helper.set_model_props(made, {"contract": json.dumps(fields, allow_nan=False)})
+    checker.check_model(made, full_check=True)
+    return made.SerializeToString(deterministic=True)
+
+
+def _missing(package: str) -> InputError:
+    return InputError(f"an ONNX artefact needs the package {package}: pip install '.[onnx]' in a clone of csac")
+
+
+class Session:
+    """Runs a graph by ONNX Runtime, in one thread: a controller shares its processor.
+
+    Raises:
+        InputError: the package onnxruntime is not installed.
+    """
+
+    def __init__(self, path: Path, policy: Policy, guards: Guards) -> None:
+        try:
+            import onnxruntime
+        except ImportError:
+            raise _missing("onnxruntime") from None
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        self._first = np.zeros((1, policy.contract.spec.action_size + 1), np.float32) if guards.has_state else None
+        self.reset()
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action for an observation."""
+        given = {"observation": observation[None]}
+        if self._state is not None:
+            given["state"] = self._state
+        outputs: Any = self._session.run(None, given)
+        if self._state is not None:
+            self._state = outputs[1]
+        return outputs[0][0]
+
+    def reset(self) -> None:
+        """Forget the action before."""
+        self._state = self._first
+
+
+class _Graph:
+    """Nodes in the order in which they run, and the arrays that they use."""
+
+    def __init__(self) -> None:
+        self.nodes: list[tuple[str, list[str], str, dict[str, Any]]] = []
+        self.constants: dict[str, np.ndarray] = {}
+
+    def add(self, kind: str, inputs: Sequence[Any], output: str = "", **options: Any) -> str:
+        """Add a node; return the name of its output. An array or a number among the inputs becomes a constant."""
+        output = output or f"{kind.lower()}_{len(self.nodes)}"
+        names = [item if isinstance(item, str) else self._constant(np.asarray(item)) for item in inputs]
+        self.nodes.append((kind, names, output, options))
+        return output
+
+    def _constant(self, array: np.ndarray) -> str:
+        name = f"constant_{len(self.constants)}"
+        self.constants[name] = np.ascontiguousarray(array, np.float32 if array.dtype.kind == "f" else array.dtype)
+        return name
+
+    def clip(self, name: str, low: Any, high: Any) -> str:
+        """Return values within [low, high]; bounds may differ from number to number, and be computed."""
+        return self.add("Min", [self.add("Max", [name, low]), high])
+
+    def network(self, layers: tuple[Layer, ...], inputs: str, activation: str) -> str:
+        """Return the output of an MLP."""
+        for index, (weight, bias) in enumerate(layers):
+            inputs = self.add("Gemm", [inputs if index == 0 else self.add(activation, [inputs]), weight, bias])
+        return inputs
+
+    def is_finite(self, name: str) -> str:
+        """Return whether all numbers of a row are finite, [n, 1]."""
+        zeros = self.add("Mul", [name, 0.0])  # NaN where it is not finite, which no sum loses, unlike a maximum
+        return self.add("Equal", [self.add("ReduceSum", [zeros, np.array([1])], keepdims=1), 0.0])
+
+
+def _action(graph: _Graph, policy: Policy) -> str:
+    """Add everything from the observation to the action within its bounds; return the action's name."""
+    contract, inputs = policy.contract, "observation"
+    parameters = deterministic(policy.network.parameters, contract.spec.action_size)
+    if (normaliser := parameters.normaliser) is not None:
+        inputs = graph.add("Div", [graph.add("Sub", [inputs, normaliser.mean]), normaliser.std])
+        inputs = graph.clip(inputs, -normaliser.limit, normaliser.limit)
+    actions = [graph.network(layers, inputs, contract.activation.capitalize()) for layers in parameters.actors]
+    is_clipped = contract.head == "clipped_gaussian"
+    actions = [graph.clip(name, -1.0, 1.0) if is_clipped else graph.add("Tanh", [name]) for name in actions]
+    action, best = actions[0], ""
+    for layers, candidate in zip(parameters.critics, actions, strict=bool(parameters.critics)):
+        value = graph.network(layers, graph.add("Concat", [inputs, candidate], axis=1), "Relu")
+        if best:
+            # As for NumPy, a NaN is above all: what goes wrong is for the guards to see.
+            is_first_nan = graph.add("And", [graph.add("IsNaN", [value]), graph.add("Equal", [best, best])])
+            is_more = graph.add("Or", [graph.add("Greater", [value, best]), is_first_nan])
+            action = graph.add("Where", [is_more, candidate, action])
+            value = graph.add("Where", [is_more, value, best])
+        best = value
+    scaled = graph.add("Add", [graph.add("Mul", [action, contract.bounds.half]), contract.bounds.centre])
+    return graph.clip(scaled, contract.action_low, contract.action_high)
+
+
+def _guarded(graph: _Graph, guards: Guards, contract: Contract, action: str) -> str:
+    """Add the guards, as `csac.deploy.guards` defines them; return the name of the action to send.
+
+    The state holds the action before, and 1 once there is one.
+    """
+    if guards.fallback is None:
+        return action
+    size = contract.spec.action_size
+    fallback: Any = guards.fallback
+    last = flag = has_last = ""
+    if guards.has_state:
+        last = graph.add("Slice", ["state", *map(np.array, ([0], [size], [1]))])
+        flag = graph.add("Slice", ["state", *map(np.array, ([size], [size + 1], [1]))])  # [n, 1]
+        has_last = graph.add("Greater", [flag, 0.5])
+    if guards.repeats_last:
+        fallback = graph.add("Where", [has_last, last, fallback])
+    is_good = graph.add("And", [graph.is_finite("observation"), graph.is_finite(action)])
+    action = graph.add("Where", [is_good, action, fallback])
+    if guards.largest_change is not None:
+        least, most = (graph.add(kind, [last, guards.largest_change]) for kind in ("Sub", "Add"))
+        limited = graph.clip(graph.clip(action, least, most), contract.action_low, contract.action_high)
+        action = graph.add("Where", [has_last, limited, action])
+    if guards.has_state:
+        ones = graph.add("Add", [graph.add("Mul", [flag, 0.0]), 1.0])
+        graph.add("Concat", [action, ones], "next_state", axis=1)
+    return action

@@ -1,0 +1,125 @@
+"""What is looked at once before a run begins: arguments that JSON keeps, the API, seeds, wrappers."""
+
+from __future__ import annotations
+
+import json
+import random
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import probes
+import pytest
+
+from csac.tasks.environment import Environment
+from csac.tasks.preflight import json_arguments, seed_globals, seed_warning, try_task, wrapper_warnings
+from csac.types import InputError
+
+
+@dataclass
+class Options:
+    size: int = 3
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        (None, {}),
+        ({"size": (3, 4), "depth": [1, {"a": None}]}, {"size": [3, 4], "depth": [1, {"a": None}]}),
+        ({"g": np.float64(9.5), "n": np.int64(3), "on": np.bool_(True)}, {"g": 9.5, "n": 3, "on": True}),
+    ],
+)
+def test_arguments_are_what_json_keeps(given, kept):
+    arguments = json_arguments(given)
+    assert arguments == kept == json.loads(json.dumps(arguments))
+    assert not any(isinstance(value, np.generic) for value in arguments.values())
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"levels": {1: 2.0}}, "levels"),
+        ({"mean": np.zeros(2)}, "mean"),
+        ({"file": Path("here")}, "file"),
+        ({"options": [Options()]}, r"options'\]\[0\]"),
+        (["g"], "environment_arguments"),
+    ],
+)
+def test_arguments_that_json_would_change_are_refused(given: Any, name):
+    with pytest.raises(InputError, match=name) as refusal:
+        json_arguments(given)
+    assert "\n" not in str(refusal.value)
+
+
+class Seedless(probes.Endless):
+    def reset(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return np.zeros(1, np.float32), {}
+
+
+class OldReset(probes.Endless):
+    def reset(self, *, seed=None, options=None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return np.zeros(3, np.float32)
+
+
+class OldStep(probes.Endless):
+    def step(self, action):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return super().step(action)[1:]
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "name"),
+    [(Seedless, {}, "seed"), (OldReset, {}, "reset"), (OldStep, {}, "step"), (probes.Endless, {"length": []}, "step")],
+)
+def test_a_task_of_another_api_is_refused_in_one_line(task, arguments, name):
+    class Adds(task):
+        def step(self, action):
+            assert self.length + 1
+            return super().step(action)
+
+    with pytest.raises(InputError, match=f"^Adds does not work.*: .*{name}") as refusal:
+        try_task(Environment(Adds, arguments), arguments)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_simulator_that_breaks_is_left_to_the_run():
+    try_task(Environment("probes:Failing-v0"))
+
+
+class Careless(probes.Probe):
+    """Draws its start from NumPy's global generator, or has always the same."""
+
+    def __init__(self, draws: bool) -> None:
+        super().__init__()
+        self.draws = draws
+
+    def first_observation(self):
+        return np.full(1, np.random.random() if self.draws else 0.0, np.float32)
+
+
+def test_a_task_that_ignores_its_seed_is_told():
+    assert "same seed" in str(seed_warning(Environment(Careless, {"draws": True})))
+    assert "every seed" in str(seed_warning(Environment(Careless, {"draws": False})))
+    for task in ("Hopper-v4", "probes:Failing-v0"):
+        environment = Environment(task, {"where": "reset"} if "Failing" in task else None)
+        assert seed_warning(environment) is None
+
+
+def test_global_generators_are_seeded():
+    def draws() -> tuple[float, float]:
+        seed_globals(2**40 + 5)
+        return random.random(), np.random.random()
+
+    assert draws() == draws()
+
+
+@pytest.mark.parametrize("wrapper", ["NormalizeObservation", "NormalizeReward"])
+def test_a_wrapper_that_learns_by_itself_is_told(wrapper):
+    def wrapped() -> gymnasium.Env:
+        environment = getattr(gymnasium.wrappers, wrapper)(probes.Endless())
+        return gymnasium.wrappers.TimeLimit(environment, 9)
+
+    (line,) = wrapper_warnings(Environment(wrapped))
+    assert line.startswith(f"wrapped: {wrapper} ")
+    assert wrapper_warnings(Environment("Hopper-v4")) == []

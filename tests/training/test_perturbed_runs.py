@@ -1,0 +1,208 @@
+"""Runs that are perturbed, killed, resumed and forked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import probes
+import pytest
+from logs import log_lines
+from plans import settings
+from resuming import LEARNERS, Crash, contents, crash_at, run
+
+from csac.deploy.choosing import load
+from csac.evaluation.evaluator import Evaluator
+from csac.record.manifest import Origin
+from csac.tasks.perturbations import perturbations_of, values_at
+from csac.tasks.seeds import EVALUATION_SEED
+from csac.training import messages
+from csac.training.group import Group
+from csac.training.train import resume
+from csac.types import InputError
+
+
+def model_of(environment: Any) -> Any:
+    return environment.raw.unwrapped.model
+
+
+# In the group.
+
+
+def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-v4") -> Group:
+    changes = perturbations_of(perturbations)
+    return Group(settings(LEARNERS[0], task, 400, folder, begin, evaluation_interval=30, perturbations=changes), (3,))
+
+
+def advance(group: Group, until: int) -> list[messages.GroupMessage]:
+    return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
+
+
+def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
+    """In the environments, in the evaluations, and in what is remembered."""
+    perturbed = group(tmp_path, ["friction=2@30", "observation_noise=0.1@35", "action_noise=0.1@38"])
+    plain = group(tmp_path, ())
+    own = model_of(plain.environments.environments[0]).geom_friction.copy()
+    at_30 = [advance(one, 30) for one in (perturbed, plain)]
+    rows = [[event.rows for event in events if isinstance(event, messages.Evaluated)] for events in at_30]
+    assert rows[0] == rows[1]
+    assert len(rows[0]) == 1
+    training, evaluation = perturbed.environments.environments[0], perturbed.evaluator._environments[0]
+    for environment in (training, evaluation):
+        np.testing.assert_array_equal(model_of(environment).geom_friction, own)
+    advance(perturbed, 31)
+    np.testing.assert_array_equal(model_of(training).geom_friction, 2 * own)
+    advance(perturbed, 60)
+    np.testing.assert_array_equal(model_of(evaluation).geom_friction, 2 * own)
+    assert evaluation._noise
+    assert evaluation._noise._levels == {"observation_noise": 0.1, "action_noise": 0.1}
+
+
+def test_the_replay_holds_what_the_policy_saw_and_what_it_chose(tmp_path):
+    """Endless observes 0: what is not 0 in the replay is noise. Its actions are as without any."""
+    given = ["observation_noise=0.5@12", "action_noise=0.5@15"]
+    noisy, plain = (group(tmp_path, perturbations, task=probes.Endless) for perturbations in (given, ()))
+    for one in (noisy, plain):
+        advance(one, 39)  # the warm-up: actions are drawn, whatever is observed
+    rows, others = (one.learner.memory(0, 39).rows[:39] for one in (noisy, plain))
+    observation, action, next_observation = rows[:, 0], rows[:, 1], rows[:, 3]
+    np.testing.assert_array_equal(np.flatnonzero(next_observation), np.arange(12, 39))  # the step that makes 13
+    np.testing.assert_array_equal(np.flatnonzero(observation), np.arange(13, 39))
+    # The end of an episode, every ten steps: what came is not what the next one begins with.
+    same = observation[13:] == next_observation[12:-1]
+    np.testing.assert_array_equal(np.flatnonzero(~same) + 13, [20, 30])
+    np.testing.assert_array_equal(action, others[:, 1])
+
+
+def test_the_beginning_is_perturbed_from_the_first_observation(tmp_path):
+    noisy = group(tmp_path, "observation_noise=0.5", task=probes.Endless)
+    assert noisy._observations[0, 0] != 0
+
+
+# Whole runs. Evaluations every 100 steps, checkpoints every 100.
+
+GIVEN = ("friction=2@200", "observation_noise=0.05@200", "mass=1.5@250", "action_noise=0.1@250", "friction=1@430")
+LONG: dict[str, Any] = {"checkpoint_interval": 100, "keep_checkpoints": 0, "evaluation_interval": 50}
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A run without perturbations, with every checkpoint."""
+    return run(tmp_path_factory.mktemp("plain") / "run", **LONG)
+
+
+@pytest.fixture(scope="module")
+def perturbed(tmp_path_factory):
+    """The same with them, uninterrupted."""
+    return run(tmp_path_factory.mktemp("perturbed") / "run", perturbations=GIVEN, **LONG)
+
+
+def test_a_run_is_the_same_until_it_is_perturbed(plain, perturbed):
+    ours, theirs = perturbed.evaluations, plain.evaluations
+    np.testing.assert_array_equal(ours["return"][ours["step"] <= 200], theirs["return"][theirs["step"] <= 200])
+    after = ours["step"] > 200
+    assert after.sum() == 12
+    assert (ours["return"][after] != theirs["return"][after]).all()
+
+
+def test_a_run_says_what_it_was_perturbed_by(perturbed):
+    assert list(perturbed.manifest.perturbations) == [
+        "friction=2@200",
+        "observation_noise=0.05@200",
+        "mass=1.5@250",
+        "action_noise=0.1@250",
+        "friction=1@430",
+    ]
+    log = log_lines(perturbed.path)
+    told = {number: line for number, line in enumerate(log) if line.startswith("perturbed")}
+    assert told == {
+        4: "perturbed from step 201 on: friction x 2, observation noise 0.05",
+        6: "perturbed from step 251 on: mass x 1.5, action noise 0.1",
+        10: "perturbed from step 431 on: friction x 1",
+    }
+    assert [log[number - 1].split(":")[0] for number in told] == ["step 200", "step 250", "step 400"]
+
+
+def test_evaluations_meet_the_perturbed_task(perturbed):
+    rows = perturbed.evaluations
+    evaluator = Evaluator("Hopper-v4", None, 2, EVALUATION_SEED)
+    evaluator.perturb(values_at(perturbations_of(GIVEN), 500))
+    episodes = evaluator.run(load(perturbed.path, 0))
+    assert [episode.episode_return for episode in episodes] == rows["return"][rows["step"] == 500].tolist()
+
+
+@pytest.mark.parametrize("crash", [150, 200, 450])
+def test_a_perturbed_run_that_crashed_goes_on_and_leaves_the_same_files(tmp_path, perturbed, crash):
+    """From checkpoints before the first perturbation, at its very step, between two and after the last."""
+    with pytest.raises(Crash):
+        run(tmp_path / "run", perturbations=GIVEN, on_evaluation=crash_at(crash + 50), **LONG)
+    finished = resume(tmp_path / "run")
+    assert finished.manifest.history[0].step == crash // 100 * 100
+    assert contents(tmp_path / "run") == contents(perturbed.path)
+    curves = [(path / "curve.png").read_bytes() for path in (tmp_path / "run", perturbed.path)]
+    assert curves[0] == curves[1]
+
+
+@pytest.mark.parametrize("step", [100, 200])
+def test_a_fork_that_is_perturbed_equals_a_run_that_was_from_the_start(tmp_path, plain, perturbed, step):
+    forked = run(tmp_path / "run", start_from=f"{plain.path}@{step}", perturbations=GIVEN, **LONG)
+    assert contents(forked.path) == contents(perturbed.path)
+    assert forked.manifest.perturbations == perturbed.manifest.perturbations
+    changes = (f"perturbations is [], not {list(perturbed.manifest.perturbations)!r}",)
+    assert forked.manifest.forked_from == Origin(str(plain.path), step, changes)
+
+
+def test_a_fork_that_is_not_perturbed_equals_going_on(tmp_path, plain):
+    forked = run(tmp_path / "run", start_from=f"{plain.path}@200", **LONG)
+    assert contents(forked.path) == contents(plain.path)
+
+
+def test_a_fork_of_a_perturbed_run_keeps_what_had_happened(tmp_path, perturbed):
+    """The last one, at 430, is still to come at 300: without a word of it, it is the same run."""
+    whole = run(tmp_path / "same", start_from=f"{perturbed.path}@300", **LONG)
+    assert contents(whole.path) == contents(perturbed.path)
+    other = run(tmp_path / "other", start_from=f"{perturbed.path}@300", perturbations=(), **LONG)
+    assert other.manifest.perturbations == perturbed.manifest.perturbations[:4]
+    rows, before = other.evaluations, perturbed.evaluations
+    np.testing.assert_array_equal(rows["return"][rows["step"] <= 400], before["return"][before["step"] <= 400])
+    assert contents(other.path)["evaluations.csv"] != contents(perturbed.path)["evaluations.csv"]
+    again = run(tmp_path / "other", start_from=f"{perturbed.path}@300", resume=True, **LONG)
+    assert again.manifest.perturbations == other.manifest.perturbations
+    with pytest.raises(InputError, match=r"friction=1@430 .*the run ends at step 400"):
+        run(tmp_path / "short", start_from=f"{perturbed.path}@300", steps=400)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((), r"perturbations is \['friction=2@200', .*\], not \[\]"),
+        ((*GIVEN[:4], "friction=1.5@430"), r"not \['friction=2@200', .*'friction=1.5@430'\]"),
+    ],
+)
+def test_other_perturbations_are_no_continuation(perturbed, given, message):
+    before = {path: path.read_bytes() for path in perturbed.path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=message):
+        run(perturbed.path, perturbations=given, resume=True, **LONG)
+    assert {path: path.read_bytes() for path in perturbed.path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"perturbations": "friction=2@500"}, "friction=2@500 would change nothing: the run ends at step 500"),
+        ({"perturbations": "frction=2"}, "frction"),
+        ({"perturbations": ["gravity=2@5"], "task": "Pendulum-v1"}, "Pendulum-v1 is no MuJoCo task"),
+        ({"perturbations": ["friction=3", "friction=2@5"], "task": probes.Endless}, "Endless is no MuJoCo task"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        run(tmp_path / "run", **change)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_fork_is_not_perturbed_in_its_past(tmp_path, plain):
+    with pytest.raises(InputError, match="friction=2@199 lies before step 200, where this run begins"):
+        run(tmp_path / "run", start_from=f"{plain.path}@200", perturbations="friction=2@199", **LONG)
+    assert list(tmp_path.iterdir()) == []
