@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from csac.record.curve_measures import Recovery, drawdown, recovery
 from csac.record.statistics import (
     FEWEST_FOR_BOOTSTRAP,
     FEWEST_FOR_INTERVAL,
+    Recovery,
     dispersion_across,
+    drawdown,
     evaluation_matrix,
     improvement_interval,
     interquartile_mean,
@@ -18,6 +19,7 @@ from csac.record.statistics import (
     maximum_average_return,
     mean_and_interval,
     probability_of_improvement,
+    recovery,
     stratified_bootstrap_interval,
 )
 

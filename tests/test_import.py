@@ -43,7 +43,7 @@ def tiny_run(tmp_path):
     (tmp_path / "drawn.py").write_text(DRAWN)
     run = RunDirectory.create(tmp_path / "run", manifest(task="drawn:Drawn-v0", steps=9))
     run.append("evaluations", [{"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 5, "success": None}])
-    random_policy(contract()).save_in(run.policies, ("last",))
+    random_policy(contract()).write(run.policy_file())
     return tmp_path
 
 

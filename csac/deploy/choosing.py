@@ -19,7 +19,7 @@ from csac.record.statistics import last_evaluations
 from csac.types import InputError
 
 
-def load(directory: str | Path, seed: int | None = None, which: Which = "last") -> Policy:
+def load(directory: str | os.PathLike[str], seed: int | None = None, which: Which = "last") -> Policy:
     """Return a policy of a run, or one that was saved by itself (`Policy.save`).
 
     Args:

@@ -72,7 +72,7 @@ class RunDirectory:
         return cls(path, manifests.read(content))
 
     @classmethod
-    def open(cls, path: str | Path) -> RunDirectory:
+    def open(cls, path: str | os.PathLike[str]) -> RunDirectory:
         """Open a run that exists; where its manifest is lost or damaged, from the copy in its newest checkpoint.
 
         Raises:

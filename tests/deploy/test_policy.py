@@ -15,14 +15,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from manifests import make_set
 from policies import DICT_PARTS, contract, random_layers, random_network, random_policy
 
 from csac.deploy import contract as contracts
 from csac.deploy.contract import Activation, Contract, sha256_of, write_with_checksum
 from csac.deploy.policy import Policy
-from csac.record.atomic import write_atomically
-from csac.record.manifest import Manifest
-from csac.record.run import RunDirectory
+from csac.record.files import write_atomically
 from csac.types import InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
 
 
@@ -352,8 +351,8 @@ def test_a_contract_without_a_named_task_is_kept(tmp_path):
 def test_a_policy_needs_numpy_and_safetensors_and_nothing_else(tmp_path):
     """What a robot has: Python, these two and this package."""
     policy = random_policy(contract(DICT_PARTS, (2,)))
-    run = RunDirectory.create(tmp_path / "run", Manifest(task="Task-v0", algorithm="csac", seeds=(3,), steps=9))
-    policy.write(run.policy(3))
+    (run,) = make_set(tmp_path / "run", (3,), task="Task-v0", algorithm="csac", steps=9).runs
+    policy.write(run.policy_file())
     code = f"""
 import sys
 
@@ -373,7 +372,7 @@ print(*action.tolist())
     assert done.returncode == 0, done.stderr
     expected, _ = policy.predict({"speed": 0.5, "position": [[0.3, 0.4]], "achieved": [0.1, 0.2]})
     np.testing.assert_array_equal(np.array(done.stdout.split(), np.float32), expected)
-    assert (tmp_path / "again" / "policy.safetensors").read_bytes() == run.policy(3).read_bytes()
+    assert (tmp_path / "again" / "policy.safetensors").read_bytes() == run.policy_file().read_bytes()
 
 
 @given(st.data())

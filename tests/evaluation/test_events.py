@@ -18,8 +18,8 @@ from csac.console.progress import Reporter
 from csac.evaluation.episode import _number
 from csac.evaluation.evaluator import Evaluator
 from csac.evaluation.play import evaluate_run
-from csac.record.csv_tables import read_rows
 from csac.record.run import RunDirectory
+from csac.record.tables import read_rows
 from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.training.train import resume, train
 from csac.types import InputError
@@ -87,7 +87,7 @@ def cases(tmp_path_factory):
 
 def test_events_are_columns_after_success(cases):
     run, _ = cases
-    lines = (run.path / "evaluations.csv").read_text().splitlines()
+    lines = (run.runs[0].path / "evaluations.csv").read_text().splitlines()
     assert lines[0] == "seed,step,episode,return,length,success,crashed,stops,nothing"
     expected = []
     for step in (20, 40):
@@ -98,7 +98,7 @@ def test_events_are_columns_after_success(cases):
 
 
 def test_events_are_curves_of_tensorboard(cases):
-    found = scalars(cases[0].path / "tensorboard" / "seed_0")
+    found = scalars(cases[0].runs[0].path / "tensorboard")
     mean = (story(0)[1] + story(1)[1]) / 2
     assert found["eval/stops"] == [(20, mean), (40, mean)]
     assert {"eval/crashed", "eval/success_rate"} <= found.keys()
@@ -108,13 +108,13 @@ def test_events_are_curves_of_tensorboard(cases):
 def test_a_name_that_nobody_says_is_noted_once(cases):
     run, reporter = cases
     (note,) = [line for line in reporter.notes if "nothing" in line]
-    assert (run.path / "log.txt").read_text().count(note) == 1
+    assert (run.runs[0].path / "log.txt").read_text().count(note) == 1
 
 
 def test_events_stay_in_a_longer_run_and_in_a_fork(cases, tmp_path):
     forked = train(TINY, "probes:Cases-v0", steps=60, directory=tmp_path / "fork", start_from=cases[0].path, **SHORT)
     assert forked.evaluations.dtype.names == cases[0].evaluations.dtype.names
-    assert resume(tmp_path / "fork", steps=80).manifest.events == ("crashed", "stops", "nothing")
+    assert resume(tmp_path / "fork", steps=80).config.events == ("crashed", "stops", "nothing")
     with pytest.raises(InputError, match="stops"):
         train(TINY, "probes:Cases-v0", steps=80, directory=tmp_path / "fork", events=[], resume=True, **SHORT)
 
@@ -151,7 +151,7 @@ def test_evaluate_writes_its_episodes_where_nothing_is(tmp_path, monkeypatch, ca
 def test_the_example_of_the_documentation_runs(tmp_path, capsys):
     example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "own_task.py"))
     example["main"](tmp_path / "run", 600)
-    run = RunDirectory.open(tmp_path / "run")
+    run = RunDirectory.open(tmp_path / "run" / "seed-0")
     assert (run.evaluations.dtype.names or ())[-3:] == ("success", "off_the_rail", "reversals")
-    assert run.manifest.inexact_seeds == ()
+    assert not run.manifest.restarts_episode
     assert capsys.readouterr().out.startswith("success ")

@@ -6,12 +6,14 @@ import dataclasses
 import json
 import shlex
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from artefacts import HAS_COMPILER
 from gymnasium.spaces import Box
+from manifests import make_set
 from policies import algorithm_policy, contract, random_policy
 
 import csac.evaluation.export as exporting
@@ -24,8 +26,7 @@ from csac.deploy.export import provenance
 from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import evaluate
 from csac.evaluation.export import check_returns, control_rate, export_run
-from csac.record.manifest import Manifest
-from csac.record.run import RunDirectory
+from csac.record.sets import RunSet
 from csac.training.train import train
 from csac.types import InputError
 
@@ -55,33 +56,23 @@ class Follow(gymnasium.Env):
 gymnasium.register("Follow-v0", entry_point=f"{__name__}:Follow") if "Follow-v0" not in gymnasium.registry else None
 
 
-def make_run(path: Path, algorithm: str = "csac", task: str = "Follow-v0") -> RunDirectory:
-    """A finished run of two seeds that has learnt nothing; seed 1 was better at its last evaluation."""
-    manifest = Manifest(
-        task=task,
-        algorithm=algorithm,
-        hyperparameters={"batch_size": 8},
-        seeds=(0, 1),
-        steps=200,
-        steps_done=200,
-        commit="0123456",
-        command="csac train Follow-v0",
-        state="finished",
-        versions={"csac": "0.1.0"},
-    )
-    run, policy = RunDirectory.create(path, manifest), algorithm_policy(algorithm)
-    for seed in (0, 1):
+def make_run(path: Path, algorithm: str = "csac", task: str = "Follow-v0", **values: Any) -> RunSet:
+    """Two finished seeds that have learnt nothing; seed 1 was better at its last evaluation."""
+    given = {"task": task, "algorithm": algorithm, "hyperparameters": {"batch_size": 8}, "steps": 200, **values}
+    given |= {"commit": "0123456", "command": "csac train Follow-v0", "versions": {"csac": "0.1.0"}}
+    runs, policy = make_set(path, (0, 1), **given), algorithm_policy(algorithm)
+    for run, returns in zip(runs.runs, ((6.0, 1.0), (5.0, 3.0)), strict=True):
         agreement = dataclasses.replace(policy.contract, task=task)
-        Policy(policy.network, agreement, step=200).write(run.policy(seed))
-        Policy(policy.network, agreement, step=100).write(run.policy(seed, "best"))
-    rows = [
-        {"seed": seed, "step": step, "episode": episode, "return": value + episode, "length": 20, "success": None}
-        for step, values in ((100, (6.0, 5.0)), (200, (1.0, 3.0)))
-        for seed, value in enumerate(values)
-        for episode in range(3)
-    ]
-    run.append("evaluations", rows)
-    return run
+        Policy(policy.network, agreement, step=200).write(run.policy_file())
+        Policy(policy.network, agreement, step=100).write(run.policy_file("best"))
+        row = {"seed": run.seed, "length": 20, "success": None}
+        rows = [
+            {**row, "step": step, "episode": episode, "return": value + episode}
+            for step, value in zip((100, 200), returns, strict=True)
+            for episode in range(3)
+        ]
+        run.append("evaluations", rows)
+    return runs
 
 
 @pytest.fixture(autouse=True)
@@ -126,17 +117,18 @@ SPREAD = ("standard_deviation", "interval_95")
 
 def test_the_best_policy_of_a_seed_comes_with_its_own_evaluation(tmp_path):
     run = make_run(tmp_path / "run")
-    origin = provenance(run, 0, load(run.path, 0, "best"), "best")
+    origin = provenance(run, run.run(0), load(run, 0, "best"), "best")
     assert (origin["seed"], origin["steps"], origin["evaluation"]["mean_return"]) == (0, 100, 7.0)
     stopped = Policy(load(run.path, 0).network, load(run.path, 0).contract, step=230)  # between two evaluations
-    origin = provenance(run, 0, stopped, "last")
+    origin = provenance(run, run.run(0), stopped, "last")
     assert (origin["steps"], origin["evaluation"]["step"]) == (230, 200)
 
 
 def test_a_seed_that_failed_says_so_and_counts_in_no_mean(tmp_path):
-    run = make_run(tmp_path / "run")
-    run.update_manifest(failures={0: "step 120: its reward is nan"}, perturbations=["action_noise=0.1@100"])
-    origin = provenance(run, 1, load(run.path, 1), "last")
+    run = make_run(
+        tmp_path / "run", failures={0: "step 120: its reward is nan"}, perturbations=["action_noise=0.1@100"]
+    )
+    origin = provenance(run, run.run(1), load(run, 1), "last")
     assert (origin["failure"], origin["all_seeds"]["mean_return"]) == (None, 4.0)  # of seed 1 alone: 3, 4 and 5
     exported = export_run(run.path, seed=0, episodes=1)
     assert exported.fields["provenance"]["failure"] == "step 120: its reward is nan"
@@ -147,20 +139,19 @@ def test_a_seed_that_failed_says_so_and_counts_in_no_mean(tmp_path):
 
 
 def test_weights_that_are_learnt_come_with_what_they_had_become(tmp_path):
-    run = make_run(tmp_path / "run")
-    run.update_manifest(hyperparameters={"entropy_weight": "auto", "relative_entropy_weight": 0.5})
-    rows = [(0, 100, 0.4), (1, 100, 0.3), (0, 200, 0.2), (1, 200, 0.1)]
-    run.append("metrics", [{"seed": seed, "step": step, "entropy_weight": value} for seed, step, value in rows])
-    assert provenance(run, 0, load(run.path, 0), "last")["learnt_weights"] == {"entropy_weight": 0.2}
-    assert provenance(run, 0, load(run.path, 0, "best"), "best")["learnt_weights"] == {"entropy_weight": 0.4}
+    run = make_run(tmp_path / "run", hyperparameters={"entropy_weight": "auto", "relative_entropy_weight": 0.5})
+    rows = [(0, 100, 0.4), (0, 200, 0.2)]
+    run.run(0).append("metrics", [{"seed": seed, "step": step, "entropy_weight": value} for seed, step, value in rows])
+    assert provenance(run, run.run(0), load(run, 0), "last")["learnt_weights"] == {"entropy_weight": 0.2}
+    assert provenance(run, run.run(0), load(run, 0, "best"), "best")["learnt_weights"] == {"entropy_weight": 0.4}
     card = (export_run(run.path, seed=0, episodes=0, card=True).place / "README.md").read_text()
     assert "| entropy_weight | `auto`, at last 0.2 |" in card
     assert "| relative_entropy_weight | `0.5` |" in card
 
 
 def test_infinite_arguments_of_a_task_stand_in_its_contract_as_text(tmp_path):
-    run = make_run(tmp_path / "run")
-    run.update_manifest(environment_arguments={"reach": float("inf")}, hyperparameters={"bounds": [float("nan")]})
+    infinite = {"environment_arguments": {"reach": float("inf")}, "hyperparameters": {"bounds": [float("nan")]}}
+    run = make_run(tmp_path / "run", **infinite)
     origin = told(export_run(run.path, episodes=1, card=True).place)["provenance"]
     assert origin["environment_arguments"] == {"reach": "Infinity"}
     assert origin["hyperparameters"] == {"bounds": ["NaN"]}
@@ -284,11 +275,11 @@ def test_a_run_is_trained_exported_and_described(tmp_path, monkeypatch, capsys):
 def test_a_changed_policy_is_not_evaluated_and_not_exported(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run, other = make_run(Path("run")), make_run(Path("other"), "td3")
-    run.policy(1).write_bytes(other.policy(1).read_bytes())
+    run.run(1).policy_file().write_bytes(other.run(1).policy_file().read_bytes())
     for command in ("evaluate run --episodes 1", "export run"):
         assert csac(command) == 2
         said = capsys.readouterr().err
-        assert "run/policy/seed_1.safetensors does not match its checksum" in said
+        assert "run/seed-1/policy/last.safetensors does not match its checksum" in said
         assert said.count("\n") == 1
 
 

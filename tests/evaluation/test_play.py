@@ -11,15 +11,15 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from gymnasium import spaces
+from manifests import make_set
 from policies import contract, random_policy
 
 from csac.cli import main
 from csac.deploy.contract import Contract
 from csac.evaluation import play as playing
 from csac.evaluation.play import evaluate_run, play
-from csac.record.csv_tables import read_rows
-from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
+from csac.record.tables import read_rows
 from csac.types import InputError
 
 # JAX may be loaded here; where csac plays, it is not.
@@ -62,8 +62,8 @@ def run_of(tmp_path):
         task = f"Stripes-v{steps or 0}"
         if task not in gymnasium.registry:
             gymnasium.register(task, entry_point=f"{__name__}:Stripes", max_episode_steps=steps)
-        run = RunDirectory.create(tmp_path / "run", Manifest(task=task, algorithm="csac", seeds=(0,), steps=9))
-        random_policy(agreement).write(run.policy(0))
+        (run,) = make_set(tmp_path / "run", task=task, algorithm="csac", steps=9).runs
+        random_policy(agreement).write(run.policy_file())
         return run
 
     return make

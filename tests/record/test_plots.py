@@ -50,9 +50,9 @@ def test_three_seeds_are_shown_with_their_range_and_their_mean():
     axes = axes_of(("csac", rows))
     *single, mean = axes.lines
     by_seed = rows["return"].reshape(4, 3).T
-    np.testing.assert_allclose([line.get_ydata() for line in single], by_seed)
-    np.testing.assert_allclose(mean.get_ydata(), by_seed.mean(axis=0))
-    np.testing.assert_array_equal(mean.get_xdata(), [5000, 10000, 15000, 20000])
+    np.testing.assert_allclose(np.array([np.asarray(line.get_ydata()) for line in single]), by_seed)
+    np.testing.assert_allclose(np.asarray(mean.get_ydata()), by_seed.mean(axis=0))
+    np.testing.assert_array_equal(np.asarray(mean.get_xdata()), [5000, 10000, 15000, 20000])
     for step, returns in zip((5000, 10000, 15000, 20000), by_seed.T, strict=True):
         assert band(axes, step) == pytest.approx((returns.min(), returns.max()))
     assert note(axes) == "line: mean over seeds · thin: single seeds · band: range of seeds"
@@ -112,14 +112,14 @@ def test_a_wide_band_does_not_flatten_the_curves():
 
 def test_marks_are_vertical_lines_with_their_text():
     axes = axes_of(("csac", evaluations(1)), marks=[(30_000, "friction × 1.5")])
-    assert list(axes.lines[-1].get_xdata()) == [30_000, 30_000]
+    assert np.asarray(axes.lines[-1].get_xdata()).tolist() == [30_000, 30_000]
     assert [text.get_text() for text in axes.texts] == ["friction × 1.5"]
 
 
 def test_a_seed_that_ended_early_and_a_single_point_are_drawn():
     rows = evaluations(seeds=2, points=3)
     *_, mean, first, second, point = axes_of(("csac", rows[:-1]), ("sac", rows[:2])).lines
-    assert mean.get_ydata()[-1] == rows["return"][-2]
+    assert np.asarray(mean.get_ydata())[-1] == rows["return"][-2]
     assert [line.get_marker() for line in (first, second, point)] == ["o", "o", "o"]
 
 

@@ -171,6 +171,7 @@ def test_each_change_has_a_table_as_far_as_the_next(tmp_path):
 def test_success_has_curves_where_the_task_tells_of_it(tmp_path):
     write_run(tmp_path / "seed-0", config(), success=1.0)
     heading, picture = success(read_arms([tmp_path]))
+    assert isinstance(picture, Picture)
     assert (heading, picture.title) == (Heading("Success"), "Ant-v4, success")
     assert np.all(picture.figure.axes[0].lines[0].get_ydata() == 1.0)
 

@@ -49,7 +49,8 @@ def test_what_is_over_is_left_alone_and_the_rest_goes_on(tmp_path, supervised):
     write_run(tmp_path / one.folder, one.config)
     write_run(tmp_path / two.folder, two.config, state="failed")
     write_run(tmp_path / three.folder, three.config, state="interrupted", points=4)
-    assert three.open(tmp_path).state == "interrupted"
+    assert (begun := three.open(tmp_path))
+    assert begun.state == "interrupted"
     run_study([one, two, three, four], tmp_path, How(), make_console())
     ((programs, _, _),) = supervised
     assert [program.directories[0] for program in programs] == [tmp_path / three.folder, tmp_path / four.folder]
@@ -61,7 +62,8 @@ def test_more_steps_later_go_on(tmp_path, supervised):
     (longer, *_) = tiny_study(tmp_path, steps=2_000).runs()
     write_run(tmp_path / run.folder, run.config)
     run_study([longer], tmp_path, How(), make_console())
-    assert longer.open(tmp_path).config.steps == 2_000
+    assert (begun := longer.open(tmp_path))
+    assert begun.config.steps == 2_000
 
 
 @pytest.mark.parametrize("change", [{"evaluation_interval": 300}, {"steps": 500}])

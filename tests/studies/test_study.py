@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -84,7 +85,8 @@ def test_a_part_of_a_study():
     study = find("mujoco").narrowed(["Ant-v4"], ["PPO", "csac"], 2)
     assert [method.label for method in study.methods] == ["CSAC (paper)", "CSAC (periodic)", "PPO"]
     assert len(study.runs()) == 6
-    for wrong in ({"tasks": ["Ant-v3"]}, {"methods": ["TD4"]}):
+    wrongs: list[dict[str, Any]] = [{"tasks": ["Ant-v3"]}, {"methods": ["TD4"]}]
+    for wrong in wrongs:
         with pytest.raises(InputError, match=r"did you mean (Ant-v4|td3)\?"):
             find("mujoco").narrowed(**wrong)
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def trained(monkeypatch):
     """Trials that are not trained: a seed's return at a step is `score(discount, step)`."""
     found = []
 
-    def train(algorithm, task, *, directory, stop_when, seeds, first_seed, steps, evaluation_interval, **options):
+    def trained(algorithm, task, *, directory, stop_when, seeds, first_seed, steps, evaluation_interval, **options):
         found.append((algorithm, directory, options))
         score = train.score(algorithm.discount)
         for seed in range(first_seed, first_seed + seeds):
@@ -58,6 +59,7 @@ def trained(monkeypatch):
                     return RunSet.open(directory)
         return RunSet.open(directory)
 
+    train: Any = trained
     train.score, train.interrupted_at, train.found = lambda discount: 100 * discount, None, found
     monkeypatch.setattr(module, "train", train)
     return train
@@ -196,6 +198,7 @@ def test_a_trial_whose_process_died_is_taken_up_again(tmp_path, trained):
     tune(search(), tmp_path, 1, None, make_console())
     study = module._open(search(), tmp_path)
     lost = module._next(study, search(), tmp_path, 2)
+    assert lost
     assert module._next(study, search(), tmp_path, 2) is None  # another process has it
     lost.lock.close()
     tune(search(), tmp_path, 2, None, make_console())

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from manifests import make_set
 
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.record.manifest import Manifest
-from csac.record.run import RunDirectory
+from csac.record.sets import RunSet
 from csac.tasks.environment import Environment
 from csac.types import Layer, PolicyNetwork, PolicyParameters
 
@@ -30,19 +30,10 @@ def policy_for(task: Any, width: int = 8, seed: int = 0) -> Policy:
 
 def run_of_task(
     path: Path, task: str, events: tuple[str, ...] = (), seeds: tuple[int, ...] = (0,), arguments: Any = None
-) -> RunDirectory:
-    """Return a finished run with a random policy for each seed."""
-    manifest = Manifest(
-        task=task,
-        algorithm="sac",
-        seeds=seeds,
-        steps=9,
-        steps_done=9,
-        events=events,
-        environment_arguments=arguments or {},
-    )
-    run = RunDirectory.create(path, manifest)
-    for seed in seeds:
-        policy_for(task, seed=seed).write(run.policy(seed))
-    run.update_manifest(state="finished")
-    return run
+) -> RunSet:
+    """Return a finished set with a random policy for each seed."""
+    given = {"algorithm": "sac", "steps": 9, "events": events, "environment_arguments": arguments or {}}
+    runs = make_set(path, seeds, task=task, **given)
+    for run in runs.runs:
+        policy_for(task, seed=run.seed).write(run.policy_file())
+    return runs

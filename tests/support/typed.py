@@ -83,7 +83,8 @@ def make_runs(path, task="Pictures-v0", size=3, low=(-2.0,), high=(2.0,), **valu
     for run in runs.runs:
         weight = generator.normal(size=(size, 2 * len(low))).astype(np.float32)
         network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * len(low), np.float32)),),)))
-        Policy(network, contract, step=100).save_in(run.policies, ("last", "best"))
+        for which in ("last", "best"):
+            Policy(network, contract, step=100).write(run.policy_file(which))
     return runs
 
 

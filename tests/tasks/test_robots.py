@@ -206,7 +206,7 @@ def test_a_robots_run_is_stopped_and_goes_on(tmp_path, task):
     run = train(TINY, task, steps=40, directory=tmp_path / "run", **short)
     before = run.evaluations
     grown = resume(tmp_path / "run", steps=60)
-    assert (grown.manifest.state, grown.manifest.steps_done) == ("finished", 60)
+    assert (grown.state, grown.steps_done) == ("finished", 60)
     rows = grown.evaluations
     assert sorted(set(rows["step"].tolist())) == [20, 40, 60]
     np.testing.assert_array_equal(rows["return"][: len(before)], before["return"])

@@ -9,10 +9,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from manifests import make_set
 from policies import contract, random_policy
 
-from csac.record.manifest import Manifest
-from csac.record.run import RunDirectory
 from csac.tasks import trust
 from csac.types import InputError
 
@@ -57,8 +56,8 @@ def stranger(tmp_path, monkeypatch):
 
     def make_run(task: str) -> Path:
         path = folder / "run"
-        manifest = Manifest(task=task, algorithm="csac", seeds=(0,), steps=9, state="finished", steps_done=9)
-        random_policy(contract()).write(RunDirectory.create(path, manifest).policy(0))
+        (run,) = make_set(path, task=task, algorithm="csac", steps=9).runs
+        random_policy(contract()).write(run.policy_file())
         return path
 
     return SimpleNamespace(folder=folder, marker=marker, make_run=make_run, state=tmp_path / "state")

@@ -158,13 +158,13 @@ def test_the_programs_of_one_worker_serve_the_others(tmp_path, choices):
     algorithm = CSAC(batch_size=8, warmup_steps=50, **TINY)
     settings: dict[str, Any] = {"steps": 100, "evaluation_episodes": 1, "checkpoint_interval": 0, "tensorboard": False}
 
-    train(algorithm, "Pendulum-v1", seeds=2, groups=2, directory=tmp_path / "first", **settings)
+    train(algorithm, "Pendulum-v1", seeds=2, directory=tmp_path / "first", **settings)
     programs = kept(tmp_path / "csac")
-    train(algorithm, "Pendulum-v1", seeds=2, groups=2, directory=tmp_path / "second", **settings)
+    train(algorithm, "Pendulum-v1", seeds=2, directory=tmp_path / "second", **settings)
 
     assert programs
     assert kept(tmp_path / "csac") == programs
-    first, second = (tmp_path / name / "metrics.csv" for name in ("first", "second"))
+    first, second = (tmp_path / name / "seed-0" / "metrics.csv" for name in ("first", "second"))
     assert first.read_bytes() == second.read_bytes()
 
 

@@ -132,9 +132,9 @@ def test_a_gpu_s_libraries_are_recorded(monkeypatch):
     monkeypatch.setattr(provenance_module, "distributions", lambda: [SimpleNamespace(name=name) for name in installed])
     monkeypatch.setattr(provenance_module, "version", lambda name: installed.get(name, "2"))
     monkeypatch.setattr(provenance_module, "in_use", lambda: {"gpu": "GPU A"})
-    on_gpu = provenance_module.provenance("Pendulum-v1", None)["versions"]
+    on_gpu = provenance_module.provenance("Pendulum-v1", None, 1)["versions"]
     monkeypatch.setattr(provenance_module, "in_use", lambda: {"gpu": ""})
-    on_cpu = provenance_module.provenance("Pendulum-v1", None)["versions"]
+    on_cpu = provenance_module.provenance("Pendulum-v1", None, 1)["versions"]
     assert on_gpu == {**on_cpu, "jax-cuda13-plugin": "0.11", "nvidia-cublas": "13.1"}
 
 

@@ -1,4 +1,4 @@
-"""A scheduler types the same line again: runs that have begun with others' checkpoints, and folders with more in them."""
+"""A scheduler types the same line again: runs that began with others' checkpoints, and folders with more in them."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import weakref
 from typing import Any
@@ -16,10 +15,9 @@ import trainer  # noqa: F401  (its cache of compiled programs)
 from csac.algorithms import ALGORITHMS, CSAC, SAC, TD3
 from csac.algorithms.memory import row_width
 from csac.tasks.seeds import Steps
-from csac.training.checkpoint import SCHEMA_VERSION, Checkpoint, Checkpoints, Damaged
+from csac.training.checkpoint import SCHEMA_VERSION, Checkpoint, Damaged, Writer
 from csac.training.learner import Learner, misfit
 from csac.training.packing import by_name
-from csac.training.seed_files import SeedFiles
 from csac.types import Snapshot, Spec
 
 SPEC = Spec(3, 1)
@@ -40,8 +38,8 @@ def advance(learner: Learner, seeds: int, first: int, last: int) -> np.ndarray:
 def test_a_checkpoint_names_its_arrays_by_where_they_are_in_the_state(tmp_path):
     learner = Learner(TD3(**TINY), SPEC, [0], 100)
     ring = learner.memory(0, 0)
-    name = next(name for name in SeedFiles(tmp_path, 0, {}).write(0, learner.save(0), ring) if "step_0" in name)
-    arrays = safetensors.numpy.load((tmp_path / name).read_bytes())
+    Writer(tmp_path, 2).write(0, learner.save(0), ring, {})
+    arrays = safetensors.numpy.load((tmp_path / "step_0" / "state.safetensors").read_bytes())
 
     networks = ["actor", "target_actor", "critics.0", "critics.1", "target_critics.0", "target_critics.1"]
     parts = [f"layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
@@ -52,13 +50,12 @@ def test_a_checkpoint_names_its_arrays_by_where_they_are_in_the_state(tmp_path):
     np.testing.assert_array_equal(arrays["state.actor.layers.1.bias"], learner.carry(0).state.actor.layers[1].bias)
 
 
-def test_a_checkpoint_of_the_schema_before_is_refused_in_one_line(tmp_path):
-    Checkpoints(tmp_path, 2).commit(5, {}, {})
-    path = tmp_path / "step_5.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "schema_version": SCHEMA_VERSION - 1}))
-    with pytest.raises(
-        Damaged, match=rf"^{path} is of schema {SCHEMA_VERSION - 1} and this csac reads {SCHEMA_VERSION}: go on with"
-    ):
+def test_a_checkpoint_of_the_schema_before_is_refused_in_one_line(tmp_path, monkeypatch):
+    learner = Learner(TD3(**TINY), SPEC, [0], 100)
+    with monkeypatch.context() as older:
+        older.setattr("csac.training.checkpoint.SCHEMA_VERSION", SCHEMA_VERSION - 1)
+        Writer(tmp_path, 2).write(5, learner.save(0), learner.memory(0, 0), {})
+    with pytest.raises(Damaged, match=f"schema {SCHEMA_VERSION - 1}"):
         Checkpoint.open(tmp_path, 5)
 
 

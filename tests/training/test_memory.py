@@ -122,7 +122,7 @@ class Watcher:
 
     def update(self, state, batch, key, step):
         drawn, times = state.drawn.at[step].set(batch.observation), state.times.at[step].add(1)
-        return state._replace(drawn=drawn, times=times), {"step": step}
+        return state._replace(drawn=drawn, times=times), {"number": step}
 
     def policy(self, state):
         layer = Layer(state.weight, jnp.zeros(2))  # a bias that is in no state has no seed axis

@@ -73,7 +73,7 @@ def joined(tables: list[Path]) -> bytes:
     rows = [line for table in tables for line in table.read_bytes().splitlines(keepends=True)[1:]]
     columns = headers.decode().strip().split(",")
     order = [columns.index(name) for name in ("step", "seed", "episode") if name in columns]
-    return headers + b"".join(sorted(rows, key=lambda row: [int(row.split(b",")[place]) for place in order]))
+    return headers + b"".join(sorted(rows, key=lambda row: [int(bytes(row).split(b",")[place]) for place in order]))
 
 
 def machine() -> str:

@@ -9,16 +9,18 @@ import numpy as np
 import probes
 import pytest
 from logs import log_lines
-from plans import settings
 from resuming import LEARNERS, Crash, contents, crash_at, run
+from trainer import Silent
 
 from csac.deploy.choosing import load
 from csac.evaluation.evaluator import Evaluator
-from csac.record.manifest import Origin
+from csac.record.config import RunConfig
+from csac.record.manifest import Manifest, Origin
+from csac.record.run import RunDirectory
 from csac.tasks.perturbations import perturbations_of, values_at
 from csac.tasks.seeds import EVALUATION_SEED
-from csac.training import messages
-from csac.training.group import Group
+from csac.training.loop import Loop, Program
+from csac.training.resume import ResumePoint
 from csac.training.train import resume
 from csac.types import InputError
 
@@ -27,33 +29,48 @@ def model_of(environment: Any) -> Any:
     return environment.raw.unwrapped.model
 
 
-# In the group.
+# In the loop.
 
 
-def group(folder: Path, perturbations: Any, begin: int = 0, task: Any = "Hopper-v4") -> Group:
-    changes = perturbations_of(perturbations)
-    return Group(settings(LEARNERS[0], task, 400, folder, begin, evaluation_interval=30, perturbations=changes), (3,))
+class Paused:
+    """A loop that is run a few steps at a time."""
 
+    def __init__(self, folder: Path, perturbations: Any, task: Any = "Hopper-v4") -> None:
+        config = RunConfig(
+            task=task if isinstance(task, str) else "probe",
+            steps=400,
+            seed=3,
+            evaluation_interval=30,
+            evaluation_episodes=1,
+            checkpoint_interval=0,
+            perturbations=tuple(map(str, perturbations_of(perturbations))),
+        )
+        self.run = RunDirectory.create(folder, Manifest(config=config))
+        program = Program((self.run.path,), LEARNERS[0], task, threads=1, tensorboard=False)
+        self.loop = Loop(program, [self.run], [ResumePoint(None, [])], Silent())
 
-def advance(group: Group, until: int) -> list[messages.GroupMessage]:
-    return [event for event in group.run(lambda: group.step == until) if not isinstance(event, messages.Ended)]
+    def advance(self, until: int) -> None:
+        while self.loop.step < until:
+            self.loop._advance()
+            if self.loop.step % 30 == 0:
+                self.loop._evaluate()
 
 
 def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
     """In the environments, in the evaluations, and in what is remembered."""
-    perturbed = group(tmp_path, ["friction=2@30", "observation_noise=0.1@35", "action_noise=0.1@38"])
-    plain = group(tmp_path, ())
-    own = model_of(plain.environments.environments[0]).geom_friction.copy()
-    at_30 = [advance(one, 30) for one in (perturbed, plain)]
-    rows = [[event.rows for event in events if isinstance(event, messages.Evaluated)] for events in at_30]
-    assert rows[0] == rows[1]
-    assert len(rows[0]) == 1
-    training, evaluation = perturbed.environments.environments[0], perturbed.evaluator._environments[0]
+    perturbed = Paused(tmp_path / "perturbed", ["friction=2@30", "observation_noise=0.1@35", "action_noise=0.1@38"])
+    plain = Paused(tmp_path / "plain", ())
+    own = model_of(plain.loop.environments.environments[0]).geom_friction.copy()
+    for one in (perturbed, plain):
+        one.advance(30)
+    np.testing.assert_array_equal(perturbed.run.evaluations, plain.run.evaluations)
+    assert len(plain.run.evaluations) == 1
+    training, evaluation = perturbed.loop.environments.environments[0], perturbed.loop._base_evaluator._environments[0]
     for environment in (training, evaluation):
         np.testing.assert_array_equal(model_of(environment).geom_friction, own)
-    advance(perturbed, 31)
+    perturbed.advance(31)
     np.testing.assert_array_equal(model_of(training).geom_friction, 2 * own)
-    advance(perturbed, 60)
+    perturbed.advance(60)
     np.testing.assert_array_equal(model_of(evaluation).geom_friction, 2 * own)
     assert evaluation._noise
     assert evaluation._noise._levels == {"observation_noise": 0.1, "action_noise": 0.1}
@@ -62,10 +79,10 @@ def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
 def test_the_replay_holds_what_the_policy_saw_and_what_it_chose(tmp_path):
     """Endless observes 0: what is not 0 in the replay is noise. Its actions are as without any."""
     given = ["observation_noise=0.5@12", "action_noise=0.5@15"]
-    noisy, plain = (group(tmp_path, perturbations, task=probes.Endless) for perturbations in (given, ()))
-    for one in (noisy, plain):
-        advance(one, 39)  # the warm-up: actions are drawn, whatever is observed
-    rows, others = (one.learner.memory(0, 39).rows[:39] for one in (noisy, plain))
+    both = [Paused(tmp_path / name, p, probes.Endless) for name, p in (("noisy", given), ("plain", ()))]
+    for one in both:
+        one.advance(39)  # the warm-up: actions are drawn, whatever is observed
+    rows, others = (one.loop.learner.memory(0, 39).rows[:39] for one in both)
     observation, action, next_observation = rows[:, 0], rows[:, 1], rows[:, 3]
     np.testing.assert_array_equal(np.flatnonzero(next_observation), np.arange(12, 39))  # the step that makes 13
     np.testing.assert_array_equal(np.flatnonzero(observation), np.arange(13, 39))
@@ -76,8 +93,7 @@ def test_the_replay_holds_what_the_policy_saw_and_what_it_chose(tmp_path):
 
 
 def test_the_beginning_is_perturbed_from_the_first_observation(tmp_path):
-    noisy = group(tmp_path, "observation_noise=0.5", task=probes.Endless)
-    assert noisy._observations[0, 0] != 0
+    assert Paused(tmp_path / "noisy", "observation_noise=0.5", probes.Endless).loop._observations[0, 0] != 0
 
 
 # Whole runs. Evaluations every 100 steps, checkpoints every 100.
@@ -107,21 +123,20 @@ def test_a_run_is_the_same_until_it_is_perturbed(plain, perturbed):
 
 
 def test_a_run_says_what_it_was_perturbed_by(perturbed):
-    assert list(perturbed.manifest.perturbations) == [
+    assert list(perturbed.config.perturbations) == [
         "friction=2@200",
         "observation_noise=0.05@200",
         "mass=1.5@250",
         "action_noise=0.1@250",
         "friction=1@430",
     ]
-    log = log_lines(perturbed.path)
-    told = {number: line for number, line in enumerate(log) if line.startswith("perturbed")}
-    assert told == {
-        4: "perturbed from step 201 on: friction x 2, observation noise 0.05",
-        6: "perturbed from step 251 on: mass x 1.5, action noise 0.1",
-        10: "perturbed from step 431 on: friction x 1",
-    }
-    assert [log[number - 1].split(":")[0] for number in told] == ["step 200", "step 250", "step 400"]
+    log = log_lines(perturbed.runs[0].path)
+    told = [line for line in log if line.startswith("perturbed")]
+    assert told == [
+        "perturbed from step 201 on: friction x 2, observation noise 0.05",
+        "perturbed from step 251 on: mass x 1.5, action noise 0.1",
+        "perturbed from step 431 on: friction x 1",
+    ]
 
 
 def test_evaluations_meet_the_perturbed_task(perturbed):
@@ -138,8 +153,8 @@ def test_a_perturbed_run_that_crashed_goes_on_and_leaves_the_same_files(tmp_path
     with pytest.raises(Crash):
         run(tmp_path / "run", perturbations=GIVEN, on_evaluation=crash_at(crash + 50), **LONG)
     finished = resume(tmp_path / "run")
-    assert finished.manifest.history[0].step == crash // 100 * 100
-    assert contents(tmp_path / "run") == contents(perturbed.path)
+    assert finished.runs[0].manifest.history[0].step == crash // 100 * 100
+    assert contents(finished.runs[0]) == contents(perturbed.runs[0])
     curves = [(path / "curve.png").read_bytes() for path in (tmp_path / "run", perturbed.path)]
     assert curves[0] == curves[1]
 
@@ -147,28 +162,28 @@ def test_a_perturbed_run_that_crashed_goes_on_and_leaves_the_same_files(tmp_path
 @pytest.mark.parametrize("step", [100, 200])
 def test_a_fork_that_is_perturbed_equals_a_run_that_was_from_the_start(tmp_path, plain, perturbed, step):
     forked = run(tmp_path / "run", start_from=f"{plain.path}@{step}", perturbations=GIVEN, **LONG)
-    assert contents(forked.path) == contents(perturbed.path)
-    assert forked.manifest.perturbations == perturbed.manifest.perturbations
-    changes = (f"perturbations is [], not {list(perturbed.manifest.perturbations)!r}",)
-    assert forked.manifest.forked_from == Origin(str(plain.path), step, changes)
+    assert contents(forked.runs[0]) == contents(perturbed.runs[0])
+    assert forked.config.perturbations == perturbed.config.perturbations
+    changes = (f"perturbations is [], not {list(perturbed.config.perturbations)!r}",)
+    assert forked.runs[0].manifest.forked_from == Origin(str(plain.runs[0].path), step, changes)
 
 
 def test_a_fork_that_is_not_perturbed_equals_going_on(tmp_path, plain):
     forked = run(tmp_path / "run", start_from=f"{plain.path}@200", **LONG)
-    assert contents(forked.path) == contents(plain.path)
+    assert contents(forked.runs[0]) == contents(plain.runs[0])
 
 
 def test_a_fork_of_a_perturbed_run_keeps_what_had_happened(tmp_path, perturbed):
     """The last one, at 430, is still to come at 300: without a word of it, it is the same run."""
     whole = run(tmp_path / "same", start_from=f"{perturbed.path}@300", **LONG)
-    assert contents(whole.path) == contents(perturbed.path)
+    assert contents(whole.runs[0]) == contents(perturbed.runs[0])
     other = run(tmp_path / "other", start_from=f"{perturbed.path}@300", perturbations=(), **LONG)
-    assert other.manifest.perturbations == perturbed.manifest.perturbations[:4]
+    assert other.config.perturbations == perturbed.config.perturbations[:4]
     rows, before = other.evaluations, perturbed.evaluations
     np.testing.assert_array_equal(rows["return"][rows["step"] <= 400], before["return"][before["step"] <= 400])
-    assert contents(other.path)["evaluations.csv"] != contents(perturbed.path)["evaluations.csv"]
+    assert contents(other.runs[0])["evaluations.csv"] != contents(perturbed.runs[0])["evaluations.csv"]
     again = run(tmp_path / "other", start_from=f"{perturbed.path}@300", resume=True, **LONG)
-    assert again.manifest.perturbations == other.manifest.perturbations
+    assert again.config.perturbations == other.config.perturbations
     with pytest.raises(InputError, match=r"friction=1@430 .*the run ends at step 400"):
         run(tmp_path / "short", start_from=f"{perturbed.path}@300", steps=400)
 
