@@ -96,7 +96,7 @@ def read(content: bytes) -> Manifest:
     try:
         fields = json.loads(content)
         version = fields.pop("schema_version", None)
-    except (ValueError, RecursionError, AttributeError):
+    except (ValueError, RecursionError, AttributeError, TypeError):
         raise InputError("it is not a JSON object") from None
     if version != SCHEMA_VERSION or isinstance(version, bool):
         raise NewerError(f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}")

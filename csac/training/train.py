@@ -206,7 +206,7 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
         try:
             loop.run(should_stop)
         finally:
-            stopped = loop.step < loop.steps and (should_stop() or not loop.is_over)
+            stopped = not loop.is_over or (loop.step < loop.steps and should_stop())
             for run in runs:
                 if run.manifest.state == "running":
                     run.update_manifest(state="interrupted" if stopped else "finished")

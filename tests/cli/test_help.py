@@ -44,8 +44,8 @@ def test_the_help_of_train_explains_every_hyperparameter(capsys, monkeypatch, na
 @pytest.mark.parametrize("command", ["train", "tune"])
 @pytest.mark.parametrize(("task", "weight"), [("PyFlyt/QuadX-Waypoints-v1", 0.1), ("Hopper-v4", 0.5), ("", 0.5)])
 def test_the_help_shows_what_a_preset_sets_for_the_task(capsys, monkeypatch, command, task, weight):
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "100")
     csac(f"{command} {task} --preset paper --help")
-    output = " ".join(capsys.readouterr().out.split())
+    output = " ".join(line.strip("│ ") for line in capsys.readouterr().out.splitlines())
     assert f"(default: {weight})" in output.partition("--relative-entropy-weight ")[2].partition(" --")[0]
     assert "(default: paper)" in output

@@ -11,7 +11,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from gymnasium import spaces
-from manifests import make_set
+from manifests import make_set, manifest
 from policies import contract, random_policy
 
 from csac.cli import main
@@ -151,7 +151,7 @@ def test_the_policy_of_the_best_evaluation_can_be_tested_and_watched(run_of, tmp
     """Its rows are of the step at which it was saved."""
     run = run_of(3)
     best = random_policy(contract(), 5, step=6)
-    best.write(run.policy(0, "best"))
+    best.write(run.policy_file("best"))
     run.append("evaluations", [evaluation(step, value) for step, value in ((3, 1.0), (6, 8.0), (9, 2.0))])
     (expected,) = best.contract.to_environment(best.act(np.zeros((1, 2), np.float32)))[0]
     monkeypatch.chdir(tmp_path)
@@ -173,16 +173,14 @@ def test_evaluating_a_run_tells_how_far_it_is(run_of):
     assert told == [(10, 12), (12, 12)]
 
 
-def test_the_best_policies_of_a_run_are_those_of_the_seeds_that_were_evaluated(run_of, capsys):
+def test_the_best_policies_of_a_set_are_those_of_the_seeds_that_were_evaluated(run_of, tmp_path, capsys):
     run = run_of(3)
-    with pytest.raises(InputError, match="has no best policies, since no seed of it was evaluated"):
+    with pytest.raises(InputError, match="best"):
         list(evaluate_run(run.path, episodes=1, processes=1, which="best"))
-    run.update_manifest(seeds=(0, 1), failures={1: "step 5: it broke"})
-    for which in ("last", "best"):
-        random_policy(contract()).write(run.policy(0, which))
-    random_policy(contract()).write(run.policy(1))
-    run.append("evaluations", [{"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 3}])
-    assert [seed for seed, _ in evaluate_run(run.path, episodes=1, processes=1, which="best")] == [0]
-    assert main(["evaluate", str(run.path), "--checkpoint", "best", "--episodes", "1", "--processes", "1"]) == 0
-    said = "note: not tested, never evaluated in training and so without a best policy: seed 1\n"
-    assert said in capsys.readouterr().out
+    random_policy(contract()).write(run.policy_file("best"))
+    other = RunDirectory.create(tmp_path / "run" / "seed-1", manifest(task=run.config.task, steps=9, seed=1))
+    random_policy(contract()).write(other.policy_file())
+    places = str(tmp_path / "run")
+    assert [seed for seed, _ in evaluate_run(places, episodes=1, processes=1, which="best")] == [0]
+    assert main(["evaluate", places, "--checkpoint", "best", "--episodes", "1", "--processes", "1"]) == 0
+    assert "seed 1" in capsys.readouterr().out

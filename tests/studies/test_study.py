@@ -98,9 +98,8 @@ def test_the_studies_that_csac_brings(name):
     assert all(method.algorithm in ALGORITHMS for method in study.methods)
 
 
-@pytest.mark.parametrize("path", sorted(RESULTS.glob("*/*.toml")), ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_the_studies_of_the_results_can_be_read(path):
-    assert read_study(path).runs()
+def test_the_study_that_is_running_can_be_read():
+    assert len(read_study(RESULTS / "paper" / "paper.toml").runs()) == 40
 
 
 @pytest.mark.parametrize(
