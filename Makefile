@@ -44,7 +44,7 @@ test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
 slow: $(SETUP)  ## Run the tests that need longer: processes that are killed, clusters, browsers
 	$(VENV)/bin/pytest -m slow $(ARGS)
 
-chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave, 20 minutes: make chaos ARGS='--kills 12'
+chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave: make chaos ARGS='--kills 25'
 	.venv/bin/python tests/support/chaos.py --out results/reliability $(ARGS)
 
 results: $(SETUP)  ## Write the tables and pictures of results/ from the CSVs there

@@ -184,7 +184,7 @@ class Child:
         if code == UNGUARDED:
             raise InputError(
                 "this script starts processes that import it, and would run anew in each of them: put what it runs "
-                'under `if __name__ == "__main__":`, or use groups=1 and evaluation_processes=0'
+                'under `if __name__ == "__main__":`, or use seeds_per_process=seeds and evaluation_processes=0'
             )
         return "its process spoke no more and was killed" if code is None else cause_of_death(code)
 

@@ -31,6 +31,7 @@ NAMES = MappingProxyType(
         "--q-lr": "--critic-learning-rate",
         "--net-arch": _SIZES,
         "--hidden-sizes": _SIZES,
+        "--batch-size": "--minibatches (their number)",
         "--buffer-size": "--replay-size",
         "--learning-starts": "--warmup-steps",
         "--train-freq": "--update-interval",

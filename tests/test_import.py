@@ -89,7 +89,7 @@ def test_what_needs_no_learning_imports_no_jax(arguments, tiny_run):
 def test_loading_a_policy_imports_no_jax_and_no_task(tiny_run):
     code = "from csac import load; import numpy; load('run').predict(numpy.zeros(2))"
 
-    assert not {"jax", "jaxlib", "equinox", "optax", "gymnasium", "safetensors"} & modules_after(code, tiny_run)
+    assert not {"jax", "jaxlib", "equinox", "optax", "gymnasium"} & modules_after(code, tiny_run)
 
 
 def test_evaluating_in_python_imports_no_jax(tiny_run):

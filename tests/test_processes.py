@@ -63,8 +63,7 @@ def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
     """Each of its processes imports it, and would train anew; they say nothing."""
     script = tmp_path / "script.py"
     script.write_text(
-        "from csac import SAC, train\n"
-        "train(SAC(batch_size=8), 'Pendulum-v1', steps=100, seeds=2, groups=2, directory='run')\n"
+        "from csac import SAC, train\ntrain(SAC(batch_size=8), 'Pendulum-v1', steps=100, seeds=2, directory='run')\n"
     )
     result = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False)
     lines = result.stderr.strip().splitlines()

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import os
 import pickle
+import shutil
 import sys
 import warnings
-from contextlib import ExitStack, closing, nullcontext
+from contextlib import ExitStack, closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -135,7 +136,15 @@ def train(
         group = next(group for group in groups if config.seed in group)
         _create_or_extend(place, config, group, existing.get(config.seed), source)
     runs = RunSet(place, [RunDirectory.open(place / f"seed-{seed}") for seed in wanted])
-    return _run(runs, programs, watch, notes)
+    try:
+        return _run(runs, programs, watch, notes)
+    except InputError:  # such as a script without a guard: once mended, it begins in the same directory
+        for run in runs.runs:
+            if run.seed not in existing and RunDirectory.open(run.path).manifest.process is None:
+                shutil.rmtree(run.path)
+        with suppress(OSError):
+            place.rmdir()
+        raise
 
 
 def resume(
