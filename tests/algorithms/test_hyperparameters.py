@@ -139,7 +139,7 @@ def test_a_hyperparameter_of_another_name_is_refused_with_what_it_is_called_here
 
 def test_a_copy_with_a_hyperparameter_of_another_name_is_refused_alike():
     changes: dict[str, Any] = {"tau": 0.01}
-    with pytest.raises(InputError, match="SAC has no hyperparameter 'tau'.*target_rate"):
+    with pytest.raises(InputError, match=r"SAC has no hyperparameter 'tau'.*target_rate"):
         dataclasses.replace(SAC(), **changes)
     assert dataclasses.replace(SAC(), target_rate=0.01) == SAC(target_rate=0.01)
 
