@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 from csac.record.locks import is_locked
 from csac.record.run import LOCK, StorageFailure
 from csac.training.signals import stop_requested
-from csac.training.supervisor import begin_with, record_failure
+from csac.training.supervisor import record_failure
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from csac.training.loop import Program, Watcher
+    from csac.training.program import Program, Watcher
 
 RETRIES = 5  # of a run whose node or process was lost
 SECONDS_FOR_LOCK = 300.0  # a node that vanished keeps its locks until the file server's lease ends, a minute or two
@@ -120,8 +120,9 @@ def _train(program: Program, index: int, messages: Any) -> None:
     import ray
 
     watcher = _QueueWatcher(index, messages)
+    from csac.training.running import begin_with, train_program  # JAX
+
     begin_with(program.threads)
-    from csac.training.train import train_program
 
     for path in program.directories:
         _wait_until_free(path / LOCK)

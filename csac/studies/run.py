@@ -16,7 +16,7 @@ from csac.record.statistics import last_evaluations
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import perturbations_of
 from csac.training.config import algorithm_of, make_manifest
-from csac.training.loop import Program
+from csac.training.program import Program
 from csac.training.signals import stop_requested
 from csac.training.supervisor import supervise
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from csac.record.config import RunConfig
-    from csac.training.loop import Program
+    from csac.training.program import Program
     from csac.types import Algorithm, Spec
 
 # Measured resident size of a process with JAX, MuJoCo and the compiled programs, before its replay; CUDA adds.

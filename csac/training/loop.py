@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -24,57 +24,16 @@ from csac.training.resume import ResumePoint
 from csac.types import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Sequence
 
     from csac.evaluation.evaluator import EvaluationEpisode
     from csac.record.run import RunDirectory
-    from csac.tasks.registry import Task
-    from csac.types import Algorithm, PolicyNetwork
+    from csac.training.program import Program, Watcher
+    from csac.types import PolicyNetwork
 
 METRICS_INTERVAL = 1_000
 LOOK_INTERVAL = 500  # steps between two looks at what is due: rows to write, a signal, a diverged seed
 SECONDS_BETWEEN_CHECKPOINTS = 600.0
-
-
-class Program(NamedTuple):
-    """The runs that one process trains together, and how. Nothing here changes what they compute but `threads`."""
-
-    directories: tuple[Path, ...]
-    algorithm: Algorithm
-    task: Task
-    threads: int
-    """Cores that XLA divides its work for."""
-    evaluation_processes: int = 0
-    tensorboard: bool = True
-    wandb: bool | str = False
-    asks: bool = False
-    """Whether an evaluation waits to hear if training goes on (`stop_when`)."""
-    command: str | None = None
-
-
-class Watcher(Protocol):
-    """Who is told what happens, beside the run directories."""
-
-    def turn(self, step: int) -> None:
-        """Wait until it is this program's turn to train on, after so many steps."""
-        ...
-
-    def progress(self, steps: Mapping[int, int]) -> None:
-        """Take how many steps each seed has made."""
-        ...
-
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
-        """Take the mean return of each seed's evaluation; return whether training is to end."""
-        ...
-
-    def failed(self, seed: int, step: int, reason: str) -> None:
-        """Take that a seed is trained no more."""
-        ...
-
-    def note(self, text: str) -> None:
-        """Take a line for the user."""
-        ...
 
 
 class Loop:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 import traceback
@@ -11,7 +10,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any
 
-from csac.processes import Child, die_with_parent, end, move_to, outlive_termination, usable_cores
+from csac.processes import Child, die_with_parent, end, outlive_termination
 from csac.record.run import RunDirectory, StorageFailure
 from csac.types import InputError
 
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from pathlib import Path
 
-    from csac.training.loop import Program, Watcher
+    from csac.training.program import Program, Watcher
 
 SECONDS_TO_CLOSE = 5.0  # that a process has to close its environments
 
@@ -145,8 +144,9 @@ def _work(connection: Connection, program: Program) -> None:
     """Train a program in a process of its own."""
     die_with_parent()
     outlive_termination()
+    from csac.training.running import begin_with, train_program  # JAX
+
     begin_with(program.threads)
-    from csac.training.train import train_program
 
     watcher = _RemoteWatcher(connection, program.asks)
     try:
@@ -213,23 +213,6 @@ class _RemoteWatcher:
                 self.stopped.set()
                 self._answers.put(True)
             self._turns.put(None)
-
-
-def begin_with(threads: int) -> None:
-    """Have XLA divide its work for so many cores, and let this process run on every one.
-
-    XLA sizes its threads by the cores that it sees when JAX first looks for devices; later this does nothing.
-    """
-    import jax
-
-    cores = usable_cores()
-    if threads >= len(cores):
-        return
-    move_to(cores[os.getpid() % (len(cores) - threads + 1) :][:threads])
-    try:
-        jax.devices()
-    finally:
-        move_to(cores)
 
 
 def _seeds(runs: list[RunDirectory]) -> str:

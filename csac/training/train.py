@@ -4,32 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import pickle
 import shutil
-import sys
 import warnings
-from contextlib import ExitStack, closing, nullcontext, suppress
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from csac.checks import check_callable, check_flag, check_path, check_whole
+from csac.checks import check_callable, check_flag, check_path
 from csac.processes import core_quota, end_if_unguarded, usable_cores
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory
 from csac.record.statistics import last_evaluations
 from csac.record.wandb import import_wandb
 from csac.tasks.perturbations import by_step, perturbations_of
-from csac.tasks.preflight import seed_globals
 from csac.tasks.trust import refuse_untrusted
 from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs, make_manifest
-from csac.training.devices import choose_device, preallocates
+from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
-from csac.training.loop import Loop, Program
-from csac.training.provenance import provenance
-from csac.training.resume import Source, as_begun, continuation, refuse_differences, roll_back
-from csac.training.signals import Interrupted, stop_requested, storage_failures
-from csac.training.supervisor import begin_with, supervise
+from csac.training.program import Plan, Program, choose_groups
+from csac.training.resume import Source, as_begun, refuse_differences
+from csac.training.running import begin_with, train_program
+from csac.training.signals import Interrupted, stop_requested
+from csac.training.supervisor import supervise
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -41,16 +38,12 @@ if TYPE_CHECKING:
     from csac.record.config import RunConfig
     from csac.tasks.registry import Task
     from csac.training.config import TrainOptions
-    from csac.training.loop import Watcher
-    from csac.training.resume import ResumePoint
     from csac.types import Algorithm
 
     OnEvaluation = Callable[[int, dict[int, float]], Any]
     StopWhen = Callable[[int, dict[int, float]], bool]
 
 PROCESSES_PER_CORE = 4  # more only cost memory: further seeds wait for their turn
-PROCESSES_PER_GPU = 4  # eight were in each other's way
-SEEDS_PER_GPU_PROCESS = 5  # with fewer, one more process gains little
 
 
 def train(
@@ -125,8 +118,8 @@ def train(
     configs, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
     place = place or new_set_directory(configs[0].task, algorithm.name)
     existing = _existing(place, configs, resume, algorithm.cadence.has_schedule)
-    groups = _groups(wanted, existing, seeds_per_process, configs[0].device, task)
-    how = _How(algorithm, task, evaluation_processes, tensorboard, wandb, command, stop_when is not None)
+    groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task)
+    how = Plan(algorithm, task, evaluation_processes, tensorboard, wandb, command, stop_when is not None)
     programs = how.programs([[place / f"seed-{seed}" for seed in group] for group in groups], existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
     for config in configs:
@@ -184,56 +177,12 @@ def resume(
             with run.locked():
                 run.update_manifest(config=wanted)
     existing = {run.seed: run for run in runs.runs}
-    groups = _groups(runs.seeds, existing, None, config.device, config.task)
+    groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
     has_wandb = any((run.path / "wandb").exists() for run in runs.runs)
     has_tensorboard = any(run.tensorboard.exists() for run in runs.runs)
-    how = _How(algorithm, config.task, evaluation_processes, has_tensorboard, has_wandb, command, stop_when is not None)
+    how = Plan(algorithm, config.task, evaluation_processes, has_tensorboard, has_wandb, command, stop_when is not None)
     programs = how.programs([[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
-
-
-def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], bool]) -> None:
-    """Train the runs of a program in this process, from their newest checkpoint or their beginning.
-
-    Raises:
-        InputError: a run is in use, or cannot go on.
-        StorageFailure: as `train`.
-    """
-    runs = [RunDirectory.open(path) for path in program.directories]
-    with ExitStack() as stack, storage_failures(runs[0].path.parent):
-        for run in runs:
-            stack.enter_context(run.locked())
-            run.read_again()  # another process may have gone on with it before we had the lock
-        choose_device(runs[0].config.device)
-        seed_globals(runs[0].seed)
-        points = roll_back(runs)
-        current = provenance(program.task, program.command, program.threads)
-        for run, point in zip(runs, points, strict=True):
-            _note_begin(run, point, current, watcher)
-        loop = Loop(program, runs, points, watcher)
-        stack.callback(loop.close)
-        try:
-            loop.run(should_stop)
-        finally:
-            stopped = not loop.is_over or (loop.step < loop.steps and should_stop())
-            for run in runs:
-                if run.manifest.state == "running":
-                    run.update_manifest(state="interrupted" if stopped else "finished")
-
-
-def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], watcher: Watcher) -> None:
-    """Record in a run's manifest where and how it begins or goes on."""
-    before, history = run.manifest, run.manifest.history
-    after = dataclasses.replace(before, **current)
-    if before.process is not None:
-        entry, lines = continuation(before, after, point)
-        history = (*history, entry)
-        for line in lines:
-            run.log(line)
-            watcher.note(f"seed {run.seed}: {line}")
-    is_resting = before.state == "failed" and point.checkpoint and not point.checkpoint.values["environment"]["alive"]
-    state = {} if is_resting else {"state": "running", "failure": ""}
-    run.update_manifest(**current, **state, history=history, steps_done=point.step)
 
 
 def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_schedule: bool) -> dict[int, RunDirectory]:
@@ -266,73 +215,6 @@ def _create_or_extend(
     run = RunDirectory.create(place / f"seed-{config.seed}", source.begun(manifest) if source else manifest)
     if source:
         source.copy_to(run)
-
-
-def _groups(
-    seeds: Sequence[int],
-    existing: Mapping[int, RunDirectory],
-    seeds_per_process: int | None,
-    device: str,
-    task: Task,
-) -> list[list[int]]:
-    """Return the seeds of each program: as they were, as asked for, or as pays here."""
-    known = {existing[seed].manifest.program for seed in seeds if seed in existing}
-    together = [[seed for seed in group if seed in seeds] for group in sorted(known) if len(group) > 1]
-    rest = [seed for seed in seeds if not any(seed in group for group in together)]
-    size = seeds_per_process
-    if size is None:
-        size = len(rest) if not _can_be_sent(task) else 1
-        if device == "gpu":
-            processes = max(1, min(len(rest) // SEEDS_PER_GPU_PROCESS, len(usable_cores()) // 2, PROCESSES_PER_GPU))
-            size = max(1, -(-len(rest) // (1 if preallocates() else processes)))
-    check_whole("seeds_per_process", size, min(len(rest), 1), max(len(seeds), 1))
-    return together + [rest[i : i + size] for i in range(0, len(rest), max(size, 1))]
-
-
-class _How(NamedTuple):
-    """What all programs of a call have in common."""
-
-    algorithm: Algorithm
-    task: Task
-    evaluation_processes: int | None
-    tensorboard: bool
-    wandb: bool | str
-    command: str | None
-    asks: bool
-
-    def programs(
-        self, directories: Sequence[Sequence[Path]], existing: Mapping[int, RunDirectory], config: RunConfig
-    ) -> list[Program]:
-        """Return the programs of these directories. Raises InputError for what cannot be sent to a process."""
-        cores = len(usable_cores()[: core_quota()])
-        threads = max(1, cores // len(directories))
-        recorded = [run.manifest.machine.cores for run in existing.values() if run.manifest.process is not None]
-        threads = recorded[0] if recorded and recorded[0] <= cores else threads
-        spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
-        processes = self.evaluation_processes
-        if processes is None:
-            pays = spare > 0 and not self.asks and 0 < config.evaluation_interval < config.steps
-            processes = min(batches, max(1, spare // len(directories))) if pays and _can_be_sent(self.task) else 0
-        check_whole("evaluation_processes", processes, 0, 1_000)
-        if (processes or len(directories) > 1) and not _can_be_sent(self.task):
-            raise InputError(
-                "the task cannot be sent to another process: make it a function of a module that can be imported, or "
-                "train with seeds_per_process=seeds and evaluation_processes=0"
-            )
-        return [
-            Program(
-                tuple(group),
-                self.algorithm,
-                self.task,
-                threads,
-                processes,
-                self.tensorboard,
-                self.wandb,
-                self.asks,
-                self.command,
-            )
-            for group in directories
-        ]
 
 
 class _Watch:
@@ -436,17 +318,6 @@ def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:
         learning_curve([(runs.config.algorithm.upper(), rows)], runs.curve, title=runs.config.task, marks=marks)
     except Exception as error:
         note(f"note: the curve could not be drawn ({type(error).__name__}: {' '.join(str(error).split())})")
-
-
-def _can_be_sent(task: Task) -> bool:
-    """Return whether another process can be sent the task; it cannot import what a notebook or a terminal defined."""
-    if getattr(task, "__module__", "") == "__main__" and not hasattr(sys.modules["__main__"], "__file__"):
-        return False
-    try:
-        pickle.dumps(task)
-    except Exception:
-        return False
-    return True
 
 
 def _warmup_note(algorithm: Algorithm, config: RunConfig) -> list[str]:

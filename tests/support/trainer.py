@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from csac.record.config import RunConfig
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
-from csac.training.loop import Loop, Program
+from csac.training.loop import Loop
+from csac.training.program import Program
 from csac.training.resume import ResumePoint
 
 if TYPE_CHECKING:

@@ -19,7 +19,8 @@ from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
 from csac.tasks.perturbations import perturbations_of, values_at
 from csac.tasks.seeds import EVALUATION_SEED
-from csac.training.loop import Loop, Program
+from csac.training.loop import Loop
+from csac.training.program import Program
 from csac.training.resume import ResumePoint
 from csac.training.train import resume
 from csac.types import InputError

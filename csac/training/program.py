@@ -1,0 +1,142 @@
+"""What one process trains: the runs of a program, how they are chosen, and who watches them."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from csac.checks import check_whole
+from csac.processes import core_quota, usable_cores
+from csac.training.devices import preallocates
+from csac.types import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from csac.record.config import RunConfig
+    from csac.record.run import RunDirectory
+    from csac.tasks.registry import Task
+    from csac.types import Algorithm
+
+PROCESSES_PER_GPU = 4  # eight were in each other's way
+SEEDS_PER_GPU_PROCESS = 5  # with fewer, one more process gains little
+
+
+class Program(NamedTuple):
+    """The runs that one process trains together, and how. Nothing here changes what they compute but `threads`."""
+
+    directories: tuple[Path, ...]
+    algorithm: Algorithm
+    task: Task
+    threads: int
+    """Cores that XLA divides its work for."""
+    evaluation_processes: int = 0
+    tensorboard: bool = True
+    wandb: bool | str = False
+    asks: bool = False
+    """Whether an evaluation waits to hear if training goes on (`stop_when`)."""
+    command: str | None = None
+
+
+class Watcher(Protocol):
+    """Who is told what happens, beside the run directories."""
+
+    def turn(self, step: int) -> None:
+        """Wait until it is this program's turn to train on, after so many steps."""
+        ...
+
+    def progress(self, steps: Mapping[int, int]) -> None:
+        """Take how many steps each seed has made."""
+        ...
+
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
+        """Take the mean return of each seed's evaluation; return whether training is to end."""
+        ...
+
+    def failed(self, seed: int, step: int, reason: str) -> None:
+        """Take that a seed is trained no more."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Take a line for the user."""
+        ...
+
+
+def choose_groups(
+    seeds: Sequence[int],
+    existing: Mapping[int, RunDirectory],
+    seeds_per_process: int | None,
+    device: str,
+    task: Task,
+) -> list[list[int]]:
+    """Return the seeds of each program: as they were, as asked for, or as pays here."""
+    known = {existing[seed].manifest.program for seed in seeds if seed in existing}
+    together = [[seed for seed in group if seed in seeds] for group in sorted(known) if len(group) > 1]
+    rest = [seed for seed in seeds if not any(seed in group for group in together)]
+    size = seeds_per_process
+    if size is None:
+        size = len(rest) if not can_be_sent(task) else 1
+        if device == "gpu":
+            processes = max(1, min(len(rest) // SEEDS_PER_GPU_PROCESS, len(usable_cores()) // 2, PROCESSES_PER_GPU))
+            size = max(1, -(-len(rest) // (1 if preallocates() else processes)))
+    check_whole("seeds_per_process", size, min(len(rest), 1), max(len(seeds), 1))
+    return together + [rest[i : i + size] for i in range(0, len(rest), max(size, 1))]
+
+
+class Plan(NamedTuple):
+    """What all programs of a call have in common."""
+
+    algorithm: Algorithm
+    task: Task
+    evaluation_processes: int | None
+    tensorboard: bool
+    wandb: bool | str
+    command: str | None
+    asks: bool
+
+    def programs(
+        self, directories: Sequence[Sequence[Path]], existing: Mapping[int, RunDirectory], config: RunConfig
+    ) -> list[Program]:
+        """Return the programs of these directories. Raises InputError for what cannot be sent to a process."""
+        cores = len(usable_cores()[: core_quota()])
+        threads = max(1, cores // len(directories))
+        recorded = [run.manifest.machine.cores for run in existing.values() if run.manifest.process is not None]
+        threads = recorded[0] if recorded and recorded[0] <= cores else threads
+        spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
+        processes = self.evaluation_processes
+        if processes is None:
+            pays = spare > 0 and not self.asks and 0 < config.evaluation_interval < config.steps
+            processes = min(batches, max(1, spare // len(directories))) if pays and can_be_sent(self.task) else 0
+        check_whole("evaluation_processes", processes, 0, 1_000)
+        if (processes or len(directories) > 1) and not can_be_sent(self.task):
+            raise InputError(
+                "the task cannot be sent to another process: make it a function of a module that can be imported, or "
+                "train with seeds_per_process=seeds and evaluation_processes=0"
+            )
+        return [
+            Program(
+                tuple(group),
+                self.algorithm,
+                self.task,
+                threads,
+                processes,
+                self.tensorboard,
+                self.wandb,
+                self.asks,
+                self.command,
+            )
+            for group in directories
+        ]
+
+
+def can_be_sent(task: Task) -> bool:
+    """Return whether another process can be sent the task; it cannot import what a notebook or a terminal defined."""
+    if getattr(task, "__module__", "") == "__main__" and not hasattr(sys.modules["__main__"], "__file__"):
+        return False
+    try:
+        pickle.dumps(task)
+    except Exception:
+        return False
+    return True

@@ -1,0 +1,84 @@
+"""Trains the runs of one program in this process, from their newest checkpoint or their beginning."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+from csac.processes import move_to, usable_cores
+from csac.record.run import RunDirectory
+from csac.tasks.preflight import seed_globals
+from csac.training.devices import choose_device
+from csac.training.loop import Loop
+from csac.training.provenance import provenance
+from csac.training.resume import continuation, roll_back
+from csac.training.signals import storage_failures
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from csac.training.program import Program, Watcher
+    from csac.training.resume import ResumePoint
+
+
+def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], bool]) -> None:
+    """Train the runs of a program in this process, from their newest checkpoint or their beginning.
+
+    Raises:
+        InputError: a run is in use, or cannot go on.
+        StorageFailure: as `train`.
+    """
+    runs = [RunDirectory.open(path) for path in program.directories]
+    with ExitStack() as stack, storage_failures(runs[0].path.parent):
+        for run in runs:
+            stack.enter_context(run.locked())
+            run.read_again()  # another process may have gone on with it before we had the lock
+        choose_device(runs[0].config.device)
+        seed_globals(runs[0].seed)
+        points = roll_back(runs)
+        current = provenance(program.task, program.command, program.threads)
+        for run, point in zip(runs, points, strict=True):
+            _note_begin(run, point, current, watcher)
+        loop = Loop(program, runs, points, watcher)
+        stack.callback(loop.close)
+        try:
+            loop.run(should_stop)
+        finally:
+            stopped = not loop.is_over or (loop.step < loop.steps and should_stop())
+            for run in runs:
+                if run.manifest.state == "running":
+                    run.update_manifest(state="interrupted" if stopped else "finished")
+
+
+def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], watcher: Watcher) -> None:
+    """Record in a run's manifest where and how it begins or goes on."""
+    before, history = run.manifest, run.manifest.history
+    after = dataclasses.replace(before, **current)
+    if before.process is not None:
+        entry, lines = continuation(before, after, point)
+        history = (*history, entry)
+        for line in lines:
+            run.log(line)
+            watcher.note(f"seed {run.seed}: {line}")
+    is_resting = before.state == "failed" and point.checkpoint and not point.checkpoint.values["environment"]["alive"]
+    state = {} if is_resting else {"state": "running", "failure": ""}
+    run.update_manifest(**current, **state, history=history, steps_done=point.step)
+
+
+def begin_with(threads: int) -> None:
+    """Have XLA divide its work for so many cores, and let this process run on every one.
+
+    XLA sizes its threads by the cores that it sees when JAX first looks for devices; later this does nothing.
+    """
+    import jax
+
+    cores = usable_cores()
+    if threads >= len(cores):
+        return
+    move_to(cores[os.getpid() % (len(cores) - threads + 1) :][:threads])
+    try:
+        jax.devices()
+    finally:
+        move_to(cores)
