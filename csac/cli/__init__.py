@@ -6,11 +6,11 @@ import errno
 import faulthandler
 import io
 import os
-import signal
 import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from csac.cli.exits import complain, interrupted
 from csac.types import Failure, InputError
 
 if TYPE_CHECKING:
@@ -52,17 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         failure = _flush()
     return complain(_unwritten(failure), 1) if failure and not code else code
-
-
-def complain(message: object, code: int) -> int:
-    """Write one line to stderr and return the exit code."""
-    print(f"csac: {' '.join(str(message).split())}", file=sys.stderr)
-    return code
-
-
-def interrupted(error: KeyboardInterrupt) -> int:
-    """Return the exit code of the signal."""
-    return 128 + (signal.SIGTERM if signal.SIGTERM in error.args else signal.SIGINT)
 
 
 def _run(words: list[str]) -> int:

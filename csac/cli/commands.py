@@ -7,7 +7,7 @@ from contextlib import nullcontext, suppress
 from typing import TYPE_CHECKING, Any
 
 from csac.checks import did_you_mean
-from csac.cli import complain, interrupted
+from csac.cli.exits import complain, interrupted
 from csac.cli.options import Evaluate, Export, Latency, List, Play, Resume, Train, Tune, learner_of, parse_training
 from csac.cli.parsing import HelpShown, parse
 from csac.types import InputError

@@ -1,0 +1,17 @@
+"""How a command ends: its last line, and its exit code."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+
+def complain(message: object, code: int) -> int:
+    """Write one line to stderr and return the exit code."""
+    print(f"csac: {' '.join(str(message).split())}", file=sys.stderr)
+    return code
+
+
+def interrupted(error: KeyboardInterrupt) -> int:
+    """Return the exit code of the signal."""
+    return 128 + (signal.SIGTERM if signal.SIGTERM in error.args else signal.SIGINT)
