@@ -24,7 +24,6 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "episodes": ("seed", "step", "return", "length"),
     "metrics": ("seed", "step"),
 }
-LARGEST_RETURN = 1e100
 INTEGER_COLUMNS = frozenset({"seed", "step", "episode", "length"})
 
 
@@ -118,33 +117,6 @@ def read_rows(path: str | Path) -> np.ndarray:
         return structured(header, body)
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path} is damaged ({_short(error)}); remove the line that holds it") from None
-
-
-def read_evaluations(path: str | Path) -> np.ndarray:
-    """Read a table of returns by seed and step, as `read_rows` does; `success` is NaN where it does not say.
-
-    Raises:
-        InputError: as `read_rows`, of a table without returns, or of returns that are infinite or too large to square.
-    """
-    rows = read_rows(path)
-    names = rows.dtype.names or ()
-    if "return" not in names:
-        raise InputError(f"{path} has no returns: give an evaluations.csv, or columns seed, step and return")
-    if (np.abs(rows["return"]) > LARGEST_RETURN).any():
-        raise InputError(f"{path} has returns beyond ±{LARGEST_RETURN:g}, which no mean can be made of: remove them")
-    if "success" in names:
-        return rows
-    found = np.empty(len(rows), [*rows.dtype.descr, ("success", float)])
-    for name in names:
-        found[name] = rows[name]
-    found["success"] = np.nan
-    return found
-
-
-def check_ends(path: Path) -> None:
-    """Raise InputError where the last line of a table has no end, so that nobody knows whether it is whole."""
-    if not path.read_bytes().endswith(b"\n"):
-        raise InputError(f"{path} ends within a line, which may be cut off: end it with a newline, or remove it")
 
 
 def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarray:

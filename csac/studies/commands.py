@@ -20,6 +20,7 @@ from csac.console.tables import STATE_STYLES, duration, make_console, program
 from csac.processes import core_quota, usable_cores
 from csac.record.rendering import short
 from csac.record.run import RunDirectory, StorageFailure
+from csac.record.wandb import import_wandb
 from csac.studies.study import find, named
 from csac.types import InputError
 
@@ -136,6 +137,8 @@ class Run(Show):
         if self.engine != "ray" and cluster != Cluster():
             raise InputError("--address and --cell-cores, -gpus and -memory are for Ray: add --engine ray")
         check_whole("--cell-cores", self.cell_cores, 1, 10_000)
+        if self.wandb:
+            import_wandb()
         one_at_a_time = self.engine == "local" or self.cell is not None or (self.device == "gpu" and not self.workers)
         return How(
             1 if one_at_a_time else workers,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 RETRIES = 5  # of a run whose node or process was lost
 SECONDS_FOR_LOCK = 300.0  # a node that vanished keeps its locks until the file server's lease ends, a minute or two
 SECONDS_BETWEEN_LOOKS = 0.5
+SECONDS_TO_ANSWER = 10.0
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,12 @@ class Cluster:
             import ray
         except ImportError:
             raise InputError("Ray is not installed: pip install '.[cluster]' in a clone of csac") from None
+        host, _, port = (self.address or "").rpartition(":")
+        if host and port.isdigit():  # Ray itself would try for minutes
+            try:
+                socket.create_connection((host, int(port)), SECONDS_TO_ANSWER).close()
+            except OSError as error:
+                raise InputError(f"no Ray cluster can be reached at {self.address}: {error}") from None
         options: dict[str, Any] = {"address": self.address} if self.address else {"include_dashboard": False}
         try:
             ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)

@@ -15,6 +15,7 @@ from csac.record.run import RunDirectory, is_run
 from csac.record.statistics import last_evaluations
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import perturbations_of
+from csac.tasks.trust import remember
 from csac.training.config import algorithm_of, make_manifest
 from csac.training.program import Program
 from csac.training.signals import stop_requested
@@ -50,11 +51,13 @@ def run_study(runs: Sequence[StudyRun], directory: Path, how: How, console: Cons
     """
     directory = directory.absolute()
     waiting = {directory / run.folder: run for run in runs if not run.is_over(directory)}
+    for path in [path for path in waiting if is_run(path) and RunDirectory.open(path).state == "running"]:
+        console.print(f"{waiting.pop(path).name}: another process trains it", soft_wrap=True)
     if how.cluster is None:  # whose nodes may have what this machine has not
         try_tasks(waiting.values())
     programs = [_program(path, run, how) for path, run in waiting.items()]
     with stop_requested(lambda text: console.print(text)) as request, closing(Progress(waiting, console)) as progress:
-        if how.cluster:
+        if programs and how.cluster:
             how.cluster.run(programs, progress.of, request.is_set)
         elif programs:
             turns = len(usable_cores()) // programs[0].threads
@@ -74,6 +77,7 @@ def try_tasks(runs: Any) -> None:
         if one not in tried:
             tried.append(one)
             with closing(Environment(config.task, config.environment_arguments)) as environment:
+                remember(config.task)
                 for change in perturbations_of(config.perturbations):
                     environment.perturb({change.kind: change.value})
 

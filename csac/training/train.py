@@ -56,7 +56,7 @@ def train(
     resume: bool = False,
     start_from: str | Path | None = None,
     seeds_per_process: int | None = None,
-    evaluation_processes: int | None = None,
+    evaluation_processes: int | None = 0,
     tensorboard: bool = True,
     wandb: bool | str = False,
     progress: bool = False,
@@ -80,8 +80,8 @@ def train(
         start_from: `DIRECTORY` or `DIRECTORY@STEP` of a set or a run: begin with copies of the seeds' checkpoints.
         seeds_per_process: seeds that share one program; by default 1 on a CPU, and a few on a GPU. With all of them
             training stays in this process.
-        evaluation_processes: processes in which a program evaluates while it trains on; 0 evaluates in between, None
-            chooses by the cores. The numbers are the same.
+        evaluation_processes: processes in which a program evaluates while it trains on (a script needs the guard then);
+            0 evaluates in between, None chooses by the cores, as the command line does. The numbers are the same.
         tensorboard: whether to write TensorBoard files.
         wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to.
         progress: whether to show progress on the terminal.
@@ -144,7 +144,7 @@ def resume(
     directory: str | Path,
     *,
     steps: int | None = None,
-    evaluation_processes: int | None = None,
+    evaluation_processes: int | None = 0,
     trust_task: bool = False,
     progress: bool = False,
     reporter: Reporter | None = None,

@@ -49,12 +49,21 @@ def test_what_is_over_is_left_alone_and_the_rest_goes_on(tmp_path, supervised):
     write_run(tmp_path / one.folder, one.config)
     write_run(tmp_path / two.folder, two.config, state="failed")
     write_run(tmp_path / three.folder, three.config, state="interrupted", points=4)
-    assert (begun := three.open(tmp_path))
-    assert begun.state == "interrupted"
+    assert RunDirectory.open(tmp_path / three.folder).state == "interrupted"
     run_study([one, two, three, four], tmp_path, How(), make_console())
     ((programs, _, _),) = supervised
     assert [program.directories[0] for program in programs] == [tmp_path / three.folder, tmp_path / four.folder]
     assert programs[0].threads == 1  # as it began
+
+
+def test_what_another_process_trains_is_left_to_it(tmp_path, supervised, capsys):
+    one, two, *_ = tiny_study(tmp_path).runs()
+    write_run(tmp_path / one.folder, one.config, state="running", points=4)
+    with RunDirectory.open(tmp_path / one.folder).locked():
+        run_study([one, two], tmp_path, How(), make_console())
+    ((programs, _, _),) = supervised
+    assert [program.directories[0] for program in programs] == [tmp_path / two.folder]
+    assert "another process trains it" in capsys.readouterr().out
 
 
 def test_more_steps_later_go_on(tmp_path, supervised):
@@ -62,8 +71,7 @@ def test_more_steps_later_go_on(tmp_path, supervised):
     (longer, *_) = tiny_study(tmp_path, steps=2_000).runs()
     write_run(tmp_path / run.folder, run.config)
     run_study([longer], tmp_path, How(), make_console())
-    assert (begun := longer.open(tmp_path))
-    assert begun.config.steps == 2_000
+    assert RunDirectory.open(tmp_path / run.folder).config.steps == 2_000
 
 
 @pytest.mark.parametrize("change", [{"evaluation_interval": 300}, {"steps": 500}])

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,22 +35,28 @@ def search(**changes):
     return Search(task="Pendulum-v1", **options)
 
 
-@pytest.fixture
-def trained(monkeypatch):
-    """Trials that are not trained: a seed's return at a step is `score(discount, step)`."""
-    found = []
+class Trained:
+    """Stands for `train`: a seed's return at a step is `score(discount)`; it is interrupted once, at a step."""
 
-    def trained(algorithm, task, *, directory, stop_when, seeds, first_seed, steps, evaluation_interval, **options):
-        found.append((algorithm, directory, options))
-        score = train.score(algorithm.discount)
+    def __init__(self):
+        self.found = []
+        self.interrupted_at = None
+
+    def score(self, discount):
+        return 100 * discount
+
+    def __call__(
+        self, algorithm, task, *, directory, stop_when, seeds, first_seed, steps, evaluation_interval, **options
+    ):
+        self.found.append((algorithm, directory, options))
+        score = self.score(algorithm.discount)
         for seed in range(first_seed, first_seed + seeds):
             one = RunConfig(task=task, algorithm=algorithm.name, seed=seed, steps=steps)
             if not is_run(directory / f"seed-{seed}"):
-                run = write_run(directory / f"seed-{seed}", one, points=0)
-                run.checkpoints.mkdir()
+                write_run(directory / f"seed-{seed}", one, points=0).checkpoints.mkdir()
         for step in range(evaluation_interval, steps + 1, evaluation_interval):
-            if step == train.interrupted_at:
-                train.interrupted_at = None
+            if step == self.interrupted_at:
+                self.interrupted_at = None
                 raise Interrupted(RunSet.open(directory), signal.SIGINT)
             for run in RunSet.open(directory).runs:
                 run.append("evaluations", [row(run.seed, step, score)])
@@ -59,10 +64,12 @@ def trained(monkeypatch):
                     return RunSet.open(directory)
         return RunSet.open(directory)
 
-    train: Any = trained
-    train.score, train.interrupted_at, train.found = lambda discount: 100 * discount, None, found
-    monkeypatch.setattr(module, "train", train)
-    return train
+
+@pytest.fixture
+def trained(monkeypatch):
+    found = Trained()
+    monkeypatch.setattr(module, "train", found)
+    return found
 
 
 def row(seed, step, value):
