@@ -36,6 +36,7 @@ autodoc_default_options = {"members": True}
 NAVIGATION = {
     "Use": [
         "docs/python",
+        "docs/saving-and-resuming",
         "docs/from-stable-baselines3",
         "docs/tasks",
         "docs/perturbations",
@@ -43,8 +44,6 @@ NAVIGATION = {
         "docs/studies",
         "docs/cluster",
         "docs/tuning",
-        "docs/going-on",
-        "docs/reliability",
         "docs/glossary",
     ],
     "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")]
