@@ -2,7 +2,7 @@
 
     from csac import CSAC, train, evaluate, load
 
-    run = train(CSAC(), "HalfCheetah-v4", steps=60_000, seeds=2, directory="runs/cheetah")
+    run = train(CSAC(), "HalfCheetah-v4", steps=60_000, directory="runs/cheetah")
     policy = load("runs/cheetah")
     returns = evaluate(policy, "HalfCheetah-v4", episodes=100)
 
