@@ -86,8 +86,11 @@ def test_resume_passes_its_options_on(monkeypatch):
     line = "resume runs --steps 2e3 --trust-task"
     assert csac(line) == csac("resume runs") == 0
     assert calls == [
-        {"directory": Path("runs"), "steps": 2_000, "trust_task": True, "command": f"csac {line}"},
-        {"directory": Path("runs"), "steps": None, "trust_task": False, "command": "csac resume runs"},
+        {"directory": Path("runs"), "evaluation_processes": None, **options}
+        for options in (
+            {"steps": 2_000, "trust_task": True, "command": f"csac {line}"},
+            {"steps": None, "trust_task": False, "command": "csac resume runs"},
+        )
     ]
 
 
