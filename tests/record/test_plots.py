@@ -195,7 +195,7 @@ def test_pictures_need_neither_pyplot_nor_jax():
     assert answer.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("module", ["plots", "jitter"])
+@pytest.mark.parametrize("module", ["plots"])
 def test_a_wrong_choice_of_window_stops_no_picture(tmp_path, module):
     path = tmp_path / "curve.png"
     code = (

@@ -289,7 +289,7 @@ def test_an_episode_that_is_not_taken_back_is_said_and_the_run_goes_on(tmp_path)
         tmp_path / "run", on_evaluation=lambda *_: seen.append(RunDirectory.open(tmp_path / "run").manifest)
     )
     assert (finished.manifest.state, finished.manifest.failures) == ("finished", {})
-    assert "does not take its snapshot back" in (finished.path / "log.txt").read_text()
+    assert "restoring its snapshot raised" in (finished.path / "log.txt").read_text()
     assert seen[0].inexact_seeds == (0,)  # as long as that checkpoint is the newest
     assert finished.manifest.inexact_seeds == ()
     assert [entry.exact for entry in finished.manifest.history] == [False]
@@ -789,11 +789,11 @@ def test_an_error_of_the_caller_s_own_function_is_theirs(tmp_path):
         run(tmp_path / "run", LEARNERS[1], 30, probes.Endless, on_evaluation=read)
 
 
-def test_a_run_whose_arguments_are_arrays_goes_on_and_is_forked(tmp_path):
-    """What JSON has no word for comes back as lists and texts, which were compared with the arrays themselves."""
+def test_a_run_whose_arguments_are_not_as_json_has_them_goes_on_and_is_forked(tmp_path):
+    """Tuples and NumPy's numbers come back as lists and plain numbers."""
 
     def given(directory: str, steps: int, **options: Any) -> RunDirectory:
-        arguments = {"where": "step", "at": 1_000_000, "seeds": np.array([1, 2])}
+        arguments = {"where": "step", "at": np.int64(1_000_000), "seeds": (1, 2)}
         return run(tmp_path / directory, LEARNERS[1], steps, probes.Failing, environment_arguments=arguments, **options)
 
     given("run", 30)
