@@ -18,6 +18,7 @@ import numpy as np
 from tables import (
     LAST_SHARE,
     Finals,
+    boundary_tables,
     comma,
     compared,
     measure,
@@ -110,6 +111,16 @@ def returns(page: Page, arms: Any, picture: str = "", title: str = "", **chosen:
     if picture and page.has_pictures:
         learning_curve(list(found.items()), page.file(picture), title)
     return returns_table(found)
+
+
+def boundary(
+    page: Page, arms: Any, boundary: float, steps: int, picture: str = "", title: str = "", **chosen: Any
+) -> str:
+    """Return when each seed first reached a return, and draw the curves."""
+    found = page.arms(arms, **chosen)
+    if picture and page.has_pictures:
+        learning_curve(list(found.items()), page.file(picture), title)
+    return boundary_tables(found, boundary, steps)
 
 
 def recoveries(
@@ -316,6 +327,7 @@ def _save(figure: Figure, path: Path, columns: int) -> None:
 
 KINDS = {
     "returns": returns,
+    "boundary": boundary,
     "recoveries": recoveries,
     "study": study,
     "cases": cases,

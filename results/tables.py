@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from csac.record.statistics import (
     FEWEST_FOR_BOOTSTRAP,
@@ -20,6 +21,7 @@ from csac.record.statistics import (
     mean_and_interval,
     probability_of_improvement,
     recovery,
+    steps_to_reach,
     stratified_bootstrap_interval,
 )
 
@@ -163,6 +165,52 @@ def _recovery_cells(one: Recovery, largest: float) -> list[str]:
 # By the rules of the protocols.
 
 
+def boundary_tables(runs: Mapping[str, np.ndarray], boundary: float, steps: int) -> str:
+    """Return when each seed first reached a return, and how two arms of five seeds compare in that.
+
+    A seed that never does is censored at its last step: two such are equal. The return is that of the last tenth.
+    """
+    times, finals, falls, lines = [], [], [], []
+    for label, rows in runs.items():
+        at, seeds, values = evaluation_matrix(rows)
+        times.append(np.array([steps_to_reach(at, line, boundary) for line in values]))
+        finals.append(values[:, at > 0.9 * steps].mean(axis=1))
+        falls.append(np.array([drawdown(line) for line in values]))
+        told = ["not reached" if np.isinf(time) else f"{time:,.0f}" for time in times[-1]]
+        each = [f"{seed}: {time}" for seed, time in zip(seeds, told, strict=True)]
+        spread = plus_minus(finals[-1]) if len(seeds) > 1 else number(finals[-1][0])
+        lines.append([label, comma(each), spread, number(falls[-1].mean())])
+    headings = ["method", f"steps to {boundary:,.2f}, each seed", "return, last tenth", "drawdown, mean"]
+    parts = [table(headings, lines)]
+    if min(map(len, times)) >= FEWEST_FOR_BOOTSTRAP:
+        parts.append(_boundary_comparison(list(runs), times, finals, falls, steps))
+    return "\n\n".join(parts)
+
+
+def _boundary_comparison(
+    labels: Sequence[str],
+    times: Sequence[np.ndarray],
+    finals: Sequence[np.ndarray],
+    falls: Sequence[np.ndarray],
+    steps: int,
+) -> str:
+    """Return the first arm against the second: by the steps to the boundary, the return and the drawdown."""
+    censored = [stats.CensoredData(uncensored=t[t <= steps], right=np.full(sum(t > steps), steps)) for t in times]
+    difference = stats.ttest_ind(*finals, equal_var=False)
+    bounds = difference.confidence_interval()
+    mean = float(finals[0].mean() - finals[1].mean())
+    lines = [
+        ["is first at the boundary", *compared(-times[0], -times[1], 10_000)],
+        ["has the higher return", *compared(*finals, 10_000)],
+        ["has the smaller drawdown", *compared(-falls[0], -falls[1], 10_000)],
+    ]
+    told = table([f"{labels[0]} against {labels[1]}", "probability", "so"], lines)
+    p_value = stats.logrank(*censored).pvalue
+    return f"{told}\n\nLog-rank test of the steps to the boundary: p = {p_value:.3f}. Difference of the returns: " + (
+        f"{mean:,.0f} ({bounds.low:,.0f} to {bounds.high:,.0f}, 95 % Welch interval)."
+    )
+
+
 def measure(rows: np.ndarray, steps: int, changed_at: int | None = None) -> Measured:
     """Return what an arm has reached; a seed's final return is the mean of its evaluations in the last fifth."""
     at, _, values = evaluation_matrix(rows)
@@ -215,9 +263,9 @@ def stacked(values: Finals) -> dict[str, np.ndarray]:
     return {label: np.stack([arms[label] for arms in values.values()], axis=1) for label in next(iter(values.values()))}
 
 
-def compared(values: np.ndarray, others: np.ndarray) -> tuple[str, str]:
+def compared(values: np.ndarray, others: np.ndarray, repetitions: int = 2_000) -> tuple[str, str]:
     """Return the probability that the first are higher, with its interval, and the verdict."""
-    interval = improvement_interval(values, others)
+    interval = improvement_interval(values, others, repetitions)
     return with_interval(probability_of_improvement(values, others), interval), verdict(interval)
 
 

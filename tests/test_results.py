@@ -7,11 +7,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import collect
 import make
 import numpy as np
 import pytest
 import tables
 from chaos import MARKERS, Kill, summary
+from shown import make_set
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*ROOT.glob("results/*/README.md"), ROOT / "docs" / "relative-entropy.md"]
@@ -68,6 +70,29 @@ def test_returns_are_set_against_the_first_arm():
     table = tables.returns_table({"one": rows([2, 2, 2, 2]), "two": rows([9, 6, 6, 6], [0, 0, 0, 0])})
     assert cells(table, "one") == ["1", "40", "2.00", "1 seed: no interval", "1.00", "2.00 at 10"]
     assert cells(table, "two") == ["2", "40", "3.00 ± 4.24", "2 seeds: no interval", "1.50", "4.50 at 10"]
+
+
+def test_seeds_that_miss_the_boundary_are_censored_and_tie():
+    # Of two arms of five seeds one reaches 5 at step 20 in four seeds, the other at step 30 in one: 20 pairs won,
+    # one seed that never gets there loses one pair and ties four.
+    quick, slow = [0, 5, 5, 5, 5], [0, 0, 5, 5, 5]
+    runs = {"one": rows(quick, quick, quick, quick, [0] * 5), "two": rows(slow, [0] * 5, [0] * 5, [0] * 5, [0] * 5)}
+    told = tables.boundary_tables(runs, 5, 50)
+    assert cells(told, "two")[0] == "0: 30, 1: not reached, 2: not reached, 3: not reached, 4: not reached"
+    assert cells(told, "is first at the boundary")[0].startswith("0.880 ")
+    assert "Difference of the returns: 3 (" in told
+    assert "against" not in tables.boundary_tables({name: of[of["seed"] < 4] for name, of in runs.items()}, 5, 50)
+
+
+def test_a_finished_run_is_collected_once(tmp_path):
+    for name, head in (("runs", collect.RUNS), ("evaluations", collect.EVALUATIONS)):
+        (tmp_path / f"{name}.csv").write_text(",".join(head) + "\n")
+    (tmp_path / "configs.json").write_text("{}")
+    run = make_set(tmp_path / "runs", [[1.0, 2.0]]).runs[0]
+    assert [collect.add_run(tmp_path, "SAC, mine", run) for _ in range(2)] == [True, False]
+    (told,) = make.read_csv(tmp_path / "runs.csv")
+    assert (told["arm"], told["seed"], told["config"]) == ("SAC, mine", "0", "sac-mine")
+    assert [row["return"] for row in make.read_csv(tmp_path / "evaluations.csv")] == ["1", "2"]
 
 
 def test_an_arm_that_no_run_has_is_an_error(tmp_path):
