@@ -196,16 +196,16 @@ def _boundary_comparison(
 ) -> str:
     """Return the first arm against the second: by the steps to the boundary, the return and the drawdown."""
     censored = [stats.CensoredData(uncensored=t[t <= steps], right=np.full(sum(t > steps), steps)) for t in times]
-    difference = stats.ttest_ind(*finals, equal_var=False)
+    difference = stats.ttest_ind(finals[0], finals[1], equal_var=False)
     bounds = difference.confidence_interval()
     mean = float(finals[0].mean() - finals[1].mean())
     lines = [
         ["is first at the boundary", *compared(-times[0], -times[1], 10_000)],
-        ["has the higher return", *compared(*finals, 10_000)],
+        ["has the higher return", *compared(finals[0], finals[1], 10_000)],
         ["has the smaller drawdown", *compared(-falls[0], -falls[1], 10_000)],
     ]
     told = table([f"{labels[0]} against {labels[1]}", "probability", "so"], lines)
-    p_value = stats.logrank(*censored).pvalue
+    p_value = stats.logrank(censored[0], censored[1]).pvalue
     return f"{told}\n\nLog-rank test of the steps to the boundary: p = {p_value:.3f}. Difference of the returns: " + (
         f"{mean:,.0f} ({bounds.low:,.0f} to {bounds.high:,.0f}, 95 % Welch interval)."
     )

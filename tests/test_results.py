@@ -75,8 +75,8 @@ def test_returns_are_set_against_the_first_arm():
 def test_seeds_that_miss_the_boundary_are_censored_and_tie():
     # Of two arms of five seeds one reaches 5 at step 20 in four seeds, the other at step 30 in one: 20 pairs won,
     # one seed that never gets there loses one pair and ties four.
-    quick, slow = [0, 5, 5, 5, 5], [0, 0, 5, 5, 5]
-    runs = {"one": rows(quick, quick, quick, quick, [0] * 5), "two": rows(slow, [0] * 5, [0] * 5, [0] * 5, [0] * 5)}
+    quick, slow, never = [0.0, 5, 5, 5, 5], [0.0, 0, 5, 5, 5], [0.0] * 5
+    runs = {"one": rows(quick, quick, quick, quick, never), "two": rows(slow, never, never, never, never)}
     told = tables.boundary_tables(runs, 5, 50)
     assert cells(told, "two")[0] == "0: 30, 1: not reached, 2: not reached, 3: not reached, 4: not reached"
     assert cells(told, "is first at the boundary")[0].startswith("0.880 ")
