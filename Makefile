@@ -41,7 +41,7 @@ train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=2 S
 test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
 	$(VENV)/bin/pytest --numprocesses logical --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 
-slow: $(SETUP)  ## Run the tests that need longer: processes that are killed, clusters, browsers
+slow: $(SETUP)  ## Run the tests that need longer: learning, fixed-seed digests, kills, clusters
 	$(VENV)/bin/pytest -m slow $(ARGS)
 
 chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave: make chaos ARGS='--kills 25'

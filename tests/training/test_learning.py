@@ -10,6 +10,7 @@ from trainer import run
 
 from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
 
+pytestmark = pytest.mark.slow
 SETTINGS: dict[str, Any] = {
     "discount": 0.95,
     "target_rate": 0.01,

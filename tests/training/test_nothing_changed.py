@@ -24,6 +24,7 @@ from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
 from csac.presets import hyperparameters
 from csac.training.train import train
 
+pytestmark = pytest.mark.slow
 DIGESTS = Path(__file__).with_name("digests.json")
 SMALL: dict[str, Any] = {
     "actor_hidden_sizes": (32, 32),
