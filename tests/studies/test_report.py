@@ -162,6 +162,17 @@ def test_steps_to_the_lower_boundary(tmp_path):
     assert ppo[3] == "980,000"
 
 
+def test_without_ppo_the_boundary_is_the_papers(tmp_path):
+    """On HalfCheetah it is 4,181.89; shorter runs decide who is first there."""
+    arms = [arm for arm in arms_of("paper", tmp_path, {"csac": 6_000, "sac": 4_000}) if arm.task == "HalfCheetah-v4"]
+    (table,) = tables(efficiency(arms))
+    assert table.title == "HalfCheetah-v4, return 4,181.9"
+    assert [row[2] for row in cells(table)] == ["5 of 5", "0 of 5"]
+    verdicts = {claim.text: claim.verdict()[0] for claim in paper.claims(arms)}
+    assert verdicts["fewer steps to the lower boundary"] == "reproduced"
+    assert verdicts["a higher maximum average return"] == "not yet decidable"
+
+
 def test_each_change_has_a_table_as_far_as_the_next(tmp_path):
     write_run(tmp_path / "seed-0", config(perturbations=("friction=2@300", "gravity=1.1@600")))
     titles = [table.title for table in tables(robustness(read_arms([tmp_path])))]

@@ -99,7 +99,7 @@ def test_the_studies_that_csac_brings(name):
 
 
 def test_the_study_that_is_running_can_be_read():
-    assert len(read_study(RESULTS / "paper" / "paper.toml").runs()) == 40
+    assert len(find("paper").runs()) == 40
 
 
 @pytest.mark.parametrize(
