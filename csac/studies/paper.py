@@ -212,7 +212,7 @@ def robustness(arm: Arm, other: Arm) -> Iterator[Claim]:
         ("ends higher", "final", 1),
     ):
         values = [sign * np.array([getattr(one, name) for one in side]) for side in (ours, others)]
-        yield Claim(text, arm, other, *values)
+        yield Claim(text, arm, other, values[0], values[1])
 
 
 def lower_boundary(arms: Sequence[Arm]) -> float:
