@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from csac.checks import did_you_mean
 from csac.record.config import RunConfig, as_json
 from csac.studies.arms import train_command
-from csac.training.options import Options
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -114,20 +113,20 @@ def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: S
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search(Options):
+class Search:
     """What is tuned, and how a trial is judged: what all processes that share a directory agree on."""
 
-    task: str
+    config: RunConfig
+    """What the first seed of a trial computes but for what is searched."""
+    seeds: int
     algorithm: Algorithm
     """Where the search begins; what is not searched stays so."""
     space: Space
-    environment_arguments: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.steps < self.algorithm.cadence.first_update:
-            first = self.algorithm.cadence.first_update
-            raise InputError(f"no updates: steps ({self.steps:,}) < {first:,}, where the first one comes")
+        first = self.algorithm.cadence.first_update
+        if self.config.steps < first:
+            raise InputError(f"no updates: steps ({self.config.steps:,}) < {first:,}, where the first one comes")
 
     def algorithm_with(self, values: Mapping[str, Any]) -> Any:
         """Return what a trial trains. Raises InputError for values that do not go with what is given."""
@@ -135,25 +134,19 @@ class Search(Options):
 
     def told(self) -> dict[str, Any]:
         """Return it as JSON has it."""
-        own = {item.name: getattr(self, item.name) for item in dataclasses.fields(Options) if item.name != "device"}
-        values = dataclasses.asdict(self.algorithm)  # pyright: ignore[reportArgumentType]
         searched = {name: f"searched, {' '.join(map(str, dimension))}" for name, dimension in self.space.items()}
-        fixed = {"task": self.task, "algorithm": self.algorithm.name, "arguments": self.environment_arguments}
-        return as_json("the search", {**own, **fixed, "hyperparameters": {**values, **searched}})
+        own = {name: value for name, value in vars(self.config).items() if name != "device"}
+        return as_json("the search", {**own, "seeds": self.seeds, **self._hyperparameters(searched)})
 
     def command(self, values: Mapping[str, Any]) -> str:
         """Return the line that trains a configuration with seeds that the search has not used."""
-        first = 0 if self.first_seed >= REPORT_SEEDS else self.first_seed + self.seeds
-        config = RunConfig(
-            task=self.task,
-            algorithm=self.algorithm.name,
-            hyperparameters=dataclasses.asdict(self.algorithm_with(values)),
-            steps=self.steps,
-            evaluation_interval=self.evaluation_interval,
-            evaluation_episodes=self.evaluation_episodes,
-            environment_arguments=self.environment_arguments,
-        )
+        first = 0 if self.config.seed >= REPORT_SEEDS else self.config.seed + self.seeds
+        config = dataclasses.replace(self.config, device="cpu", **self._hyperparameters(values))
         return train_command(config, range(first, first + REPORT_SEEDS))
+
+    def _hyperparameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        own: dict[str, Any] = dataclasses.asdict(self.algorithm)  # pyright: ignore[reportArgumentType]
+        return {"hyperparameters": {**own, **values}}
 
 
 def _rounded(value: float) -> float:

@@ -5,7 +5,6 @@ Any number of processes may share a directory: the study is a journal in it, and
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import shutil
 import sys
@@ -25,7 +24,7 @@ from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
 from csac.studies.arms import plain
 from csac.studies.search import Search, draw
-from csac.training.options import Options
+from csac.training.config import RUN_OPTIONS
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.train import train
 from csac.types import InputError
@@ -89,7 +88,7 @@ def _open(search: Search, directory: Path) -> optuna.Study:
     except OSError as error:
         raise InputError(f"cannot write to {directory}: {error.strerror}; choose another directory") from None
     backend = JournalFileBackend(str(journal), JournalFileOpenLock(str(journal)))
-    unpruned = max(search.algorithm.cadence.first_update, round(SHARE_UNPRUNED * search.steps))
+    unpruned = max(search.algorithm.cadence.first_update, round(SHARE_UNPRUNED * search.config.steps))
     with _alone(directory):
         study = optuna.create_study(
             storage=optuna.storages.JournalStorage(backend),
@@ -181,22 +180,22 @@ def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None,
             if known not in reported:
                 trial.trial.report(score, known)
                 reported.add(known)
-        is_pruned = is_pruned or (step < search.steps and step in reported and trial.trial.should_prune())
+        is_pruned = is_pruned or (step < search.config.steps and step in reported and trial.trial.should_prune())
         return is_pruned or bool(runs.failures)
 
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of seeds that fail: told below
             runs = train(
                 search.algorithm_with(trial.values),
-                search.task,
+                search.config.task,
+                seeds=search.seeds,
+                first_seed=search.config.seed,
                 directory=trial.folder,
                 resume=True,
                 tensorboard=False,
                 command=command,
                 stop_when=is_enough,
-                environment_arguments=search.environment_arguments,
-                evaluation_seed=EVALUATION_SEED,
-                **{item.name: getattr(search, item.name) for item in dataclasses.fields(Options)},
+                **{name: getattr(search.config, name) for name in RUN_OPTIONS},
             )
     except Interrupted:
         _requeue(study, study.get_trials(deepcopy=False)[trial.trial.number])

@@ -17,7 +17,6 @@ from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.preflight import json_arguments, seed_warning, try_task, wrapper_warnings
 from csac.tasks.registry import check_events, events_of
 from csac.tasks.trust import remember
-from csac.training.options import MOST_SEEDS
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -41,6 +40,10 @@ class TrainOptions(TypedDict, total=False):
     environment_arguments: dict[str, Any] | None
     perturbations: str | Perturbation | Iterable[str | Perturbation] | None
     events: Sequence[str] | None
+
+
+RUN_OPTIONS = tuple(TrainOptions.__annotations__)
+MOST_SEEDS = 10_000
 
 
 def make_configs(
@@ -124,13 +127,12 @@ def check_algorithm(algorithm: object) -> None:
 
 
 def _refuse_unknown(given: TrainOptions, algorithm: Algorithm) -> None:
-    known = TrainOptions.__annotations__
     for name in given:
-        if name in known:
+        if name in RUN_OPTIONS:
             continue
         if name in (item.name for item in dataclasses.fields(algorithm)):  # pyright: ignore[reportArgumentType]
             raise InputError(
                 f"train takes no {name}: it is a hyperparameter, as in {type(algorithm).__name__}({name}=...)"
             )
-        hint = called_in_python(name, known) or did_you_mean(name, known)
+        hint = called_in_python(name, RUN_OPTIONS) or did_you_mean(name, RUN_OPTIONS)
         raise InputError(f"train takes no {name}" + (f": {hint}" if hint else ""))

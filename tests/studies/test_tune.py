@@ -29,10 +29,12 @@ WORDS += ["--warmup-steps", "400", "--batch-size", "16", "--replay-size", "2000"
 WORDS += ["--actor-hidden-sizes", "8", "--critic-hidden-sizes", "8"]
 
 
-def search(**changes):
-    options = {"algorithm": SAC(warmup_steps=100, entropy_weight=0.2), "steps": 1_000, "seeds": 2, "first_seed": 1_000}
-    options |= {"space": {"discount": SPACES["sac"]["discount"]}, "evaluation_interval": 100, **changes}
-    return Search(task="Pendulum-v1", **options)
+def search(seeds=2, first_seed=1_000, algorithm=None, space=None, **changes):
+    options = {"steps": 1_000, "evaluation_interval": 100, "evaluation_seed": EVALUATION_SEED, **changes}
+    algorithm = algorithm or SAC(warmup_steps=100, entropy_weight=0.2)
+    config = RunConfig(task="Pendulum-v1", algorithm=algorithm.name, seed=first_seed, **options)
+    space = space or {"discount": SPACES["sac"]["discount"]}
+    return Search(config=config, seeds=seeds, algorithm=algorithm, space=space)
 
 
 class Trained:
