@@ -6,9 +6,10 @@ UV ?= $(or $(shell command -v uv),.tools/bin/uv)
 UV_VERSION := 0.13.8
 
 TASK ?= HalfCheetah-v4
-ALGORITHM ?= csac
-STEPS ?= 60000
-SEEDS ?= 2
+ALGORITHM ?= sac
+PRESET ?= $(if $(filter csac sac,$(ALGORITHM)),strong)
+STEPS ?= 30000
+SEEDS ?= 1
 ARGS ?=
 
 # A Python that is not that of .venv gets an environment of its own: make test PYTHON=python3.13 tests in .venv-3.13.
@@ -35,8 +36,9 @@ help:  ## List the targets
 setup: $(SETUP)  ## Install csac and its exact dependencies into .venv
 	@echo "csac is ready: $(VENV)/bin/csac --help, or make train"
 
-train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=2 STEPS=60000 ALGORITHM=csac ARGS=
-	$(VENV)/bin/csac train $(TASK) --algorithm $(ALGORITHM) --seeds $(SEEDS) --steps $(STEPS) $(ARGS)
+train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=1 STEPS=30000 ALGORITHM=sac PRESET=strong ARGS=
+	$(VENV)/bin/csac train $(TASK) --algorithm $(ALGORITHM) $(addprefix --preset ,$(PRESET)) --seeds $(SEEDS) --steps $(STEPS) $(ARGS)
+	@echo "before that: . $(VENV)/bin/activate"
 
 test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
 	$(VENV)/bin/pytest --numprocesses logical --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)

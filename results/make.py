@@ -1,4 +1,4 @@
-"""Fill in the tables of the pages in results/ and of docs/relative-entropy.md, and draw their pictures: `make results`.
+"""Fill in the tables of the pages in results/ and of two in docs/, and draw their pictures: `make results`.
 
 A page says in a comment what stands below it: `<!-- table`, lines of TOML, `-->`, and at the end `<!-- end -->`. Their
 `kind` is a function in KINDS, the others are its arguments. Each folder has `runs.csv`, a row for each run,
@@ -33,7 +33,8 @@ from tables import (
 )
 
 from csac.record.plots import COLOURS, learning_curve
-from csac.record.statistics import evaluation_matrix
+from csac.record.statistics import evaluation_matrix, maximum_average_return
+from csac.studies.paper import RETURNS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -121,6 +122,26 @@ def boundary(
     if picture and page.has_pictures:
         learning_curve(list(found.items()), page.file(picture), title)
     return boundary_tables(found, boundary, steps)
+
+
+def finals(page: Page, tasks: list[str], steps: int, **chosen: Any) -> str:
+    """Return the final returns of arms on several tasks."""
+    found = {task: page.arms(task=task, until=steps, **chosen) for task in tasks}
+    lines = [[task, *(plus_minus(measure(rows, steps).final) for rows in found[task].values())] for task in tasks]
+    return table(["final return, mean ± std", *found[tasks[0]]], lines)
+
+
+def published(page: Page, steps: dict[str, int], ours: str, others: str, seeds: list[int]) -> str:
+    """Return the paper's maximum average returns of CSAC and SAC beside those of two arms, after some steps."""
+    lines = []
+    for task, until in steps.items():
+        arms = page.arms([ours, others], task, seeds, until)
+        told = [f"{cell.mean:,.0f} ± {cell.std:,.0f}" for cell in (RETURNS[task]["CSAC"], RETURNS[task]["SAC"])]
+        best = [f"{maximum_average_return(rows)[0]:,.0f}" for rows in arms.values()]
+        final = [measure(rows, until).final for rows in arms.values()]
+        lines.append([task, *told, f"{until:,}", *best, compared(*final)[0]])
+    headings = ["task", "paper: CSAC", "paper: SAC", "steps here", ours, others]
+    return table([*headings, "P(higher final return)"], lines)
 
 
 def recoveries(
@@ -328,6 +349,8 @@ def _save(figure: Figure, path: Path, columns: int) -> None:
 KINDS = {
     "returns": returns,
     "boundary": boundary,
+    "finals": finals,
+    "published": published,
     "recoveries": recoveries,
     "study": study,
     "cases": cases,
@@ -340,7 +363,8 @@ KINDS = {
 def main(root: Path = Path(__file__).parents[1], has_pictures: bool = True) -> None:
     """Make every page of a working copy."""
     runs = read_runs(root / "results")
-    for path in (*sorted(root.glob("results/*/README.md")), root / "docs" / "relative-entropy.md"):
+    in_docs = (root / "docs" / name for name in ("relative-entropy.md", "results.md"))
+    for path in (*sorted(root.glob("results/*/README.md")), *in_docs):
         Page(path, runs, has_pictures).fill_in()
 
 

@@ -1,10 +1,14 @@
-"""The examples that speak of the theory print what the theory says, and documents hold what they print."""
+"""What README shows runs; the examples about the theory print what it says, and documents hold what they print."""
 
 from __future__ import annotations
 
+import importlib.util
 import math
+import os
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +20,23 @@ ROOT = Path(__file__).parents[1]
 LAG = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "reference_lag.py")))
 READING = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "minibatch_reading.py")))
 NUMBER = re.compile(r"[-+]?\d+\.?\d*")
+BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+SHORT = {"10000": "700", "8000": "600", "8_000": "600", "1000": "300", "1_000": "300"}  # steps on the page and here
+
+
+def test_what_the_front_page_shows_runs(tmp_path):
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    blocks = BLOCK.findall((ROOT / "README.md").read_text())
+    assert {language for language, _ in blocks} == {"sh", "python"}
+    for language, block in blocks:
+        text = re.sub(r"\b\d[\d_]*\b", lambda found: SHORT.get(found[0], found[0]), block)
+        if importlib.util.find_spec("pygame") is None:  # draws Pendulum
+            text = re.sub("^csac play .*$", "", text, flags=re.MULTILINE)
+        command = ["bash", "-ec", text] if language == "sh" else [sys.executable, "-c", text]
+        done = subprocess.run(
+            command, cwd=tmp_path, env=os.environ | {"PATH": path}, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
 
 
 @pytest.mark.parametrize(("tau", "expected"), [(0.05, 0.9), (0.5, 0.9), (5.0, 5.0 / 5.2), (50.0, 50.0 / 50.2)])

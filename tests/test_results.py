@@ -16,7 +16,7 @@ from chaos import MARKERS, Kill, summary
 from shown import make_set
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*ROOT.glob("results/*/README.md"), ROOT / "docs" / "relative-entropy.md"]
+PAGES = [*ROOT.glob("results/*/README.md"), *(ROOT / "docs" / name for name in ("relative-entropy.md", "results.md"))]
 
 
 def rows(*curves: list[float]) -> np.ndarray:
@@ -125,6 +125,21 @@ def test_every_interval_that_documents_tell_stands_in_a_table():
     }
     assert told
     assert told <= known
+
+
+def test_the_front_page_quotes_the_results_and_the_benchmarks():
+    page = (ROOT / "README.md").read_text()
+    (gains,) = re.findall(r"- \*\*`sac --preset strong` gains most.*?\n-", page, re.DOTALL)
+    means = re.findall(r"([\d,]+\.\d) ±", (ROOT / "docs" / "results.md").read_text())
+    assert _numbers(gains) - {100_000} <= {round(float(mean.replace(",", ""))) for mean in means}
+    speeds = "".join(re.findall(r"^\| (?:SAC|TD3|PPO|CSAC)(?:, [^|]*)? \|(.*)", page, re.MULTILINE))
+    measured = "".join((ROOT / name).read_text() for name in ("benchmarks/README.md", "docs/gpu.md"))
+    assert len(_numbers(speeds)) == 11
+    assert _numbers(speeds) <= _numbers(measured)
+
+
+def _numbers(text: str) -> set[int]:
+    return {int(one.replace(",", "")) for one in re.findall(r"\b\d[\d,]*", text)}
 
 
 def test_every_run_has_evaluations_and_known_settings():

@@ -49,6 +49,7 @@ NAVIGATION = {
     "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")]
     + ["docs/relative-entropy"],
     "Measured": [
+        "docs/results",
         "docs/performance",
         "docs/statistics",
         "docs/gpu",
