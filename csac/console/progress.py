@@ -232,7 +232,7 @@ def _next_lines(runs: RunSet, has_curve: bool) -> list[tuple[str, str]]:
     if can_be_drawn(config.task) and (has_curve or len(runs.runs) == 1):
         film = shlex.quote(str(runs.path / "play.mp4"))
         lines.append(("watch it", f"{program()} play {directory} --video {film}"))
-    return lines
+    return [*lines, ("export", f"{program()} export {directory} --format numpy")]
 
 
 def _has_traceback(log: Path) -> bool:
