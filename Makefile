@@ -38,7 +38,6 @@ setup: $(SETUP)  ## Install csac and its exact dependencies into .venv
 
 train: $(SETUP)  ## Train a controller: make train TASK=HalfCheetah-v4 SEEDS=1 STEPS=30000 ALGORITHM=sac PRESET=strong ARGS=
 	$(VENV)/bin/csac train $(TASK) --algorithm $(ALGORITHM) $(addprefix --preset ,$(PRESET)) --seeds $(SEEDS) --steps $(STEPS) $(ARGS)
-	@echo "before that: . $(VENV)/bin/activate"
 
 test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
 	$(VENV)/bin/pytest --numprocesses logical --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)

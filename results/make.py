@@ -136,7 +136,7 @@ def published(page: Page, steps: dict[str, int], ours: str, others: str, seeds: 
         told = [f"{cell.mean:,.0f} ± {cell.std:,.0f}" for cell in (RETURNS[task]["CSAC"], RETURNS[task]["SAC"])]
         best = [f"{maximum_average_return(rows)[0]:,.0f}" for rows in arms.values()]
         final = [measure(rows, until).final for rows in arms.values()]
-        lines.append([task, *told, f"{until:,}", *best, compared(*final)[0]])
+        lines.append([task, *told, f"{until:,}", *best, compared(final[0], final[1])[0]])
     headings = ["task", "paper: CSAC", "paper: SAC", "steps here", ours, others]
     return table([*headings, "P(higher final return)"], lines)
 

@@ -128,10 +128,11 @@ def test_the_end_shows_results_and_what_to_type_next(plain, clock, tmp_path):
     clock.now += 200
     reporter.finish(runs)
     assert "finished 20 steps in 3 min 20 s" in lines(plain)
-    assert lines(plain)[-3:] == [
+    assert lines(plain)[-4:] == [
         f"curve    {runs.path}/curve.png",
         f"test it  csac evaluate '{runs.path}'",
         f"watch it csac play '{runs.path}' --video '{runs.path}/play.mp4'",
+        f"export   csac export '{runs.path}' --format numpy",
     ]
 
 
