@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sysconfig
+from collections.abc import Sequence
 from pathlib import Path
 from traceback import walk_tb
 
@@ -40,12 +41,17 @@ def raised(error: BaseException) -> str:
     origin = error
     while origin.__cause__:  # Gymnasium raises another one from what a constructor raised
         origin = origin.__cause__
-    places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(origin.__traceback__)]
+    return one_line(error) + place_of(
+        [(frame.f_code.co_filename, line) for frame, line in walk_tb(origin.__traceback__)]
+    )
+
+
+def place_of(places: Sequence[tuple[str, int]]) -> str:
+    """Return the innermost of files and lines that is the user's, else a library's, as " (file.py:12)", or nothing."""
     foreign = [place for place in places if _PACKAGES.search(place[0]) or not place[0].startswith(_PASSED_OVER)]
     foreign = [place for place in foreign if not place[0].startswith(_CSAC)]
     own = [place for place in foreign if not _PACKAGES.search(place[0])]
-    where = "".join(f" ({Path(path).name}:{line})" for path, line in (own or foreign)[-1:])
-    return one_line(error) + where
+    return "".join(f" ({Path(path).name}:{line})" for path, line in (own or foreign)[-1:])
 
 
 def one_line(error: BaseException) -> str:

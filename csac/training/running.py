@@ -15,6 +15,7 @@ from csac.training.loop import Loop
 from csac.training.provenance import provenance
 from csac.training.resume import continuation, roll_back
 from csac.training.signals import storage_failures
+from csac.training.stalls import stalls_noted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,6 +44,8 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
             _note_begin(run, point, current, watcher)
         loop = Loop(program, runs, points, watcher)
         stack.callback(loop.close)
+        seeds = ", ".join(str(run.seed) for run in runs)
+        stack.enter_context(stalls_noted(lambda: loop.step, watcher.note, f"seed{'s' * (len(runs) > 1)} {seeds}"))
         try:
             loop.run(should_stop)
         finally:

@@ -41,9 +41,8 @@ class StopRequest:
 
     def __call__(self, number: int, _: Any = None) -> None:
         """Take a signal."""
-        if os.getpid() != self._process:  # a helper that the task has forked
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
+        if os.getpid() != self._process:
+            _end_helper(number)
             return
         if self.received:
             raise KeyboardInterrupt(number)
@@ -82,14 +81,23 @@ def leaving_at_once() -> Iterator[None]:
 
     An exception in their place does not always arrive: imports and finalisers swallow some.
     """
+    process = os.getpid()
 
     def leave(number: int, _: Any) -> None:
+        if os.getpid() != process:
+            _end_helper(number)
         with suppress(OSError):
             os.write(2, f"csac: stopped by {signal.Signals(number).name} before training\n".encode())
         os._exit(128 + number)
 
     with _handled(leave):
         yield
+
+
+def _end_helper(number: int) -> None:
+    """End a helper that the task has forked by a signal whose handler it inherited."""
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
 
 
 @contextmanager

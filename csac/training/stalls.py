@@ -1,0 +1,56 @@
+"""Notice that training stands still inside an environment, and say where."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from csac.tasks.failures import place_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from types import FrameType
+
+SECONDS = 180.0  # in one call of an environment, before a line says so
+_ENVIRONMENTS = {str(Path(__file__).parents[1] / name) for name in ("tasks/environment.py", "evaluation/pool.py")}
+
+
+@contextmanager
+def stalls_noted(progress: Callable[[], int], note: Callable[[str], None], who: str) -> Iterator[None]:
+    """Call `note` once whenever this thread's step, `progress`, stays the same for minutes while an environment runs.
+
+    `who` names the seed. Nothing is ended: a real robot may wait for somebody.
+    """
+    is_over, thread = threading.Event(), threading.get_ident()
+
+    def watch() -> None:
+        before, is_told = progress(), False
+        while not is_over.wait(SECONDS):
+            now = progress()
+            is_told = is_told and now == before
+            place = _place_in_environment(sys._current_frames().get(thread)) if now == before else None
+            if place and not is_told:
+                note(f"{who}: at step {now:,} for {SECONDS / 60:.0f} minutes, inside the environment{place}")
+                is_told = True
+            before = now
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        watcher.join()
+
+
+def _place_in_environment(frame: FrameType | None) -> str | None:
+    """Return where the user's code is, as " (file.py:12)", or None outside of an environment."""
+    places = []
+    while frame:
+        places.append((frame.f_code.co_filename, frame.f_lineno))
+        frame = frame.f_back
+    calls = [index for index, (path, _) in enumerate(places) if path in _ENVIRONMENTS]
+    return place_of(places[calls[0] :: -1]) if calls else None
