@@ -116,6 +116,7 @@ def train(
     elif start_from is not None:
         source = Source.find(start_from, wanted)
     configs, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
+    choose_device(configs[0].device)  # the task's module may have changed JAX's settings
     place = place or new_set_directory(configs[0].task, algorithm.name)
     existing = _existing(place, configs, resume, algorithm.cadence.has_schedule)
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task)

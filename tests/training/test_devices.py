@@ -6,9 +6,11 @@ import os
 import subprocess
 import sys
 import warnings
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import jax
 import pytest
 
@@ -143,6 +145,12 @@ def test_another_device_is_refused():
         choose_device("tpu")
 
 
+def changing(name: str, value: Any) -> gymnasium.Env:
+    """A task that changes JAX's settings."""
+    jax.config.update(name, value)
+    return gymnasium.make("Pendulum-v1")
+
+
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
@@ -157,6 +165,10 @@ def test_other_numbers_than_csac_s_are_refused_before_a_run_begins(tmp_path, nam
     try:
         with pytest.raises(InputError, match=message):
             train(SAC(), "Pendulum-v1", steps=10, directory=tmp_path / "run")
+        config.update(name, before)
+        with pytest.raises(InputError, match=message):
+            train(SAC(), partial(changing, name, value), steps=10, directory=tmp_path / "run")
+        assert not (tmp_path / "run").exists()
     finally:
         config.update(name, before)
     assert not (tmp_path / "run").exists()
