@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from csac.types import InputError
+
+_CONTROLS = re.compile(rb"\\u00(0[0-8bcef]|1[0-9a-f]|7f|[89][0-9a-f])|\x7f|\xc2[\x80-\x9f]", re.IGNORECASE)
+
+
+def without_controls(content: bytes) -> bytes:
+    """Return JSON whose texts move no terminal: a stranger's file may hold its escape sequences."""
+    return _CONTROLS.sub(rb"\\ufffd", content)
 
 
 def check_whole(name: str, value: object, least: int, most: int) -> None:

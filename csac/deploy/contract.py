@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from csac.checks import without_controls
 from csac.record.files import write_atomically
 from csac.types import InputError, Spec
 
@@ -239,7 +240,7 @@ def read_json(path: Path) -> Any:
     """Return what a JSON file holds. Raises InputError if it cannot be read, or is none."""
     content = read_file(path)
     try:
-        return json.loads(content.decode())
+        return json.loads(without_controls(content).decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid JSON ({error}): restore it from a copy") from error
 

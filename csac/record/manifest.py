@@ -8,6 +8,7 @@ import types
 from dataclasses import dataclass, field
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from csac.checks import without_controls
 from csac.record.config import STEPS_LIMIT, RunConfig
 from csac.types import InputError
 
@@ -94,7 +95,7 @@ class NewerError(InputError):
 def read(content: bytes) -> Manifest:
     """Return the manifest in a file's content. Raises InputError with what is wrong with it."""
     try:
-        fields = json.loads(content)
+        fields = json.loads(without_controls(content))
         version = fields.pop("schema_version", None)
     except (ValueError, RecursionError, AttributeError, TypeError):
         raise InputError("it is not a JSON object") from None

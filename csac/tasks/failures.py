@@ -13,6 +13,7 @@ from csac.types import Failure
 
 _CSAC = f"{Path(__file__).parents[1]}{os.sep}"
 _PACKAGES = re.compile(r"\b(site|dist)-packages\b")
+_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[@-~]|[\x00-\x1f\x7f-\x9f]")  # a terminal's colours and controls
 _PASSED_OVER = (sysconfig.get_path("stdlib"), "<frozen")
 
 
@@ -66,4 +67,4 @@ def message(error: BaseException) -> str:
         text = str(error)
     except Exception as unsaid:
         text = f"(its message cannot be had: {type(unsaid).__name__})"
-    return " ".join(text.encode("utf-8", "backslashreplace").decode().split())
+    return " ".join(_ESCAPES.sub(" ", text.encode("utf-8", "backslashreplace").decode()).split())

@@ -41,7 +41,7 @@ def choose_device(device: str) -> None:
     config: Any = jax.config
     if config.jax_enable_x64:
         raise InputError(
-            "csac computes in 32 bits and JAX is set to 64: unset JAX_ENABLE_X64, or jax_enable_x64 in the task's module"
+            "csac computes in 32 bits and JAX is set to 64: unset JAX_ENABLE_X64, or jax_enable_x64 in the task"
         )
     if config.jax_default_prng_impl != PRNG:
         raise InputError(f"csac's keys are of JAX's {PRNG}: unset JAX_DEFAULT_PRNG_IMPL (jax_default_prng_impl)")

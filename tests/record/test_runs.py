@@ -33,6 +33,12 @@ def test_a_manifest_is_read_as_it_was_written():
     assert one.config.hyperparameters["hidden_sizes"] == [8, 8]
 
 
+def test_a_strangers_manifest_moves_no_terminal():
+    one = manifest(task="\x1b[31mred\x1b]0;\x07 \x9bx", failure="two\nlines \\ ö")
+    assert read(written(one)).config.task == "�[31mred�]0;� �x"
+    assert read(written(one)).failure == one.failure
+
+
 @pytest.mark.parametrize(
     ("content", "name"),
     [

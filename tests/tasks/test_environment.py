@@ -311,6 +311,7 @@ class Unsaid(Exception):
     [
         (RuntimeError("no file \udcff\nhere"), "RuntimeError: no file \\udcff here"),
         (Unsaid(), "Unsaid: ("),
+        (RuntimeError("\x1b[31mno\x1b[0m file\x07 here"), "RuntimeError: no file here"),
         (RuntimeError(), "RuntimeError"),
     ],
 )
