@@ -165,8 +165,8 @@ def _drawn_environment(run: RunSet, video: str | Path | None) -> Environment:
     except InputError as error:
         raise _cannot_be_drawn(task, error) from error
     renderer = getattr(environment.raw.unwrapped, "mujoco_renderer", None)
-    if renderer and renderer.camera_id == -1 and "trackbodyid" not in (renderer.default_cam_config or {}):
-        with suppress(KeyError):  # no camera that follows the body: a HalfCheetah runs out of the picture
+    if renderer and renderer.camera_id == -1:  # Gymnasium's free camera stays behind, whatever body it is to track
+        with suppress(KeyError):  # the model has no camera that follows its body
             renderer.camera_id = renderer.model.camera("track").id
     return environment
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import gc
+import runpy
 import shutil
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -12,6 +15,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from manifests import make_set, manifest
+from PIL import Image
 from policies import contract, random_policy
 
 from csac.cli import main
@@ -69,6 +73,13 @@ def run_of(tmp_path):
     return make
 
 
+@pytest.mark.parametrize("task", ["HalfCheetah-v4", "Walker2d-v4"])
+def test_the_camera_follows_the_body(tmp_path, task):
+    with closing(playing._drawn_environment(make_set(tmp_path, task=task), "film.mp4")) as environment:
+        renderer = environment.raw.unwrapped.mujoco_renderer
+        assert renderer.model.camera(renderer.camera_id).name == "track"
+
+
 def test_play_tells_how_far_it_is(run_of, tmp_path):
     told = []
     film = tmp_path / "film.mp4"
@@ -77,6 +88,15 @@ def test_play_tells_how_far_it_is(run_of, tmp_path):
     assert told == [(done, 14) for done in range(1, 15)]
     frames, _ = imageio_ffmpeg.count_frames_and_secs(str(film))
     assert frames == 2 * 10  # eight pictures, on the screen for a second
+
+
+def test_the_example_films_runs_side_by_side(run_of, tmp_path):
+    run = run_of(30)
+    run.append("evaluations", [{"seed": 0, "step": 9, "episode": 0, "return": 30.0, "length": 30, "success": None}])
+    film = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "film.py"))["film"]
+    film([run.path, run.path], tmp_path / "film.gif", begin=1.0, seconds=0.5)
+    with Image.open(tmp_path / "film.gif") as picture:
+        assert (picture.size, picture.n_frames) == ((520, 260), 10)
 
 
 def test_play_breaks_off_an_episode_that_never_ends(run_of, tmp_path, monkeypatch):
