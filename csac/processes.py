@@ -157,7 +157,7 @@ class Child:
         before = os.environ.get(_SAFE_PATH)
         self.process = context.Process(target=_work, args=(before, work, theirs, *arguments), daemon=daemon)
         try:
-            with _environment({_SAFE_PATH: "1"}), worker_surroundings():
+            with safe_path(), worker_surroundings():
                 self.process.start()
         except BaseException:  # a Ctrl-C that waited until the process was there
             if self.process.pid:
@@ -242,6 +242,13 @@ def worker_surroundings() -> Iterator[None]:
         finally:
             if has_masks:
                 signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+@contextmanager
+def safe_path() -> Iterator[None]:
+    """Have the Pythons that are started in this block not search the working directory for modules."""
+    with _environment({_SAFE_PATH: "1"}):
+        yield
 
 
 @contextmanager

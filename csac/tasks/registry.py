@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium
 
 from csac.checks import closest
+from csac.processes import safe_path
 from csac.tasks.failures import message, raise_interrupt, raised
 from csac.tasks.pybullet import ADAPTERS, FAMILIES, Adapter, quietly
 from csac.types import InputError
@@ -185,7 +186,8 @@ def _undisturbed(is_pybullet: bool) -> Iterator[None]:
 def _silence_mujoco() -> None:
     """Send MuJoCo's warnings to the log: by itself it prints them, and writes MUJOCO_LOG.TXT where the user works."""
     try:
-        mujoco = importlib.import_module("mujoco")
+        with safe_path():  # what draws for MuJoCo asks a Python of its own for its version
+            mujoco = importlib.import_module("mujoco")
     except Exception:  # a task that needs it says so
         return
     if mujoco.get_mju_user_warning() is None:

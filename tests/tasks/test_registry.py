@@ -113,7 +113,9 @@ import mine_alone
 def test_the_working_directory_is_searched_for_a_named_module_alone(tmp_path):
     (tmp_path / "mine_alone.py").write_text("import gymnasium; gymnasium.register('Mine-v0', 'nowhere:Mine')")
     (tmp_path / "json.py").write_text("raise SystemExit('the json.py of the working directory')")
+    (tmp_path / "struct.py").write_text("open('imported', 'w')")  # a Python that a library starts would import it
     ended = run_python(SHADOWED, tmp_path)
+    assert not (tmp_path / "imported").exists()
     assert "No module named 'mine_alone'" in ended.stderr
     named = SHADOWED.replace('"Pendulum-v1").close()', '"mine_alone:Other-v0")')
     ended = run_python(named, tmp_path)
