@@ -157,6 +157,7 @@ def _drawn_environment(run: RunSet, video: str | Path | None) -> Environment:
         raise InputError(f"the video is an .mp4 file: name it so, not {video}")
     if not has_display:
         os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is first imported
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame would complain that there is no display
     adapter = adapter_of(task)
     if adapter and video is not None:
         arguments = {**adapter.picture_arguments, **arguments}
