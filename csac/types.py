@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeAlias
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ class Spec(NamedTuple):
 
     observation_size: int
     action_size: int
+    environments: int = 1
+    """Environments that a seed steps side by side: their transitions of one turn follow each other in its memory."""
 
 
 class Transition(NamedTuple):
@@ -96,6 +99,12 @@ class Snapshot(NamedTuple):
         arrays = {key.removeprefix(prefix): array for key, array in self.arrays.items() if key.startswith(prefix)}
         return Snapshot(arrays, self.values[name])
 
+    @classmethod
+    def joined(cls, parts: dict[str, Snapshot]) -> Snapshot:
+        """Return snapshots as one, of which `part` gives each."""
+        arrays = {f"{name}.{key}": array for name, part in parts.items() for key, array in part.arrays.items()}
+        return cls(arrays, {name: part.values for name, part in parts.items()})
+
 
 class Ring(NamedTuple):
     """A seed's memory: transition number i lies in row i % capacity, as far as `added` of them were."""
@@ -105,7 +114,7 @@ class Ring(NamedTuple):
 
 
 class Cadence(NamedTuple):
-    """When an algorithm learns, and from how much. Steps are environment steps of one seed."""
+    """When an algorithm learns, and from how much. Steps are environment steps of one seed, in all its environments."""
 
     warmup_steps: int
     """Steps with uniform random actions and no update, before learning starts."""
@@ -129,6 +138,14 @@ class Cadence(NamedTuple):
     def updates(self, steps: int) -> int:
         """Return how many updates a run of so many steps makes without a warm-up, at least 1."""
         return max(steps // self.update_interval * self.updates_per_interval, 1)
+
+    def side_by_side(self, environments: int) -> Cadence:
+        """Return the cadence of so many environments: intervals of whole turns, with as many updates for each step."""
+        turns = -(-self.update_interval // environments) * environments
+        whole = self.update_interval // math.gcd(self.update_interval, self.updates_per_interval)
+        interval = math.lcm(turns, whole)
+        updates = interval * self.updates_per_interval // self.update_interval
+        return self._replace(update_interval=interval, updates_per_interval=updates)
 
 
 class Algorithm(Protocol):

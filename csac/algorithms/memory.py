@@ -70,14 +70,14 @@ def row_width(spec: Spec) -> int:
 
 
 def pack(transition: Transition) -> np.ndarray:
-    """Return transitions of several seeds, NumPy arrays [seed, ...], as rows [seed, width], fields in their order."""
-    fields = [field.reshape(len(field), -1) for field in transition]
-    return np.concatenate(fields, axis=1, dtype=np.float32, casting="unsafe")
+    """Return transitions, NumPy arrays [seed, (environment,) ...], as rows [..., width], fields in their order."""
+    fields = [field.reshape(*transition.reward.shape, -1) for field in transition]
+    return np.concatenate(fields, axis=-1, dtype=np.float32, casting="unsafe")
 
 
 def unpack(row: Float[Array, " width"], spec: Spec) -> Transition:
     """Return the transition in one packed row [width]."""
-    observation_size, action_size = spec
+    observation_size, action_size = spec[:2]
     first, second, third = observation_size, observation_size + action_size, 2 * observation_size + action_size + 1
     return Transition(
         observation=row[:first],

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import jax
@@ -10,7 +12,16 @@ import jax.numpy as jnp
 import optax
 
 from csac.algorithms.critics import make_critics
-from csac.algorithms.hyperparameters import COUNT, DISCOUNT, NOT_NEGATIVE, POSITIVE, RATE, WIDTHS, check_hyperparameters
+from csac.algorithms.hyperparameters import (
+    COUNT,
+    DISCOUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    RATE,
+    WIDTHS,
+    Limit,
+    check_hyperparameters,
+)
 from csac.algorithms.memory import Replay
 from csac.algorithms.networks import MLP, copy_tree, init_optimiser, make_mlp, make_optimiser
 from csac.algorithms.shapes import Count, Key
@@ -19,6 +30,8 @@ from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+
+UPDATES = Limit(lambda value: 0.01 <= value <= 1_000, "from 0.01 to 1,000")
 
 
 @dataclass(frozen=True)
@@ -43,10 +56,11 @@ class OffPolicy:
     """Transitions that the replay keeps."""
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts (the paper's T_initial)."""
-    updates_per_step: Annotated[int, COUNT] = 1
-    """Updates per environment step."""
+    updates_per_step: Annotated[float, UPDATES] = 1.0
+    """Updates per environment step; 0.25 is one after every fourth (rounded to a fraction of at most hundredths)."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps between rounds of updates; 1 is strict order, larger is faster."""
+    """Environment steps between rounds of updates; 1 is strict order, larger is faster. Rounded up to whole turns of
+    several environments."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
     """Decay of the average gradient in the networks' Adam (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
@@ -62,16 +76,19 @@ class OffPolicy:
     @property
     def cadence(self) -> Cadence:
         """When it learns, and from how much."""
+        updates = Fraction(self.updates_per_step).limit_denominator(100)
+        interval = math.lcm(self.update_interval, updates.denominator)
         return Cadence(
             warmup_steps=self.warmup_steps,
-            update_interval=self.update_interval,
-            updates_per_interval=self.updates_per_step * self.update_interval,
+            update_interval=interval,
+            updates_per_interval=int(updates * interval),
             transitions_per_update=self.batch_size * self.batches_per_update,
         )
 
     def memory(self, spec: Spec, steps: int) -> Replay:
         """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
-        return Replay.create(min(self.replay_size, steps), spec, self.update_interval)
+        together = self.cadence.side_by_side(spec.environments).update_interval
+        return Replay.create(min(self.replay_size, steps), spec, together)
 
     def optimiser(self, learning_rate: float) -> optax.GradientTransformation:
         """Return the networks' Adam."""

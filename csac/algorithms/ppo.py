@@ -44,7 +44,7 @@ class State(NamedTuple):
     optimiser: Any
     observations: Statistics  # [observation]
     returns: Statistics  # [] of the discounted return so far in each episode
-    discounted_return: Scalar  # of the episode that the last rollout broke off
+    discounted_return: Float[Array, "..."]  # of the episode, or [environment] episodes, that the last rollout broke off
     total_updates: Scalar  # in this run
 
 
@@ -140,10 +140,11 @@ class PPO:
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Absorb the rollout into the statistics, then take `epochs` times `minibatches` gradient steps on it."""
-        returns, discounted_return = discounted_returns(state.discounted_return, batch, self.discount)
+        in_time = by_environment(batch, state)
+        returns, discounted_return = discounted_returns(state.discounted_return, in_time, self.discount)
         absorbed = state._replace(
             observations=state.observations.absorb(batch.observation),
-            returns=state.returns.absorb(returns),
+            returns=state.returns.absorb(returns.ravel()),
             discounted_return=discounted_return,
         )
         samples = self.samples(state, absorbed, batch)
@@ -177,7 +178,8 @@ class PPO:
         value = jax.vmap(partial(value_at, state.parameters))
         values, next_values = value(observations), value(next_observations)
         scaled = batch._replace(reward=self.scale(absorbed.returns, batch.reward))
-        advantages = advantages_of(scaled, values, next_values, self.discount, self.trace_decay)
+        given = by_environment((scaled, values, next_values), state)
+        advantages = advantages_of(*given, discount=self.discount, trace_decay=self.trace_decay).ravel()
         log_probs = jax.vmap(log_prob)(batch.observation, batch.action)
         return Sample(observations, batch.action, log_probs, values, advantages, values + advantages)
 
@@ -221,7 +223,9 @@ class PPO:
         )
 
     def memory(self, spec: Spec, steps: int) -> Rollout:
-        """Return a rollout yet to be made."""
+        """Return a rollout yet to be made. Raises InputError for environments that do not share its steps evenly."""
+        if self.rollout_steps % spec.environments:
+            raise InputError(f"environments must divide rollout_steps, {self.rollout_steps}, not {spec.environments}")
         return Rollout.create(self.rollout_steps, spec)
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
@@ -237,7 +241,7 @@ class PPO:
             optimiser=init_optimiser(self._optimiser(self.learning_rate), parameters),
             observations=Statistics.create((spec.observation_size,)),
             returns=Statistics.create(()),
-            discounted_return=jnp.zeros(()),
+            discounted_return=jnp.zeros(spec.environments if spec.environments > 1 else ()),
             total_updates=jnp.float32(self.cadence.updates(steps)),
         )
 
@@ -262,6 +266,12 @@ class PPO:
     def _optimiser(self, learning_rate: float | Scalar) -> optax.GradientTransformation:
         # As one vector: few buffers to hand over when acting, which takes longer than the networks do.
         return optax.flatten(make_optimiser(learning_rate, self.max_gradient_norm, epsilon=self.adam_epsilon))
+
+
+def by_environment(rollout: Any, state: State) -> Any:
+    """Return arrays [step, ...] of a rollout as [time, environment, ...], or as they are of a single environment."""
+    environments = state.discounted_return.shape
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *environments, *leaf.shape[1:]), rollout)
 
 
 def policy_at(parameters: Parameters, observation: Observation) -> Gaussian:

@@ -1,4 +1,4 @@
-"""Returns and advantages of a rollout: transitions of one seed, in order, with a leading axis of time."""
+"""Returns and advantages of a rollout: transitions in order, [time], or [time, environment] of several of these."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from csac.algorithms.shapes import Scalar, Scalars
 from csac.types import Transition
 
 
-def discounted_returns(start: Scalar, batch: Transition, discount: float) -> tuple[Scalars, Scalar]:
+def discounted_returns(
+    start: Float[Array, "..."], batch: Transition, discount: float
+) -> tuple[Float[Array, "time ..."], Float[Array, "..."]]:
     """Return R_t = r_t + γ R_{t-1}, from 0 in each episode, and what the next rollout goes on from."""
 
-    def advance(running: Scalar, transition: Transition) -> tuple[Scalar, Scalar]:
+    def advance(running: jax.Array, transition: Transition) -> tuple[jax.Array, jax.Array]:
         running = discount * running + transition.reward
         return running * _goes_on(transition), running
 
@@ -22,8 +24,12 @@ def discounted_returns(start: Scalar, batch: Transition, discount: float) -> tup
 
 
 def advantages_of(
-    batch: Transition, values: Scalars, next_values: Scalars, discount: float, trace_decay: float
-) -> Scalars:
+    batch: Transition,
+    values: Float[Array, "time ..."],
+    next_values: Float[Array, "time ..."],
+    discount: float,
+    trace_decay: float,
+) -> Float[Array, "time ..."]:
     """Return the generalised advantages of a rollout (GAE, Eq. 16; PPO, Eq. 11).
 
     A_t = δ_t + γ λ A_{t+1} with δ_t = r_t + γ (1 - terminated_t) V(s_{t+1}) - V(s_t), where s_{t+1} is what step t
@@ -32,12 +38,12 @@ def advantages_of(
     errors = batch.reward + discount * (1.0 - batch.terminated) * next_values - values
     decays = discount * trace_decay * _goes_on(batch)
 
-    def step_back(advantage: Scalar, step: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+    def step_back(advantage: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         error, decay = step
         advantage = error + decay * advantage
         return advantage, advantage
 
-    return jax.lax.scan(step_back, jnp.zeros(()), (errors, decays), reverse=True)[1]
+    return jax.lax.scan(step_back, jnp.zeros(errors.shape[1:]), (errors, decays), reverse=True)[1]
 
 
 def explained_variance(values: Scalars, targets: Scalars) -> Scalar:

@@ -139,6 +139,7 @@ class Tune(_Training):
     """The first seed; the others are numbered from it. Report results on other seeds."""
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/tune/TASK/ALGORITHM)")] = None
     """The directory of the search: new, empty, or of the same search."""
+    environments: Suppress[int] = 1
     perturbations: Suppress[tuple[str, ...]] = ()
     events: Suppress[tuple[str, ...]] = ()
 
@@ -275,7 +276,7 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
     defaults: dict[str, Any] = {"algorithm": name, "preset": preset}
     learner = ALGORITHMS[name](**(hyperparameters(preset, name, task) if preset else {}))
     if source:
-        kept = ("steps", "evaluation_interval", "evaluation_episodes", "evaluation_seed")
+        kept = ("steps", "environments", "evaluation_interval", "evaluation_episodes", "evaluation_seed")
         defaults |= {item: getattr(source.config, item) for item in kept}
         defaults |= {"seeds": len(source.seeds), "first_seed": source.seeds[0]}
         defaults["environment_arguments"] = source.config.environment_arguments

@@ -45,7 +45,7 @@ int64_t artefact_step(const float *observation, float *action)
 
 def header(policy: Policy, guards: Guards, control_rate: float | None) -> str:
     """Return the header that runs a policy."""
-    contract, (observation_size, action_size) = policy.contract, policy.contract.spec
+    contract, (observation_size, action_size) = policy.contract, policy.contract.spec[:2]
     parameters = deterministic(policy.network.parameters, action_size)
     tensors = to_tensors(parameters) | {
         "low": contract.action_low,

@@ -40,7 +40,7 @@ def model(policy: Policy, guards: Guards, fields: dict[str, Any]) -> bytes:
     import onnx
     from onnx import TensorProto, checker, helper
 
-    graph, (observation_size, action_size) = _Graph(), policy.contract.spec
+    graph, (observation_size, action_size) = _Graph(), policy.contract.spec[:2]
     inputs, outputs = {"observation": observation_size}, {"action": action_size}
     if guards.has_state:
         inputs["state"] = outputs["next_state"] = action_size + 1

@@ -53,7 +53,7 @@ class Policy:
 
     def _check(self) -> None:
         """Raise InputError if the layers do not fit each other or the contract."""
-        (observation_size, action_size), network = self.contract.spec, self.network
+        (observation_size, action_size), network = self.contract.spec[:2], self.network
         if (network.activation, network.head) != (self.contract.activation, self.contract.head):
             raise InputError(f"the policy is {network.activation}/{network.head}, not as its contract says")
         try:

@@ -208,7 +208,7 @@ class Evaluator:
         should_stop: Callable[[], bool] | None,
     ) -> None:
         """Play episodes side by side to their ends."""
-        observation_size, action_size = policy.contract.spec
+        observation_size, action_size = policy.contract.spec[:2]
         observations = np.zeros((EPISODES_AT_ONCE, observation_size), np.float32)
         noise = None if deterministic else np.zeros((EPISODES_AT_ONCE, action_size), np.float32)
         for row, episode in enumerate(episodes):

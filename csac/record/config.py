@@ -37,6 +37,8 @@ class RunConfig:
     """Seed of the networks, of exploration, of the replay's draws and of the training episodes."""
     steps: int = 1_000_000
     """Environment steps per seed, warm-up included."""
+    environments: int = 1
+    """Environments that each seed steps side by side; steps are those of all of them together."""
     device: Literal["cpu", "gpu"] = "cpu"
     """Device that the networks are trained on."""
     evaluation_interval: int = 5_000
@@ -65,6 +67,8 @@ class RunConfig:
             raise InputError(f"device must be cpu or gpu, not {self.device!r}")
         for name, least, most in _RANGES:
             check_whole(name, getattr(self, name), least, most)
+        if self.steps % self.environments:
+            raise InputError(f"steps must be a multiple of environments, {self.environments}, not {self.steps:,}")
         for name in ("hyperparameters", "environment_arguments"):
             object.__setattr__(self, name, as_json(name, getattr(self, name)))
         for name in ("perturbations", "events"):
@@ -74,6 +78,7 @@ class RunConfig:
 _RANGES = (
     ("seed", 0, SEED_LIMIT - 1),
     ("steps", 1, STEPS_LIMIT),
+    ("environments", 1, 1_000),
     ("evaluation_interval", 0, NEVER),
     ("evaluation_episodes", 1, MOST_EPISODES),
     ("evaluation_seed", 0, 2**30 - 1),

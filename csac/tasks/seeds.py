@@ -21,9 +21,12 @@ TUNING_EVALUATION_SEED = 3_000_000  # in training for `csac tune`: what hyperpar
 FIRST_TRAINING_SEED = 2**30  # above every evaluation seed, and with as many again still a C int
 
 
-def training_seed(seed: int, episode: int) -> int:
-    """Return the reset seed of a seed's training episode: its own, and never an evaluation episode's."""
-    word = int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
+Place = tuple[int, ...]  # of an environment: its seed's, and its own where a seed has several
+
+
+def training_seed(seed: int, episode: int, environment: int = 0) -> int:
+    """Return the reset seed of an environment's training episode: its own, and never an evaluation episode's."""
+    word = int(np.random.SeedSequence([seed, episode, environment]).generate_state(1)[0])
     return FIRST_TRAINING_SEED + word % FIRST_TRAINING_SEED
 
 
@@ -44,7 +47,10 @@ class Failure(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """One step of every seed, in new arrays to be read only; a failed seed's rows stay at its last good values."""
+    """One step of every environment, in new arrays to be read only; where one failed they keep its last good values.
+
+    Their first axis is of seeds, and the second of environments where a seed has several.
+    """
 
     next_observation: np.ndarray  # [seed, observation] what the step gave, also where the episode ended
     reward: np.ndarray  # [seed] float32
@@ -56,40 +62,50 @@ class Steps(NamedTuple):
 
 
 class SeedEnvironments:
-    """One environment per seed, reset by itself where an episode ends, each episode with its own derived seed.
+    """The environments of each seed, reset by themselves where an episode ends, each episode with its own derived seed.
 
-    A seed fails alone: where its environment raises or gives what is not finite, it is reported once and never stepped
-    again. `alive` [seed] says which seeds still step; it turns false with the report.
+    A seed fails alone: where one of its environments raises or gives what is not finite, it is reported once and never
+    stepped again. `alive` [seed] says which seeds still step; it turns false with the report.
+
+    Args:
+        task, environment_arguments: as of `Environment`.
+        seeds: the seeds.
+        environments: how many each seed has.
 
     Raises:
         InputError: as `Environment`.
     """
 
-    def __init__(self, task: Task, environment_arguments: dict[str, Any] | None, seeds: Sequence[int]) -> None:
-        self.environments = [Environment(task, environment_arguments) for _ in seeds]
+    def __init__(
+        self, task: Task, environment_arguments: dict[str, Any] | None, seeds: Sequence[int], environments: int = 1
+    ) -> None:
+        axes = (len(seeds), environments) if environments > 1 else (len(seeds),)
+        self._places: list[Place] = list(np.ndindex(*axes))
+        self.environments = [Environment(task, environment_arguments) for _ in self._places]
+        self._at = dict(zip(self._places, self.environments, strict=True))
         first = self.environments[0]
-        self.spec, self.contract_parts, self.task_name = first.spec, first.contract_parts, first.task_name
+        self.spec = first.spec._replace(environments=environments)
+        self.contract_parts, self.task_name, self._bounds = first.contract_parts, first.task_name, first.bounds
         self.seeds = tuple(seeds)
         self.alive = np.ones(len(seeds), bool)
-        self._running = list(range(len(seeds)))
-        self._bounds = first.bounds
-        self._action_shape = first.contract_parts.action_shape
-        self._observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
-        self._reward = np.zeros(len(seeds), np.float32)
-        self._begun = [0] * len(seeds)
-        self._returns = [0.0] * len(seeds)
-        self._lengths = [0] * len(seeds)
+        self._running = self._places
+        self._action_axes = *axes, *first.contract_parts.action_shape
+        self._observation = np.zeros((*axes, self.spec.observation_size), np.float32)
+        self._reward = np.zeros(axes, np.float32)
+        self._begun = dict.fromkeys(self._places, 0)
+        self._returns = dict.fromkeys(self._places, 0.0)
+        self._lengths = dict.fromkeys(self._places, 0)
         self._failures: list[Failure] = []
         self.refused: dict[int, str] = {}  # why the episode saved of the seed at this place was not restored
 
     def reset(self) -> np.ndarray:
-        """Start the next episode of every seed: observations [seed, observation].
+        """Start the next episode of every environment: observations [seed, observation].
 
         A seed that fails here is reported by the next `step`.
         """
         self._observation = self._observation.copy()
-        for index in self._running:
-            self._reset(index)
+        for place in self._running:
+            self._reset(place)
         return self._observation
 
     def perturb(self, values: Mapping[str, float]) -> None:
@@ -98,25 +114,26 @@ class SeedEnvironments:
             environment.perturb(values)
 
     def step(self, actions: np.ndarray) -> Steps:
-        """Step every seed that is alive with its action in [-1, 1], [seed, action]."""
-        scaled = self._bounds.scale(actions).reshape(-1, *self._action_shape)
+        """Step every environment of the seeds that are alive with its action in [-1, 1], [seed, action]."""
+        scaled = self._bounds.scale(actions).reshape(self._action_axes)
         next_observation, reward = self._observation.copy(), self._reward.copy()
-        terminated, truncated = np.zeros(len(reward), bool), np.zeros(len(reward), bool)
-        episodes: list[FinishedEpisode] = []
-        for index in self._running:
+        terminated, truncated = np.zeros(reward.shape, bool), np.zeros(reward.shape, bool)
+        ended: list[Place] = []
+        for place in self._running:
             try:
-                step = self.environments[index].step_environment_scale(scaled[index])
+                step = self._at[place].step_environment_scale(scaled[place])
             except EnvironmentFailure as error:
-                self._fail(index, error)
+                self._fail(place, error)
                 continue
-            next_observation[index], reward[index], terminated[index], truncated[index], _ = step
-            self._returns[index] += step[1]
-            self._lengths[index] += 1
+            next_observation[place], reward[place], terminated[place], truncated[place], _ = step
+            self._returns[place] += step[1]
+            self._lengths[place] += 1
             if step[2] or step[3]:
-                episodes.append(FinishedEpisode(index, self._returns[index], self._lengths[index]))
+                ended.append(place)
         self._observation, self._reward = next_observation.copy(), reward
-        for episode in episodes:
-            self._reset(episode.place)
+        episodes = [FinishedEpisode(place[0], self._returns[place], self._lengths[place]) for place in ended]
+        for place in ended:
+            self._reset(place)
         failures, self._failures = self._failures, []
         for failure in failures:
             self.alive[failure.place] = False
@@ -125,25 +142,35 @@ class SeedEnvironments:
     def stop(self, index: int) -> None:
         """Step the seed at this place in the group no more."""
         self.alive[index] = False
-        self._running = [other for other in self._running if other != index]
+        self._rest(index)
 
     def save(self, index: int) -> Snapshot:
-        """Return what the seed at this place needs to go on; unless "exact", from the start of its episode.
+        """Return what the seed at this place needs to go on; unless "exact", from the start of its episodes.
 
         "problem" says what is wrong with an environment that offers to be saved and cannot.
         """
+        saved = {str(place[-1]): self._save(place) for place in self._of(index)}
+        if self.spec.environments == 1:
+            return next(iter(saved.values()))
+        joined, all_values = Snapshot.joined(saved), [one.values for one in saved.values()]
+        joined.values["alive"] = bool(self.alive[index])
+        joined.values["exact"] = all(values["exact"] for values in all_values)
+        joined.values["problem"] = next(filter(None, (values["problem"] for values in all_values)), "")
+        return joined
+
+    def _save(self, place: Place) -> Snapshot:
         inner, problem = None, ""
         try:
-            inner = self.environments[index].snapshot() if self.alive[index] else None
+            inner = self._at[place].snapshot() if self.alive[place[0]] else None
         except EnvironmentFailure as error:
             problem = str(error)
-        arrays = {"observation": self._observation[index].copy(), **(inner.arrays if inner else {})}
+        arrays = {"observation": self._observation[place].copy(), **(inner.arrays if inner else {})}
         values = {
-            "alive": bool(self.alive[index]),
-            "reward": float(self._reward[index]),
-            "episodes_begun": self._begun[index],
-            "episode_return": self._returns[index],
-            "episode_length": self._lengths[index],
+            "alive": bool(self.alive[place[0]]),
+            "reward": float(self._reward[place]),
+            "episodes_begun": self._begun[place],
+            "episode_return": self._returns[place],
+            "episode_length": self._lengths[place],
             "exact": inner is not None,
             "problem": problem,
             "environment": inner.values if inner else {},
@@ -151,27 +178,34 @@ class SeedEnvironments:
         return Snapshot(arrays, values)
 
     def restore(self, index: int, saved: Snapshot) -> bool:
-        """Let the seed at this place go on from `save`; return false where its episode had to start anew.
+        """Let the seed at this place go on from `save`; return false where an episode of it had to start anew.
 
         That is so as well where the environment does not take the snapshot, which `refused` then says. A seed whose
         environment cannot be reset either is reported by the next `step`. Raises KeyError or ValueError where this is
         not what `save` returns.
         """
+        if self.spec.environments == 1:
+            return self._restore((index,), saved, saved.values["exact"])
+        parts = {place: saved.part(str(place[-1])) for place in self._of(index)}
+        gone_on = [self._restore(place, part, saved.values["exact"]) for place, part in parts.items()]
+        return all(gone_on)
+
+    def _restore(self, place: Place, saved: Snapshot, is_exact: bool) -> bool:
         arrays, values = dict(saved.arrays), saved.values
         _check_saved(values)
         observation = arrays.pop("observation")
-        if observation.shape != self._observation[index].shape:
+        if observation.shape != self._observation[place].shape:
             raise ValueError(f"an observation has shape {observation.shape}")
-        self._begun[index] = values["episodes_begun"]
+        self._begun[place] = values["episodes_begun"]
         self._observation, self._reward = self._observation.copy(), self._reward.copy()
-        self._observation[index], self._reward[index] = observation, values["reward"]
+        self._observation[place], self._reward[place] = observation, values["reward"]
         if not values["alive"]:
-            self.stop(index)
-        elif values["exact"] and self._is_restored(index, Snapshot(arrays, values["environment"])):
-            self._returns[index], self._lengths[index] = values["episode_return"], values["episode_length"]
+            self.stop(place[0])
+        elif is_exact and self._is_restored(place, Snapshot(arrays, values["environment"])):
+            self._returns[place], self._lengths[place] = values["episode_return"], values["episode_length"]
         else:
-            self._begun[index] -= 1
-            self._reset(index)
+            self._begun[place] -= 1
+            self._reset(place)
             return False
         return True
 
@@ -190,28 +224,37 @@ class SeedEnvironments:
         for environment in self.environments:
             environment.close()
 
-    def _reset(self, index: int) -> None:
-        self._returns[index], self._lengths[index] = 0.0, 0
-        seed = training_seed(self.seeds[index], self._begun[index])
-        self._begun[index] += 1
-        try:
-            self._observation[index] = self.environments[index].reset(seed)
-        except EnvironmentFailure as error:
-            self._fail(index, error)
+    def _of(self, index: int) -> list[Place]:
+        """Return the places of the environments of the seed at this place."""
+        return [place for place in self._places if place[0] == index]
 
-    def _is_restored(self, index: int, saved: Snapshot) -> bool:
-        """Return whether the environment goes on with its episode; one that was saved by another task may not."""
+    def _reset(self, place: Place) -> None:
+        self._returns[place], self._lengths[place] = 0.0, 0
+        seed = training_seed(self.seeds[place[0]], self._begun[place], *place[1:])
+        self._begun[place] += 1
         try:
-            self.environments[index].restore(training_seed(self.seeds[index], self._begun[index] - 1), saved)
+            self._observation[place] = self._at[place].reset(seed)
         except EnvironmentFailure as error:
-            self.refused[index] = str(error)
+            self._fail(place, error)
+
+    def _is_restored(self, place: Place, saved: Snapshot) -> bool:
+        """Return whether the environment goes on with its episode; one that was saved by another task may not."""
+        seed = training_seed(self.seeds[place[0]], self._begun[place] - 1, *place[1:])
+        try:
+            self._at[place].restore(seed, saved)
+        except EnvironmentFailure as error:
+            self.refused[place[0]] = str(error)
             return False
         return True
 
-    def _fail(self, index: int, error: EnvironmentFailure) -> None:
-        self._running = [other for other in self._running if other != index]
+    def _rest(self, index: int) -> None:
+        self._running = [place for place in self._running if place[0] != index]
+
+    def _fail(self, place: Place, error: EnvironmentFailure) -> None:
+        self._rest(place[0])
         details = "".join(traceback.format_exception(error)) if error.__cause__ else ""
-        self._failures.append(Failure(index, str(error), details))
+        if all(failure.place != place[0] for failure in self._failures):
+            self._failures.append(Failure(place[0], str(error), details))
 
 
 def _check_saved(values: Mapping[str, Any]) -> None:

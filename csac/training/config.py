@@ -31,6 +31,7 @@ class TrainOptions(TypedDict, total=False):
     """The keyword arguments of `train` that say what a run computes, as `RunConfig` explains them."""
 
     steps: int
+    environments: int
     device: Literal["cpu", "gpu", "cuda"]
     evaluation_interval: int
     evaluation_episodes: int
@@ -91,7 +92,7 @@ def make_configs(
         refuse_late(changes, configs[0].steps, planned=source is not None and asked is None)
         for item in changes:
             environment.perturb({item.kind: item.value})
-    return configs, spec, [f"note: {line}" for line in notes]
+    return configs, spec._replace(environments=configs[0].environments), [f"note: {line}" for line in notes]
 
 
 def labels(seeds: int, first_seed: int) -> list[int]:

@@ -45,7 +45,7 @@ class Learner:
 
     def __init__(self, algorithm: Algorithm, spec: Spec, seeds: Sequence[int], steps: int) -> None:
         self.algorithm, self.spec, self._steps = algorithm, spec, steps
-        self._cadence = algorithm.cadence
+        self._cadence = algorithm.cadence.side_by_side(spec.environments)
         self._axis = SeedAxis(len(seeds))
         self._updates_summed = 0
         self._waiting = np.zeros((len(seeds), self._cadence.update_interval, row_width(spec)), np.float32)
@@ -56,7 +56,8 @@ class Learner:
         begin = jax.jit(self._axis.map(self._one.begin), compiler_options={"xla_backend_optimization_level": 1})
         keys = [np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds]
         self._carry: Carry = begin(self._axis.stack(keys))
-        observations = np.zeros((len(seeds), spec.observation_size), np.float32)
+        turn = (spec.environments,) if spec.environments > 1 else ()
+        observations = np.zeros((len(seeds), *turn, spec.observation_size), np.float32)
         self._parcel = Parcel(self._axis.strip(self._waiting).shape, self._axis.strip(observations).shape)
         # JAX pairs what is donated with what comes out by order and shape. So the carry comes out first, and is kept
         # whole where an algorithm does not read all of it: a shift by one would copy whole networks to and fro.
@@ -69,23 +70,24 @@ class Learner:
         )
 
     def next_actions(self, observations: np.ndarray, step: int) -> np.ndarray:
-        """Return the actions [seed, action] for observations [seed, observation], after `step` steps."""
+        """Return the actions [seed, (environment,) action] for observations of such axes, after `step` steps."""
         program = self._explore_alone if step < self._cadence.warmup_steps else self._act_alone
         return self._axis.restore(np.array(program(self._carry, self._axis.strip(observations), np.int32(step))))
 
     def step(self, observations: np.ndarray, actions: np.ndarray, outcome: Steps, step: int) -> np.ndarray:
-        """Remember environment step number `step`, learn where it is time to, and return the next actions.
+        """Remember a turn, learn where it is time to, and return the next actions.
 
-        One dispatch, whatever the algorithm does. Between updates transitions wait on the host, so that an algorithm
-        that learns from rollouts is only asked to act.
+        A turn is a step of each of a seed's environments, and `step` the number of its last. One dispatch, whatever the
+        algorithm does. Between updates transitions wait on the host, so that an algorithm that learns from rollouts is
+        only asked to act.
         """
-        interval = self._cadence.update_interval
-        self._waiting[:, (step - 1) % interval] = pack(
+        rows = pack(
             Transition(
                 observations, actions, outcome.reward, outcome.next_observation, outcome.terminated, outcome.truncated
             )
         )
-        if step % interval:
+        self._waiting[:, self._turn(step)] = rows.reshape(len(rows), self.spec.environments, -1)
+        if step % self._cadence.update_interval:
             return self.next_actions(outcome.observation, step)
         program = self._explore
         if step >= self._cadence.warmup_steps:
@@ -183,9 +185,13 @@ class Learner:
 
         One that an update has learnt from already stays as it was. Only rollouts look across episodes.
         """
-        interval = self._cadence.update_interval
-        if step % interval:
-            self._waiting[indices, (step - 1) % interval, -1] = 1.0  # `pack` ends with it
+        if step % self._cadence.update_interval:
+            self._waiting[indices, self._turn(step), -1] = 1.0  # `pack` ends with it
+
+    def _turn(self, step: int) -> slice:
+        """Return where the transitions of the turn that ends with this step wait."""
+        begin = (step - self.spec.environments) % self._cadence.update_interval
+        return slice(begin, begin + self.spec.environments)
 
     def first_bad(self, index: int) -> str | None:
         """Return the name of the first of a seed's arrays that is not finite, or None."""
@@ -210,6 +216,7 @@ class OneSeed:
 
     def __init__(self, algorithm: Algorithm, spec: Spec, steps: int) -> None:
         self.algorithm, self.spec = algorithm, spec
+        self.cadence = algorithm.cadence.side_by_side(spec.environments)
         # Both are asked for shapes and then to run: traced once.
         self._first = jax.jit(
             lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), inline=True
@@ -218,7 +225,7 @@ class OneSeed:
         self.state, memory = jax.eval_shape(lambda data: self._first(jax.random.wrap_key_data(data)), KEY_DATA)
         self.metrics = tuple(jax.eval_shape(self._first_metrics, self.state, memory, KEY_DATA))
         # What acts more often than it learns would take its policy out of the row again and again.
-        self.packing = Packing(self.state, SMALL if algorithm.cadence.update_interval == 1 else 0)
+        self.packing = Packing(self.state, SMALL if self.cadence.update_interval == spec.environments else 0)
 
     def begin(self, key_data: jax.Array) -> Carry:
         """Return what a seed begins with."""
@@ -227,12 +234,12 @@ class OneSeed:
         return Carry(self.packing.pack(state), memory, jnp.zeros(len(self.metrics)), jax.random.key_data(run_key))
 
     def explore(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
-        """Return a uniformly random action."""
-        shape = (self.spec.action_size,)
+        """Return a uniformly random action for each observation."""
+        shape = (*observation.shape[:-1], self.spec.action_size)
         return jax.random.uniform(_keys(carry.key, step)[2], shape, minval=-1.0, maxval=1.0)
 
     def act(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
-        """Return the policy's action, to explore."""
+        """Return the policy's action for each observation, to explore."""
         return self._act(self.packing.unpack(carry.state), carry.key, observation, step)
 
     def remember_and_explore(
@@ -257,10 +264,10 @@ class OneSeed:
             return state, sums + jnp.stack([metrics[name] for name in self.metrics])
 
         learnt = self.packing.unpack(carry.state), carry.sums
-        if self.algorithm.cadence.updates_per_interval == 1:
+        if self.cadence.updates_per_interval == 1:
             state, sums = update(jnp.int32(0), learnt)
         else:
-            state, sums = jax.lax.fori_loop(0, self.algorithm.cadence.updates_per_interval, update, learnt)
+            state, sums = jax.lax.fori_loop(0, self.cadence.updates_per_interval, update, learnt)
         action = self._act(state, carry.key, observation, step)
         return Carry(self.packing.pack(state), memory, sums, carry.key), action
 
@@ -269,15 +276,19 @@ class OneSeed:
         return self._update(state, self._draw(memory, key, jnp.int32(1)), key, jnp.int32(0))[1]
 
     def _draw(self, memory: Any, key: jax.Array, count: jax.Array) -> Transition:
-        return memory.draw(key, count, self.algorithm.cadence.transitions_per_update, self.spec)
+        return memory.draw(key, count, self.cadence.transitions_per_update, self.spec)
 
     def _updates_before(self, step: jax.Array) -> jax.Array:
         """Return how many updates came before those that follow environment step `step`."""
-        cadence = self.algorithm.cadence
+        cadence = self.cadence
         return (step - cadence.first_update) // cadence.update_interval * cadence.updates_per_interval
 
     def _act(self, state: Any, key_data: jax.Array, observation: jax.Array, step: jax.Array) -> jax.Array:
-        return self.algorithm.act(state, observation, _keys(key_data, step)[2], True)
+        key = _keys(key_data, step)[2]
+        if observation.ndim == 1:
+            return self.algorithm.act(state, observation, key, True)
+        keys = jax.random.split(key, len(observation))
+        return jax.vmap(lambda one, key: self.algorithm.act(state, one, key, True))(observation, keys)
 
 
 def misfit(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str | None:
@@ -288,12 +299,12 @@ def misfit(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str
         if given is None or given.shape != leaf.shape or given.dtype != leaf.dtype:
             found = "no such array" if given is None else f"{given.dtype} {given.shape}"
             return f"{name} is to be {leaf.dtype} {leaf.shape} and the checkpoint has {found}"
-    cadence = algorithm.cadence
+    cadence = algorithm.cadence.side_by_side(spec.environments)
     planned = saved.arrays.get("state.total_updates", cadence.updates(steps))
     if cadence.has_schedule and planned != cadence.updates(steps):
         return f"its schedule is of {cadence.updates(steps):,} updates and the checkpoint's of {planned:,.0f}"
     rows = saved.arrays["waiting"]
-    if rows.shape != (algorithm.cadence.update_interval, row_width(spec)):
+    if rows.shape != (cadence.update_interval, row_width(spec)):
         return f"the checkpoint has rollouts of {len(rows)} steps of width {rows.shape[1]}"
     return None
 

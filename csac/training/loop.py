@@ -57,10 +57,11 @@ class Loop:
     ) -> None:
         self.runs, self.watcher, self.config = list(runs), watcher, runs[0].config
         self.step, self.steps = points[0].step, self.config.steps
+        self._turn = self.config.environments  # steps made at a time: one of each environment
         seeds = [run.seed for run in runs]
         arguments = self.config.environment_arguments
         with ExitStack() as stack:
-            self.environments = SeedEnvironments(program.task, arguments, seeds)
+            self.environments = SeedEnvironments(program.task, arguments, seeds, self._turn)
             stack.callback(self.environments.close)
             self._base_evaluator = Evaluator(
                 *(program.task, arguments, self.config.evaluation_episodes, self.config.evaluation_seed),
@@ -101,9 +102,9 @@ class Loop:
         while self.step < self.steps and self.environments.is_any_alive and not is_asked:
             self._advance()
             last = self.step == self.steps
-            if self.step % METRICS_INTERVAL == 0 or last:
+            if self._is_due(METRICS_INTERVAL) or last:
                 self._record_metrics()
-            looks = self.step % LOOK_INTERVAL == 0 or last
+            looks = self._is_due(LOOK_INTERVAL) or last
             if looks:
                 self._stop_diverged()
             if self._is_due(self.config.evaluation_interval) or (last and self.config.evaluation_interval):
@@ -142,12 +143,13 @@ class Loop:
         """Reset the environments, or restore what `save` wrote."""
         keep = self.config.keep_checkpoints
         self._writers = [Writer(run.checkpoints, keep) for run in self.runs]
-        self._perturb(max(self.step - 1, 0))  # as in the step that the checkpoint came after
+        self._perturb(max(self.step - self._turn, 0))  # as in the turn that the checkpoint came after
         if not self.step:
             self._observations = self.environments.reset()
             self._actions = self.learner.next_actions(self._observations, 0)
             return
-        self._actions = np.zeros((len(self.runs), self.environments.spec.action_size), np.float32)
+        axes = self.environments.observations.shape[:-1]
+        self._actions = np.zeros((*axes, self.environments.spec.action_size), np.float32)
         learnt, restarted, fills = [], [], []
         for index, (run, point) in enumerate(zip(self.runs, points, strict=True)):
             assert point.checkpoint
@@ -184,14 +186,14 @@ class Loop:
         return fill
 
     def _advance(self) -> None:
-        """Make one environment step, and learn from it."""
-        if self.step in self._changes:
+        """Make one step of each environment, and learn from them."""
+        for change in [self._changes[step] for step in self._changes if 0 <= self.step - step < self._turn]:
             self._perturb(self.step)
             for run in self.runs:
-                run.log(f"perturbed from step {self.step + 1:,} on: {self._changes[self.step]}")
-            self.watcher.note(f"perturbed from step {self.step + 1:,} on: {self._changes[self.step]}")
+                run.log(f"perturbed from step {self.step + 1:,} on: {change}")
+            self.watcher.note(f"perturbed from step {self.step + 1:,} on: {change}")
         outcome = self.environments.step(self._actions)
-        self.step += 1
+        self.step += self._turn
         for failure in outcome.failures:
             self._save_policy(failure.place)
             self._fail(failure.place, failure.reason, failure.details)
@@ -212,7 +214,7 @@ class Loop:
         networks = self.learner.networks()
         places = [i for i in np.flatnonzero(self.environments.alive).tolist() if _is_finite(networks[i])]
         policies = [Policy(networks[i], self._contract, step=self.step) for i in places]
-        self._base_evaluator.perturb(values_at(self._perturbations, self.step - 1))
+        self._base_evaluator.perturb(values_at(self._perturbations, self.step - self._turn))
         self._pending = (self.step, places, policies, self.evaluator.begin(policies))
         return is_asked or (self._pending[3].is_over and self._settle())
 
@@ -276,13 +278,9 @@ class Loop:
             self.save()
 
     def _snapshot(self, index: int) -> Snapshot:
-        learnt, environment = self.learner.save(index), self.environments.save(index)
-        arrays = {
-            **{f"learner.{name}": array for name, array in learnt.arrays.items()},
-            **{f"environment.{name}": array for name, array in environment.arrays.items()},
-            "actions": self._actions[index],
-        }
-        return Snapshot(arrays, {"learner": learnt.values, "environment": environment.values})
+        saved = Snapshot.joined({"learner": self.learner.save(index), "environment": self.environments.save(index)})
+        saved.arrays["actions"] = self._actions[index]
+        return saved
 
     def _save_policy(self, index: int) -> None:
         network = self.learner.networks()[index]
@@ -293,7 +291,7 @@ class Loop:
         for index, metrics in enumerate(self.learner.metrics()):
             if self.environments.alive[index]:
                 self.recorders[index].add("metrics", [{"seed": self.runs[index].seed, "step": self.step, **metrics}])
-        if self.step % METRICS_INTERVAL == 0:
+        if self._is_due(METRICS_INTERVAL):
             self.learner.forget_metrics()
 
     def _stop_diverged(self) -> None:
@@ -330,7 +328,8 @@ class Loop:
             self.environments.perturb(values_at(self._perturbations, step))
 
     def _is_due(self, interval: int) -> bool:
-        return bool(interval) and self.step % interval == 0
+        """Return whether the last turn has made a step whose number is a multiple of `interval`."""
+        return bool(interval) and self.step % interval < self._turn
 
 
 def _others(run: RunDirectory) -> dict[str, bytes]:

@@ -225,6 +225,8 @@ class Source(NamedTuple):
         if before.algorithm != wanted.algorithm:
             raise InputError(f"{self.path} does not fit: its algorithm is {before.algorithm}, not {wanted.algorithm}")
         found = [] if before.events == wanted.events else [f"its events are {list(before.events)}"]
+        if before.environments != wanted.environments:
+            found.append(f"each of its seeds has environments={before.environments}")
         old, new = before.hyperparameters, wanted.hyperparameters
         if old.get("normalise_observations") != new.get("normalise_observations"):
             found.append("its networks have learnt with the other choice of normalise_observations")

@@ -90,8 +90,8 @@ def train(
         on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation of a program's seeds.
         stop_when: called in the same way; those seeds end early, as finished, once it returns True.
         **options: what a run computes, as `csac.record.config.RunConfig` explains it: `steps`, `device`,
-            `evaluation_interval`, `evaluation_episodes`, `evaluation_seed`, `checkpoint_interval`, `keep_checkpoints`,
-            `environment_arguments`, `perturbations`, `events`.
+            `environments`, `evaluation_interval`, `evaluation_episodes`, `evaluation_seed`, `checkpoint_interval`,
+            `keep_checkpoints`, `environment_arguments`, `perturbations`, `events`.
 
     Raises:
         InputError: a mistake in the arguments; nothing has been written then.
@@ -322,7 +322,7 @@ def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:
 
 
 def _warmup_note(algorithm: Algorithm, config: RunConfig) -> list[str]:
-    first = algorithm.cadence.first_update
+    first = algorithm.cadence.side_by_side(config.environments).first_update
     return (
         [f"note: no updates: steps ({config.steps:,}) < {first:,}, where the first one comes"]
         if config.steps < first

@@ -33,7 +33,7 @@ from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 def policy_for(task: Task, weight: float = 0.0, bias: float = 0.0, log_std: float = 0.0) -> Policy:
     """A policy of one layer: tanh(weight * sum of the observation + bias), the same in every action dimension."""
     environment = Environment(task)
-    observation_size, action_size = environment.spec
+    observation_size, action_size = environment.spec[:2]
     mean = np.full((observation_size, action_size), weight)
     biases = np.concatenate([np.full(action_size, bias), np.full(action_size, log_std)])
     network = PolicyNetwork(PolicyParameters(((Layer(np.concatenate([mean, np.zeros_like(mean)], axis=1), biases),),)))

@@ -18,7 +18,7 @@ from csac.types import Layer, PolicyNetwork, PolicyParameters
 def policy_for(task: Any, width: int = 8, seed: int = 0) -> Policy:
     """Return a random policy with one hidden layer."""
     environment = Environment(task)
-    (inputs, outputs), generator = environment.spec, np.random.default_rng(seed)
+    (inputs, outputs), generator = environment.spec[:2], np.random.default_rng(seed)
     layers = tuple(
         Layer(generator.normal(0, 0.3, shape).astype(np.float32), np.zeros(shape[1], np.float32))
         for shape in ((inputs, width), (width, 2 * outputs))

@@ -55,7 +55,7 @@ def algorithm_policy(algorithm: str, parts: Parts = ((None, (5,)),), action_shap
     heads: dict[str, Head] = {"csac": "tanh_gaussian", "sac": "tanh_gaussian", "ppo": "clipped_gaussian"}
     head = heads.get(algorithm, "tanh")
     agreement = contract(parts, action_shape, -0.5, 2.0, "tanh" if algorithm == "ppo" else "relu", head)
-    observation_size, action_size = agreement.spec
+    observation_size, action_size = agreement.spec[:2]
     outputs = 2 * action_size if head == "tanh_gaussian" else action_size
 
     def network(*sizes: int, seed: int = 0) -> tuple[Layer, ...]:

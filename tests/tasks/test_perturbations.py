@@ -521,7 +521,7 @@ def test_noise_that_begins_after_a_snapshot_is_the_same_as_without_one():
 def policy_for(task: Any) -> Policy:
     """A linear policy of which the actions depend on the observations."""
     environment = Environment(task)
-    size, actions = environment.spec
+    size, actions = environment.spec[:2]
     weight = np.random.default_rng(1).normal(0, 0.3, (size, 2 * actions)).astype(np.float32)
     network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * actions, np.float32)),),)))
     name, parts = environment.task_name, environment.contract_parts
