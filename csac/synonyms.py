@@ -11,7 +11,6 @@ if TYPE_CHECKING:
 
 _RATES = "--actor-learning-rate and --critic-learning-rate"
 _SIZES = "--actor-hidden-sizes and --critic-hidden-sizes"
-_SEEDS = "--seeds: each has an environment of its own"
 
 NAMES = MappingProxyType(
     {
@@ -40,8 +39,8 @@ NAMES = MappingProxyType(
         "--n-steps": "--rollout-steps",
         "--total-timesteps": "--steps",
         "--seed": "--first-seed",
-        "--n-envs": _SEEDS,
-        "--num-envs": _SEEDS,
+        "--n-envs": "--environments",
+        "--num-envs": "--environments",
         "--eval-freq": "--evaluation-interval",
         "--n-eval-episodes": "--evaluation-episodes",
         "--env-kwargs": "--environment-arguments",  # in Python

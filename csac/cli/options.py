@@ -101,6 +101,8 @@ class Train(_Training):
     """Seeds that train in one program."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
     """Processes per program that evaluate while it trains on; 0 evaluates in between. The results are the same."""
+    environment_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by a step's cost)")] = None
+    """Processes per program that share its --environments; 0 steps them in between. The results are the same."""
     wandb: Flag = False
     """Also log to Weights & Biases: one run per seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
 

@@ -45,6 +45,8 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
             raise_interrupt(error)
             given = f" with the arguments {arguments}" if arguments else ""
             raise InputError(f"{name} could not be made{given}: {raised(error)}") from error
+    if isinstance(environment, gymnasium.vector.VectorEnv):
+        raise InputError(f"{name} makes several environments at once: give what makes one, and `environments`")
     if not isinstance(environment, gymnasium.Env):
         raise InputError(f"{name} returned {environment!r:.40}: a task's callable returns a gymnasium.Env")
     return environment

@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from csac.deploy.contract import ActionBounds
 from csac.tasks.environment import Environment
 from csac.tasks.failures import EnvironmentFailure
 from csac.tasks.registry import Task
+from csac.tasks.workers import Workers
 from csac.types import Snapshot
 
 # What episode 0 of an evaluation is reset with; the next ones with the numbers after it.
@@ -71,21 +73,36 @@ class SeedEnvironments:
         task, environment_arguments: as of `Environment`.
         seeds: the seeds.
         environments: how many each seed has.
+        processes: how many share the environments; 0 steps them here. What they compute is the same.
 
     Raises:
         InputError: as `Environment`.
     """
 
     def __init__(
-        self, task: Task, environment_arguments: dict[str, Any] | None, seeds: Sequence[int], environments: int = 1
+        self,
+        task: Task,
+        environment_arguments: dict[str, Any] | None,
+        seeds: Sequence[int],
+        environments: int = 1,
+        processes: int = 0,
     ) -> None:
         axes = (len(seeds), environments) if environments > 1 else (len(seeds),)
         self._places: list[Place] = list(np.ndindex(*axes))
-        self.environments = [Environment(task, environment_arguments) for _ in self._places]
+        self._workers: Workers | None = None
+        if processes:
+            shares = [len(share) for share in np.array_split(self._places, processes)]
+            self._workers = Workers(task, environment_arguments, shares, seeds[0])
+        self.environments: list[Any] = (
+            self._workers.environments
+            if self._workers
+            else [Environment(task, environment_arguments) for _ in self._places]
+        )
         self._at = dict(zip(self._places, self.environments, strict=True))
         first = self.environments[0]
         self.spec = first.spec._replace(environments=environments)
-        self.contract_parts, self.task_name, self._bounds = first.contract_parts, first.task_name, first.bounds
+        self.contract_parts, self.task_name = first.contract_parts, first.task_name
+        self._bounds = ActionBounds(self.contract_parts.action_low, self.contract_parts.action_high)
         self.seeds = tuple(seeds)
         self.alive = np.ones(len(seeds), bool)
         self._running = self._places
@@ -104,8 +121,7 @@ class SeedEnvironments:
         A seed that fails here is reported by the next `step`.
         """
         self._observation = self._observation.copy()
-        for place in self._running:
-            self._reset(place)
+        self._reset(self._running)
         return self._observation
 
     def perturb(self, values: Mapping[str, float]) -> None:
@@ -119,6 +135,9 @@ class SeedEnvironments:
         next_observation, reward = self._observation.copy(), self._reward.copy()
         terminated, truncated = np.zeros(reward.shape, bool), np.zeros(reward.shape, bool)
         ended: list[Place] = []
+        if self._workers:
+            for place in self._running:
+                self._at[place].ask("step_environment_scale", scaled[place])
         for place in self._running:
             try:
                 step = self._at[place].step_environment_scale(scaled[place])
@@ -132,8 +151,7 @@ class SeedEnvironments:
                 ended.append(place)
         self._observation, self._reward = next_observation.copy(), reward
         episodes = [FinishedEpisode(place[0], self._returns[place], self._lengths[place]) for place in ended]
-        for place in ended:
-            self._reset(place)
+        self._reset([place for place in ended if place in self._running])
         failures, self._failures = self._failures, []
         for failure in failures:
             self.alive[failure.place] = False
@@ -205,7 +223,7 @@ class SeedEnvironments:
             self._returns[place], self._lengths[place] = values["episode_return"], values["episode_length"]
         else:
             self._begun[place] -= 1
-            self._reset(place)
+            self._reset([place])
             return False
         return True
 
@@ -223,19 +241,25 @@ class SeedEnvironments:
         """Close every environment."""
         for environment in self.environments:
             environment.close()
+        if self._workers:
+            self._workers.close()
 
     def _of(self, index: int) -> list[Place]:
         """Return the places of the environments of the seed at this place."""
         return [place for place in self._places if place[0] == index]
 
-    def _reset(self, place: Place) -> None:
-        self._returns[place], self._lengths[place] = 0.0, 0
-        seed = training_seed(self.seeds[place[0]], self._begun[place], *place[1:])
-        self._begun[place] += 1
-        try:
-            self._observation[place] = self._at[place].reset(seed)
-        except EnvironmentFailure as error:
-            self._fail(place, error)
+    def _reset(self, places: Sequence[Place]) -> None:
+        seeds = [training_seed(self.seeds[place[0]], self._begun[place], *place[1:]) for place in places]
+        for place, seed in zip(places, seeds, strict=True):
+            self._returns[place], self._lengths[place] = 0.0, 0
+            self._begun[place] += 1
+            if self._workers:
+                self._at[place].ask("reset", seed)
+        for place, seed in zip(places, seeds, strict=True):
+            try:
+                self._observation[place] = self._at[place].reset(seed)
+            except EnvironmentFailure as error:
+                self._fail(place, error)
 
     def _is_restored(self, place: Place, saved: Snapshot) -> bool:
         """Return whether the environment goes on with its episode; one that was saved by another task may not."""

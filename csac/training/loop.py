@@ -18,6 +18,7 @@ from csac.record.recorder import Recorder
 from csac.record.run import MANIFEST, TABLES
 from csac.tasks.perturbations import by_step, perturbations_of, values_at
 from csac.tasks.seeds import SeedEnvironments
+from csac.tasks.workers import choose_processes
 from csac.training.checkpoint import Writer
 from csac.training.learner import Learner
 from csac.training.resume import ResumePoint
@@ -61,7 +62,10 @@ class Loop:
         seeds = [run.seed for run in runs]
         arguments = self.config.environment_arguments
         with ExitStack() as stack:
-            self.environments = SeedEnvironments(program.task, arguments, seeds, self._turn)
+            processes = program.environment_processes
+            if processes is None:
+                processes = choose_processes(program.task, arguments, self._turn, program.threads)
+            self.environments = SeedEnvironments(program.task, arguments, seeds, self._turn, processes)
             stack.callback(self.environments.close)
             self._base_evaluator = Evaluator(
                 *(program.task, arguments, self.config.evaluation_episodes, self.config.evaluation_seed),

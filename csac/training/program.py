@@ -33,6 +33,8 @@ class Program(NamedTuple):
     threads: int
     """Cores that XLA divides its work for."""
     evaluation_processes: int = 0
+    environment_processes: int | None = 0
+    """How many share the environments; None chooses by what a step costs."""
     tensorboard: bool = True
     wandb: bool | str = False
     asks: bool = False
@@ -91,6 +93,7 @@ class Plan(NamedTuple):
     algorithm: Algorithm
     task: Task
     evaluation_processes: int | None
+    environment_processes: int | None
     tensorboard: bool
     wandb: bool | str
     command: str | None
@@ -110,10 +113,13 @@ class Plan(NamedTuple):
             pays = spare > 0 and not self.asks and 0 < config.evaluation_interval < config.steps
             processes = min(batches, max(1, spare // len(directories))) if pays and can_be_sent(self.task) else 0
         check_whole("evaluation_processes", processes, 0, 1_000)
-        if (processes or len(directories) > 1) and not can_be_sent(self.task):
+        stepping = self.environment_processes if can_be_sent(self.task) else self.environment_processes or 0
+        most = config.environments if config.environments > 1 else 0
+        check_whole("environment_processes", stepping or 0, 0, most)
+        if (processes or stepping or len(directories) > 1) and not can_be_sent(self.task):
             raise InputError(
                 "the task cannot be sent to another process: make it a function of a module that can be imported, or "
-                "train with seeds_per_process=seeds and evaluation_processes=0"
+                "train with seeds_per_process=seeds, evaluation_processes=0 and environment_processes=0"
             )
         return [
             Program(
@@ -122,6 +128,7 @@ class Plan(NamedTuple):
                 self.task,
                 threads,
                 processes,
+                stepping,
                 self.tensorboard,
                 self.wandb,
                 self.asks,

@@ -57,6 +57,7 @@ def train(
     start_from: str | Path | None = None,
     seeds_per_process: int | None = None,
     evaluation_processes: int | None = 0,
+    environment_processes: int | None = 0,
     tensorboard: bool = True,
     wandb: bool | str = False,
     progress: bool = False,
@@ -82,6 +83,8 @@ def train(
             training stays in this process.
         evaluation_processes: processes in which a program evaluates while it trains on (a script needs the guard then);
             0 evaluates in between, None chooses by the cores, as the command line does. The numbers are the same.
+        environment_processes: processes of a program that share its environments, at most as many (`environments`); 0
+            steps them here, None chooses by what a step costs, as the command line does. The numbers are the same.
         tensorboard: whether to write TensorBoard files.
         wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to.
         progress: whether to show progress on the terminal.
@@ -120,15 +123,14 @@ def train(
     place = place or new_set_directory(configs[0].task, algorithm.name)
     existing = _existing(place, configs, resume, algorithm.cadence.has_schedule)
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task)
-    how = Plan(algorithm, task, evaluation_processes, tensorboard, wandb, command, stop_when is not None)
+    processes = evaluation_processes, environment_processes
+    how = Plan(algorithm, task, *processes, tensorboard, wandb, command, stop_when is not None)
     programs = how.programs([[place / f"seed-{seed}" for seed in group] for group in groups], existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
+    if source:
+        source.refuse_misfits(configs, algorithm.cadence.has_schedule)
     for config in configs:
-        if source:
-            source.refuse_misfit(config, algorithm.cadence.has_schedule)
-    for config in configs:
-        group = next(group for group in groups if config.seed in group)
-        _create_or_extend(place, config, group, existing.get(config.seed), source)
+        _create_or_extend(place, config, groups, existing.get(config.seed), source)
     runs = RunSet(place, [RunDirectory.open(place / f"seed-{seed}") for seed in wanted])
     try:
         return _run(runs, programs, watch, notes)
@@ -146,6 +148,7 @@ def resume(
     *,
     steps: int | None = None,
     evaluation_processes: int | None = 0,
+    environment_processes: int | None = 0,
     trust_task: bool = False,
     progress: bool = False,
     reporter: Reporter | None = None,
@@ -181,7 +184,8 @@ def resume(
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
     has_wandb = any((run.path / "wandb").exists() for run in runs.runs)
     has_tensorboard = any(run.tensorboard.exists() for run in runs.runs)
-    how = Plan(algorithm, config.task, evaluation_processes, has_tensorboard, has_wandb, command, stop_when is not None)
+    processes = evaluation_processes, environment_processes
+    how = Plan(algorithm, config.task, *processes, has_tensorboard, has_wandb, command, stop_when is not None)
     programs = how.programs([[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
 
@@ -204,7 +208,7 @@ def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_sched
 
 
 def _create_or_extend(
-    place: Path, config: RunConfig, group: Sequence[int], existing: RunDirectory | None, source: Source | None
+    place: Path, config: RunConfig, groups: list[list[int]], existing: RunDirectory | None, source: Source | None
 ) -> None:
     """Create the run of a configuration, or give the existing one its larger number of steps."""
     if existing:
@@ -212,7 +216,7 @@ def _create_or_extend(
             with existing.locked():
                 existing.update_manifest(config=config)
         return
-    manifest = make_manifest(config, group)
+    manifest = make_manifest(config, next(group for group in groups if config.seed in group))
     run = RunDirectory.create(place / f"seed-{config.seed}", source.begun(manifest) if source else manifest)
     if source:
         source.copy_to(run)

@@ -18,6 +18,7 @@ from csac.record.run import RunDirectory
 
 TRAINED = {
     "steps": 1_000_000,
+    "environments": 1,
     "seeds": 1,
     "first_seed": 0,
     "device": "cpu",
@@ -34,6 +35,7 @@ TRAINED = {
     "start_from": None,
     "seeds_per_process": None,
     "evaluation_processes": None,
+    "environment_processes": None,
     "wandb": False,
 }
 
@@ -42,6 +44,7 @@ def test_train_passes_its_options_on(train_call):
     line = (
         "Hopper-v4 --steps 1e5 --seeds 3 --first-seed 7 --directory some/where --device gpu --seeds-per-process 2 "
         "--evaluation-interval 1_000 --evaluation-episodes 4 --evaluation-processes 3 --events 'fell, slid' "
+        "--environments 4 --environment-processes 2 "
         "--checkpoint-interval 5e3 --keep-checkpoints 0 --resume --wandb --from a@5 "
         "--warmup-steps 2e3 --actor-hidden-sizes 8 9 "
         "--perturb friction=1.5@5e4 --perturb=action-noise=0.1 "
@@ -72,6 +75,8 @@ def test_train_passes_its_options_on(train_call):
         "start_from": "a@5",
         "seeds_per_process": 2,
         "evaluation_processes": 3,
+        "environments": 4,
+        "environment_processes": 2,
         "wandb": True,
     }
 
@@ -86,7 +91,7 @@ def test_resume_passes_its_options_on(monkeypatch):
     line = "resume runs --steps 2e3 --trust-task"
     assert csac(line) == csac("resume runs") == 0
     assert calls == [
-        {"directory": Path("runs"), "evaluation_processes": None, **options}
+        {"directory": Path("runs"), "evaluation_processes": None, "environment_processes": None, **options}
         for options in (
             {"steps": 2_000, "trust_task": True, "command": f"csac {line}"},
             {"steps": None, "trust_task": False, "command": "csac resume runs"},

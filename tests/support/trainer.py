@@ -49,7 +49,14 @@ class Silent:
 
 
 def run(
-    algorithm: Algorithm, task: Any, steps: int, seeds: tuple[int, ...] = (0,), episodes: int = 1, **arguments: Any
+    algorithm: Algorithm,
+    task: Any,
+    steps: int,
+    seeds: tuple[int, ...] = (0,),
+    episodes: int = 1,
+    environments: int = 1,
+    environment_processes: int = 0,
+    **arguments: Any,
 ) -> Outcome:
     """Train `seeds` in one program, evaluating at the end alone, and return what there is to look at."""
     with tempfile.TemporaryDirectory() as folder:
@@ -61,13 +68,15 @@ def run(
                 hyperparameters=dataclasses.asdict(algorithm),  # pyright: ignore[reportArgumentType]
                 seed=seed,
                 steps=steps,
+                environments=environments,
                 evaluation_interval=steps,
                 evaluation_episodes=episodes,
                 checkpoint_interval=0,
                 environment_arguments=arguments,
             )
             runs.append(RunDirectory.create(Path(folder, f"seed-{seed}"), Manifest(config=config)))
-        program = Program(tuple(one.path for one in runs), algorithm, task, threads=1, tensorboard=False)
+        paths = tuple(one.path for one in runs)
+        program = Program(paths, algorithm, task, 1, environment_processes=environment_processes, tensorboard=False)
         with closing(Loop(program, runs, [ResumePoint(None, [])] * len(runs), Silent())) as loop:
             loop.run(lambda: False)
             carries = [loop.learner.carry(index) for index in range(len(seeds))]

@@ -1,0 +1,186 @@
+"""A seed with several environments: what is remembered, how often it learns, and that it is resumed and shared out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from resuming import ROLLOUT, SMALL, Crash, contents, crash_at
+from resuming import run as train
+from test_memory import RolloutWatcher, Watcher
+from trainer import run
+
+from csac import InputError
+from csac.algorithms import PPO, SAC
+from csac.algorithms.memory import unpack
+from csac.algorithms.ppo import value_at
+from csac.record.run import RunDirectory
+from csac.tasks.seeds import SeedEnvironments, training_seed
+from csac.types import Cadence, Spec
+
+SEEDS = (4, 9)
+
+
+def check_story(rows: np.ndarray, seed: int, environment: int) -> None:
+    """Check that packed rows of one environment of `IdEncoded` follow each other as its steps do."""
+    step = jax.vmap(unpack, in_axes=(0, None))(jnp.asarray(rows), Spec(4, 1))
+    reset_seed, episode, number, last_action = step.observation.T
+    assert episode.max() > 5
+    np.testing.assert_array_equal(reset_seed, [training_seed(seed, int(e), environment) % 65536 for e in episode])
+    after = np.stack([reset_seed, episode, number + 1, step.action[:, 0]], axis=1)
+    np.testing.assert_allclose(step.next_observation, after, atol=1e-6)  # never the observation of a reset
+    is_last = number + 1 == 2 + episode % 3
+    np.testing.assert_array_equal(step.terminated, is_last & (episode % 3 != 1))
+    np.testing.assert_array_equal(step.truncated, is_last & (episode % 3 != 0))
+    np.testing.assert_allclose(step.observation[1:][~is_last[:-1]], step.next_observation[:-1][~is_last[:-1]])
+    np.testing.assert_array_equal(last_action[number == 0], 0)
+
+
+@pytest.mark.parametrize("processes", [0, 2])
+def test_each_environment_has_episodes_of_its_own_and_learns_once_a_turn(processes):
+    outcome = run(
+        Watcher(warmup_steps=10), probes.IdEncoded, 72, SEEDS, environments=3, environment_processes=processes
+    )
+    for seed, rows, state in zip(SEEDS, outcome.memories, outcome.states, strict=True):
+        for environment in range(3):
+            check_story(rows[environment::3], seed, environment)
+        actions = rows[:, 4].reshape(-1, 3)
+        assert len(set(actions[:4].ravel().tolist())) == 12  # each explores for itself
+        # Two updates for each step; the first six after step 12, and the next actions are of what they learnt.
+        made = np.minimum(6 * np.arange(1, 21), 100)  # it counts no more than a hundred
+        np.testing.assert_allclose(actions[4:], np.repeat(made[:, None], 3, axis=1) / 100, atol=1e-6)
+        np.testing.assert_array_equal(state.times, np.ones(100))
+
+
+def test_a_rollout_holds_the_steps_of_a_turn_beside_each_other():
+    watcher = RolloutWatcher(warmup_steps=0, updates_per_interval=1, batch_size=48, update_interval=48)
+    outcome = run(watcher, probes.IdEncoded, 48, (4,), environments=2)
+    rows = outcome.memories[0]
+    for environment in range(2):
+        check_story(rows[environment::2], 4, environment)
+    np.testing.assert_array_equal(outcome.states[0].drawn[0], rows[:, :4])
+    assert len(set(rows[:, 4].tolist())) == 48
+
+
+@pytest.mark.parametrize(
+    ("updates_per_step", "environments", "expected"),
+    [(1, 1, (1, 1)), (1, 4, (4, 4)), (0.25, 1, (4, 1)), (0.25, 4, (4, 1)), (0.25, 3, (12, 3)), (2, 3, (3, 6))],
+)
+def test_the_ratio_of_updates_to_steps_is_kept_whatever_the_number_of_environments(
+    updates_per_step, environments, expected
+):
+    cadence = SAC(updates_per_step=updates_per_step).cadence.side_by_side(environments)
+    assert (cadence.update_interval, cadence.updates_per_interval) == expected
+    assert cadence.first_update == -(-10_000 // expected[0]) * expected[0]
+
+
+def test_an_interval_is_rounded_up_to_whole_turns():
+    assert Cadence(0, 10, 5, 8).side_by_side(4)[1:3] == (12, 6)
+
+
+class Onward(probes.Endless):
+    """Observation 0, then 1 for ever, the reward of the next step; truncated after two steps: value 10 at 1, 9 at 0."""
+
+    def __init__(self) -> None:
+        super().__init__(length=2)
+
+    def step(self, action: np.ndarray) -> probes.Result:
+        reward = float(self.observation[0])
+        self.observation = np.ones(1, np.float32)
+        return self.observation, reward, *super().step(action)[2:]
+
+
+def test_ppo_learns_known_values_over_truncation_in_four_environments():
+    algorithm = PPO(
+        discount=0.9,
+        learning_rate=3e-3,
+        learning_rate_schedule="constant",
+        clip_value_loss=False,
+        rollout_steps=128,
+        minibatches=4,
+        hidden_sizes=(32, 32),
+        normalise_rewards=False,
+    )
+    state = run(algorithm, Onward, 6144, environments=4).states[0]
+    for observation, value in {0.0: 9.0, 1.0: 10.0}.items():
+        seen = algorithm.normalise(state.observations, jnp.array([observation]))
+        assert float(value_at(state.parameters, seen)) == pytest.approx(value, rel=0.02)
+
+
+@pytest.mark.parametrize("algorithm", [SAC(**SMALL), ROLLOUT], ids=lambda algorithm: algorithm.name)
+def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path, algorithm):
+    settings: dict[str, Any] = {"environments": 4, "perturbations": ("friction=1.5@150", "observation_noise=0.01@330")}
+    whole = train(tmp_path / "whole", algorithm, **settings)
+    with pytest.raises(Crash):
+        train(tmp_path / "again", algorithm, on_evaluation=crash_at(300), **settings)
+    again = train(tmp_path / "again", algorithm, resume=True, **settings)
+    assert contents(again.runs[0]) == contents(whole.runs[0])
+    assert again.runs[0].manifest.history[-1].step == 240
+    assert again.runs[0].manifest.history[-1].exact
+
+
+def test_processes_change_no_number_and_their_episodes_are_resumed(tmp_path):
+    settings: dict[str, Any] = {"algorithm": SAC(**SMALL), "environments": 4, "perturbations": ("friction=1.5@150",)}
+    here = train(tmp_path / "here", **settings)
+    with pytest.raises(Crash):
+        train(tmp_path / "there", on_evaluation=crash_at(300), environment_processes=2, **settings)
+    there = train(tmp_path / "there", resume=True, environment_processes=2, **settings)
+    assert contents(there.runs[0]) == contents(here.runs[0])
+    assert there.runs[0].manifest.history[-1].exact
+
+
+@pytest.mark.parametrize("processes", [0, 2])
+def test_a_seed_fails_once_where_one_of_its_environments_does(processes):
+    arguments = {"at": 2, "seeds": [training_seed(4, 0, 1)]}
+    environments = SeedEnvironments(probes.Failing, arguments, SEEDS, 2, processes)
+    try:
+        environments.reset()
+        actions = np.zeros((2, 2, 1), np.float32)
+        assert environments.step(actions).failures == []
+        ((place, reason, details),) = environments.step(actions).failures
+        assert (place, environments.alive.tolist()) == (0, [False, True])
+        assert reason.startswith("step raised RuntimeError: the simulator broke (probes.py:")
+        assert "maybe_fail" in details
+        assert [episode.place for episode in environments.step(actions).episodes] == [1, 1]
+        assert environments.step(actions).failures == []
+    finally:
+        environments.close()
+
+
+def test_the_death_of_a_process_is_the_failure_of_its_seeds():
+    environments = SeedEnvironments(probes.Deadly, {"seed": training_seed(4, 1, 1)}, [4], 2, 2)
+    environments.reset()
+    actions = np.zeros((1, 2, 1), np.float32)
+    outcomes = [environments.step(actions) for _ in range(3)]
+    environments.close()
+    assert [len(outcome.failures) for outcome in outcomes] == [0, 0, 1]  # episodes have three steps
+    assert "SIGKILL" in outcomes[2].failures[0].reason
+    assert not environments.is_any_alive
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"steps": 502}, "multiple of environments"),
+        ({"algorithm": PPO(rollout_steps=66, minibatches=2), "steps": 500}, "environments must divide rollout_steps"),
+        ({"environment_processes": 5}, "environment_processes"),
+    ],
+)
+def test_numbers_that_do_not_go_together_are_refused(tmp_path, changes, words):
+    with pytest.raises(InputError, match=words):
+        train(tmp_path / "run", **{"algorithm": SAC(**SMALL), "environments": 4, **changes})
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_fork_has_as_many_environments_as_the_run(tmp_path):
+    made = train(tmp_path / "run", SAC(**SMALL), steps=120, environments=4)
+    with pytest.raises(InputError, match="environments=4"):
+        train(tmp_path / "fork", SAC(**SMALL), steps=240, start_from=made.path)
+    fork = train(tmp_path / "fork", SAC(**SMALL), steps=240, start_from=made.path, environments=4)
+    whole = train(tmp_path / "whole", SAC(**SMALL), steps=240, environments=4)
+    rows = RunDirectory.open(fork.runs[0].path).evaluations
+    np.testing.assert_array_equal(rows["return"][-2:], whole.runs[0].evaluations["return"][-2:])
