@@ -219,12 +219,8 @@ class Source(NamedTuple):
         planned = perturbations_of(self.runs[seed].config.perturbations)
         return tuple(map(str, planned if given is None else continued(planned, perturbations_of(given), self.step)))
 
-    def refuse_misfits(self, configs: Sequence[RunConfig], has_schedule: bool) -> None:
-        """Raise InputError where a new run of one of these configurations cannot begin with its checkpoint."""
-        for wanted in configs:
-            self._refuse_misfit(wanted, has_schedule)
-
-    def _refuse_misfit(self, wanted: RunConfig, has_schedule: bool) -> None:
+    def refuse_misfit(self, wanted: RunConfig, has_schedule: bool) -> None:
+        """Raise InputError where a new run of this configuration cannot begin with its checkpoint."""
         before = self.runs[wanted.seed].config
         if before.algorithm != wanted.algorithm:
             raise InputError(f"{self.path} does not fit: its algorithm is {before.algorithm}, not {wanted.algorithm}")

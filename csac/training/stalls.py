@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from types import FrameType
 
 SECONDS = 180.0  # in one call of an environment, before a line says so
-_ENVIRONMENTS = {str(Path(__file__).parents[1] / name) for name in ("tasks/environment.py", "evaluation/pool.py")}
+_ENVIRONMENTS = {
+    str(Path(__file__).parents[1] / name) for name in ("tasks/environment.py", "tasks/workers.py", "evaluation/pool.py")
+}
 
 
 @contextmanager

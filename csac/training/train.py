@@ -127,19 +127,16 @@ def train(
     how = Plan(algorithm, task, *processes, tensorboard, wandb, command, stop_when is not None)
     programs = how.programs([[place / f"seed-{seed}" for seed in group] for group in groups], existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
-    if source:
-        source.refuse_misfits(configs, algorithm.cadence.has_schedule)
+    for config in configs:
+        if source:
+            source.refuse_misfit(config, algorithm.cadence.has_schedule)
     for config in configs:
         _create_or_extend(place, config, groups, existing.get(config.seed), source)
     runs = RunSet(place, [RunDirectory.open(place / f"seed-{seed}") for seed in wanted])
     try:
         return _run(runs, programs, watch, notes)
     except InputError:  # such as a script without a guard: once mended, it begins in the same directory
-        for run in runs.runs:
-            if run.seed not in existing and RunDirectory.open(run.path).manifest.process is None:
-                shutil.rmtree(run.path)
-        with suppress(OSError):
-            place.rmdir()
+        _remove_unbegun(place, [run for run in runs.runs if run.seed not in existing])
         raise
 
 
@@ -188,6 +185,15 @@ def resume(
     how = Plan(algorithm, config.task, *processes, has_tensorboard, has_wandb, command, stop_when is not None)
     programs = how.programs([[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
+
+
+def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
+    """Remove those of these new runs that no process has begun, and their folder if nothing else is in it."""
+    for run in runs:
+        if RunDirectory.open(run.path).manifest.process is None:
+            shutil.rmtree(run.path)
+    with suppress(OSError):
+        place.rmdir()
 
 
 def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_schedule: bool) -> dict[int, RunDirectory]:

@@ -44,6 +44,7 @@ NAVIGATION = {
         "docs/studies",
         "docs/cluster",
         "docs/tuning",
+        "docs/vector-environments",
         "docs/glossary",
     ],
     "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")]
