@@ -39,6 +39,13 @@ def test_what_the_front_page_shows_runs(tmp_path):
         assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
 
 
+def test_the_front_page_is_read_in_minutes():
+    page = (ROOT / "README.md").read_text()
+    assert len(re.findall(r"\S*\w\S*", page)) <= 1_250  # words
+    assert len(re.findall(r"\d\.\d", page)) <= 25
+    assert (ROOT / "results" / "film.gif").stat().st_size < 3e6
+
+
 @pytest.mark.parametrize(("tau", "expected"), [(0.05, 0.9), (0.5, 0.9), (5.0, 5.0 / 5.2), (50.0, 50.0 / 50.2)])
 def test_an_iteration_leaves_the_larger_of_alpha_and_the_discount(tau, expected):
     # Values shrink by γ = 0.9, advantages by α = τ / (τ + 0.2): 0.2, 0.71, 0.96 and 0.996.
