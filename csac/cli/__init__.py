@@ -7,6 +7,7 @@ import faulthandler
 import io
 import os
 import sys
+import warnings
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -47,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
+    warnings.formatwarning = lambda message, *_, **__: f"csac: warning: {message}\n"
     try:
         code = _run(words)
     finally:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import os
-from contextlib import contextmanager
+import warnings
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -150,12 +153,27 @@ class RunDirectory:
         append_rows(self.table(name), COLUMNS[name], rows)
 
     def rows(self, name: Table) -> np.ndarray:
-        """Return every row of a table as a structured array; an empty one where nothing was written yet."""
-        path = self.table(name)
+        """Return every row of a table as a structured array; an empty one where nothing was written yet.
+
+        Where the file was changed or cut since the newest checkpoint, the rows are the checkpoint's: a warning says so.
+        """
+        path = self._sound(name)
         rows = read_rows(path) if path.exists() else structured(COLUMNS[name], [])
         if missing := set(COLUMNS[name]) - set(rows.dtype.names or ()):
             raise InputError(f"{path} is damaged: it has no column {min(missing)}; restore it")
         return rows
+
+    def _sound(self, name: Table) -> Path:
+        """Return the file of a table, or its copy in the newest checkpoint if it no longer begins with that."""
+        path = self.table(name)
+        for manifest in _copies(self.path)[:1]:
+            copy = manifest.with_name(path.name)
+            content = copy.read_bytes() if copy.is_file() else b""
+            known = path.read_bytes() if path.is_file() else b""
+            if not known.startswith(content) and _is_listed(copy, content):
+                warnings.warn(f"{path} has changed since the newest checkpoint: its copy there is read", stacklevel=4)
+                return copy
+        return path
 
     @property
     def evaluations(self) -> np.ndarray:
@@ -207,6 +225,14 @@ def _refuse_occupied(path: Path) -> None:
         raise InputError(f"{path} is a file; choose another directory")
     if path.exists() and any(not entry.name.startswith(".") for entry in path.iterdir()):
         raise InputError(f"{path} is not empty and holds no run; choose a new or an empty directory")
+
+
+def _is_listed(copy: Path, content: bytes) -> bool:
+    """Return whether a file of a checkpoint is as the checkpoint's list says."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        files = json.loads((copy.parent / "checkpoint.json").read_bytes())["files"]
+        return files[copy.name]["sha256"] == hashlib.sha256(content).hexdigest()
+    return False
 
 
 def _copies(path: Path) -> list[Path]:
