@@ -78,7 +78,7 @@ def verdict(interval: Interval) -> str:
     """Say what the interval of a probability of improvement says; there is none below five seeds."""
     if interval is None:
         return "no verdict"
-    return "better" if interval[0] > 0.5 else "worse" if interval[1] < 0.5 else "not told apart"
+    return "better" if interval[0] > 0.5 else "worse" if interval[1] < 0.5 else "no significant difference"
 
 
 def comma(values: Sequence[object]) -> str:

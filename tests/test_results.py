@@ -61,7 +61,7 @@ def test_scores_are_shares_of_the_first_arm_and_pairs_of_seeds_are_compared():
 
 @pytest.mark.parametrize(
     ("interval", "said"),
-    [((0.51, 0.9), "better"), ((0.1, 0.49), "worse"), ((0.5, 0.9), "not told apart"), (None, "no verdict")],
+    [((0.51, 0.9), "better"), ((0.1, 0.49), "worse"), ((0.5, 0.9), "no significant difference"), (None, "no verdict")],
 )
 def test_a_verdict_needs_an_interval_beside_one_half(interval, said):
     assert tables.verdict(interval) == said
