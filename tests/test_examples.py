@@ -21,12 +21,14 @@ LAG = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "reference_lag.py
 READING = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "minibatch_reading.py")))
 NUMBER = re.compile(r"[-+]?\d+\.?\d*")
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-SHORT = {"10000": "700", "8000": "600", "8_000": "600", "1000": "300", "1_000": "300"}  # steps on the page and here
+SHORT = {"10000": "350", "8000": "330", "8_000": "330", "1000": "300", "1_000": "300"}  # steps on the page and here
 
 
-def test_what_the_front_page_shows_runs(tmp_path):
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["README.md"])
+def test_what_a_page_shows_runs(page, tmp_path):
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    blocks = BLOCK.findall((ROOT / "README.md").read_text())
+    blocks = BLOCK.findall((ROOT / page).read_text())
     assert {language for language, _ in blocks} == {"sh", "python"}
     for language, block in blocks:
         text = re.sub(r"\b\d[\d_]*\b", lambda found: SHORT.get(found[0], found[0]), block)
