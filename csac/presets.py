@@ -29,6 +29,7 @@ _PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
         "updates_per_step": 1,
         "update_interval": 1,
         "max_gradient_norm": 0.0,
+        "learning_rate_schedule": "constant",
     }
 )
 

@@ -125,10 +125,7 @@ class Cadence(NamedTuple):
     transitions_per_update: int
     """Transitions that one call of `update` is given."""
     has_schedule: bool = False
-    """Whether what is learnt depends on how many steps the run has in all, so that it cannot be extended.
-
-    Its state has `total_updates`, by which it is planned.
-    """
+    """Whether what is learnt depends on how many steps the run has in all, so that it cannot be extended."""
 
     @property
     def first_update(self) -> int:
@@ -136,8 +133,9 @@ class Cadence(NamedTuple):
         return -(-max(self.warmup_steps, 1) // self.update_interval) * self.update_interval
 
     def updates(self, steps: int) -> int:
-        """Return how many updates a run of so many steps makes without a warm-up, at least 1."""
-        return max(steps // self.update_interval * self.updates_per_interval, 1)
+        """Return how many updates a run of so many steps makes, at least 1."""
+        rounds = (steps - self.first_update) // self.update_interval + 1
+        return max(rounds * self.updates_per_interval, 1)
 
     def side_by_side(self, environments: int) -> Cadence:
         """Return the cadence of so many environments: intervals of whole turns, with as many updates for each step."""

@@ -172,7 +172,7 @@ class CSAC(TwinCritics):
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return random networks; targets and reference are copies (Algorithm 1, line 1)."""
-        networks, given = self.first_networks(key, spec, 2 * spec.action_size), self.given_weights
+        networks, given = self.first_networks(key, spec, steps, 2 * spec.action_size), self.given_weights
         return State(
             **networks,
             reference=copy_tree(networks["actor"]),

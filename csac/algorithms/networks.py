@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -11,13 +11,15 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from csac.algorithms.shapes import Key, Scalar
+from csac.algorithms.shapes import Count, Key, Scalar
 from csac.types import Layer, Metrics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
 BATCH = "batch"  # the axis of examples, for losses that look at a whole batch
+
+Schedule: TypeAlias = Literal["constant", "linear", "cosine"]
 
 
 class MLP(eqx.Module):
@@ -88,6 +90,39 @@ def make_optimiser(
     if max_gradient_norm > 0:
         return optax.chain(optax.clip_by_global_norm(max_gradient_norm), adam)
     return adam
+
+
+class Progress(NamedTuple):
+    """How many steps an optimiser has made, and how many its schedule is for."""
+
+    done: Count
+    planned: Scalar
+
+
+def scheduled(schedule: Schedule, progress: Scalar) -> Scalar | float:
+    """Return the share of the first learning rate that is left at this share p of the run: 1, 1 - p or ½ (1 + cos πp).
+
+    The cosine is that of SGDR without restarts (Loshchilov and Hutter 2017, Eq. 5).
+    """
+    match schedule:
+        case "linear":
+            return 1.0 - progress
+        case "cosine":
+            return 0.5 * (1.0 + jnp.cos(jnp.pi * progress))
+    return 1.0
+
+
+def follow(schedule: Schedule, planned: int) -> optax.GradientTransformation:
+    """Return what shortens an optimiser's steps by a schedule; its state has how many are `planned`."""
+
+    def init(parameters: Any) -> Progress:
+        return Progress(jnp.int32(0), jnp.float32(max(planned, 1)))
+
+    def update(steps: Any, state: Progress, parameters: Any = None) -> tuple[Any, Progress]:
+        share = scheduled(schedule, jnp.minimum(state.done / state.planned, 1.0))
+        return jax.tree.map(lambda step: share * step, steps), Progress(state.done + 1, state.planned)
+
+    return optax.GradientTransformation(init, update)  # pyright: ignore[reportArgumentType]
 
 
 def init_optimiser(optimiser: optax.GradientTransformation, parameters: Any) -> Any:

@@ -23,7 +23,7 @@ from csac.algorithms.hyperparameters import (
     check_hyperparameters,
 )
 from csac.algorithms.memory import Replay
-from csac.algorithms.networks import MLP, copy_tree, init_optimiser, make_mlp, make_optimiser
+from csac.algorithms.networks import MLP, Schedule, copy_tree, follow, init_optimiser, make_mlp, make_optimiser
 from csac.algorithms.shapes import Count, Key
 from csac.algorithms.statistics import Statistics, normaliser_of
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec
@@ -46,6 +46,8 @@ class OffPolicy:
     """Learning rate of the actor."""
     critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the critics."""
+    learning_rate_schedule: Schedule = "constant"
+    """How both fall to zero over the run: not at all, linearly or as a cosine. Learnt weights keep their rate."""
     actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
@@ -83,16 +85,24 @@ class OffPolicy:
             update_interval=interval,
             updates_per_interval=int(updates * interval),
             transitions_per_update=self.batch_size * self.batches_per_update,
+            has_schedule=self.learning_rate_schedule != "constant",
         )
+
+    def updates(self, spec: Spec, steps: int) -> int:
+        """Return how many updates a run of so many steps makes, which its schedule is for."""
+        return self.cadence.side_by_side(spec.environments).updates(steps)
 
     def memory(self, spec: Spec, steps: int) -> Replay:
         """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
         together = self.cadence.side_by_side(spec.environments).update_interval
         return Replay.create(min(self.replay_size, steps), spec, together)
 
-    def optimiser(self, learning_rate: float) -> optax.GradientTransformation:
-        """Return the networks' Adam."""
-        return make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)
+    def optimiser(self, learning_rate: float, planned: int = 1) -> optax.GradientTransformation:
+        """Return the networks' Adam. The number of steps `planned` counts where it begins: its state keeps it."""
+        adam = make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)
+        if self.learning_rate_schedule == "constant":
+            return adam
+        return optax.chain(adam, follow(self.learning_rate_schedule, planned))
 
 
 @dataclass(frozen=True)
@@ -111,8 +121,10 @@ class TwinCritics(OffPolicy):
         if self.critic_normalisation == "batch" and self.batch_size == 1:
             raise InputError("critic_normalisation batch needs a batch_size of at least 2")
 
-    def first_networks(self, key: Key, spec: Spec, actor_outputs: int) -> dict[str, Any]:
+    def first_networks(self, key: Key, spec: Spec, steps: int, actor_outputs: int) -> dict[str, Any]:
         """Return the fields of a first state that the three share: random networks, targets that are copies."""
+        planned = self.updates(spec, steps)
+        actor_adam = self.optimiser(self.actor_learning_rate, planned // self.policy_delay)
         actor_key, critics_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, actor_outputs)
         critics = make_critics(critics_key, spec, self.critic_hidden_sizes)
@@ -120,8 +132,8 @@ class TwinCritics(OffPolicy):
             "actor": actor,
             "critics": critics,
             "target_critics": copy_tree(critics) if self.critic_normalisation == "none" else None,
-            "actor_optimiser": init_optimiser(self.optimiser(self.actor_learning_rate), actor),
-            "critic_optimiser": init_optimiser(self.optimiser(self.critic_learning_rate), critics),
+            "actor_optimiser": init_optimiser(actor_adam, actor),
+            "critic_optimiser": init_optimiser(self.optimiser(self.critic_learning_rate, planned), critics),
             "observations": Statistics.create((spec.observation_size,)) if self.normalise_observations else None,
         }
 

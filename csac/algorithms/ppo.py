@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,15 @@ from csac.algorithms.hyperparameters import (
     check_hyperparameters,
 )
 from csac.algorithms.memory import Rollout
-from csac.algorithms.networks import MLP, gradient_step, init_optimiser, make_optimiser, make_orthogonal_mlp
+from csac.algorithms.networks import (
+    MLP,
+    Schedule,
+    gradient_step,
+    init_optimiser,
+    make_optimiser,
+    make_orthogonal_mlp,
+    scheduled,
+)
 from csac.algorithms.returns import advantages_of, discounted_returns, explained_variance
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar, Scalars
 from csac.algorithms.statistics import EPSILON, Statistics, normalise
@@ -65,8 +73,8 @@ class PPO:
 
     learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate, initial or constant."""
-    learning_rate_schedule: Literal["linear", "constant"] = "linear"
-    """Whether the learning rate falls linearly to zero over the run or stays constant."""
+    learning_rate_schedule: Schedule = "linear"
+    """How the learning rate falls to zero over the run: not at all, linearly or as a cosine."""
     discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
     trace_decay: Annotated[float, SHARE] = 0.95
@@ -201,9 +209,7 @@ class PPO:
 
     def learning_rate_at(self, step: Count, total_updates: Scalar) -> Scalar:
         """Return the learning rate of the update after `step` others, of `total_updates` in the run."""
-        if self.learning_rate_schedule == "constant":
-            return jnp.float32(self.learning_rate)
-        return self.learning_rate * (1.0 - step / total_updates)
+        return jnp.float32(self.learning_rate * scheduled(self.learning_rate_schedule, step / total_updates))
 
     def normal_advantages(self, advantages: Scalars) -> Scalars:
         """Return a minibatch's advantages brought to mean 0 and standard deviation 1, or as they are."""
@@ -219,7 +225,7 @@ class PPO:
             update_interval=self.rollout_steps,
             updates_per_interval=1,
             transitions_per_update=self.rollout_steps,
-            has_schedule=self.learning_rate_schedule == "linear",
+            has_schedule=self.learning_rate_schedule != "constant",
         )
 
     def memory(self, spec: Spec, steps: int) -> Rollout:

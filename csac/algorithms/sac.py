@@ -101,7 +101,7 @@ class SAC(TwinCritics):
         """Return random networks; the targets are copies."""
         weight = self.initial_entropy_weight if self.entropy_weight == "auto" else self.entropy_weight
         return State(
-            **self.first_networks(key, spec, 2 * spec.action_size),
+            **self.first_networks(key, spec, steps, 2 * spec.action_size),
             temperature=make_weight(weight, make_optimiser(self.weight_learning_rate)),
             actor_metrics=first_metrics(("actor_loss", "entropy"), self.policy_delay),
         )

@@ -126,9 +126,10 @@ class SD3(OffPolicy):
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return two pairs of random networks; the targets are copies."""
         first_key, second_key = jax.random.split(key)
-        return State(self._make_pair(first_key, spec), self._make_pair(second_key, spec))
+        return State(self._make_pair(first_key, spec, steps), self._make_pair(second_key, spec, steps))
 
-    def _make_pair(self, key: Key, spec: Spec) -> Pair:
+    def _make_pair(self, key: Key, spec: Spec, steps: int) -> Pair:
+        planned = self.updates(spec, steps)
         actor_key, critic_key = jax.random.split(key)
         actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, spec.action_size)
         critic = make_critic(critic_key, spec, self.critic_hidden_sizes)
@@ -137,8 +138,8 @@ class SD3(OffPolicy):
             critic=critic,
             target_actor=copy_tree(actor),
             target_critic=copy_tree(critic),
-            actor_optimiser=init_optimiser(self.optimiser(self.actor_learning_rate), actor),
-            critic_optimiser=init_optimiser(self.optimiser(self.critic_learning_rate), critic),
+            actor_optimiser=init_optimiser(self.optimiser(self.actor_learning_rate, planned), actor),
+            critic_optimiser=init_optimiser(self.optimiser(self.critic_learning_rate, planned), critic),
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:

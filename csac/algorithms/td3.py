@@ -90,7 +90,7 @@ class TD3(TwinCritics):
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return random networks; the targets are copies."""
-        networks = self.first_networks(key, spec, spec.action_size)
+        networks = self.first_networks(key, spec, steps, spec.action_size)
         metrics = first_metrics(("actor_loss",), self.policy_delay)
         return State(**networks, target_actor=copy_tree(networks["actor"]), actor_metrics=metrics)
 

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from csac.record.config import RunConfig
     from csac.training.config import TrainOptions
 
+# What a checkpoint's networks and optimisers are made for.
+_LEARNT_WITH = ("normalise_observations", "learning_rate_schedule")
+
 # What may differ when a run goes on; with any other value it would be another run.
 _MAY_DIFFER = ("steps", "device", "checkpoint_interval", "keep_checkpoints")
 
@@ -52,7 +55,8 @@ def refuse_differences(run: RunDirectory, wanted: RunConfig, has_schedule: bool)
     if wanted.steps < before.steps:
         raise InputError(f"{run.path} is a run of {before.steps:,} steps: steps={wanted.steps:,} would shorten it")
     if wanted.steps > before.steps and has_schedule:
-        raise InputError(f"{run.path} cannot go beyond {before.steps:,} steps: its learning rate has a schedule")
+        reason = "its learning rate has a schedule that ends there: train a new run"
+        raise InputError(f"{run.path} cannot go beyond {before.steps:,} steps: {reason}")
 
 
 def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
@@ -228,8 +232,8 @@ class Source(NamedTuple):
         if before.environments != wanted.environments:
             found.append(f"each of its seeds has environments={before.environments}")
         old, new = before.hyperparameters, wanted.hyperparameters
-        if old.get("normalise_observations") != new.get("normalise_observations"):
-            found.append("its networks have learnt with the other choice of normalise_observations")
+        others = [name for name in _LEARNT_WITH if name in old and old[name] != new.get(name)]
+        found += [f"its networks have learnt with {name} {old[name]}" for name in others]
         if has_schedule and wanted.steps != before.steps:
             found.append(f"its learning rate has a schedule over {before.steps:,} steps: give as many")
         kept, size = old.get("replay_size", 0), new.get("replay_size", 0)

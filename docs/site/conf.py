@@ -44,6 +44,7 @@ NAVIGATION = {
         "docs/studies",
         "docs/cluster",
         "docs/tuning",
+        "docs/learning-options",
         "docs/vector-environments",
         "docs/glossary",
     ],

@@ -37,6 +37,7 @@ ADAPTIVE = CSAC(
     normalise_observations=True,
     policy_delay=3,
     adam_momentum=0.5,
+    learning_rate_schedule="cosine",
     **SMALL,
 )
 SHORT: dict[str, Any] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -96,11 +97,20 @@ def test_what_would_be_another_run_is_refused(tmp_path, changes, name):
     assert contents(made.runs[0]) == before
 
 
-def test_a_run_with_a_learning_rate_schedule_is_not_extended(tmp_path):
-    scheduled = PPO(rollout_steps=64, minibatches=4, epochs=1, hidden_sizes=(8, 8))
+@pytest.mark.parametrize(
+    "scheduled",
+    [
+        PPO(rollout_steps=64, minibatches=4, epochs=1, hidden_sizes=(8, 8)),
+        SAC(**SMALL, learning_rate_schedule="cosine"),
+    ],
+)
+def test_a_run_with_a_learning_rate_schedule_is_neither_extended_nor_forked_without(tmp_path, scheduled):
     run(tmp_path / "run", scheduled, steps=128)
-    with pytest.raises(InputError, match="schedule"):
+    with pytest.raises(InputError, match="schedule that ends there"):
         csac.resume(tmp_path / "run", steps=256)
+    constant = replace(scheduled, learning_rate_schedule="constant")
+    with pytest.raises(InputError, match=f"learnt with learning_rate_schedule {scheduled.learning_rate_schedule}"):
+        run(tmp_path / "fork", constant, steps=256, start_from=tmp_path / "run")
 
 
 @pytest.fixture
