@@ -51,6 +51,8 @@ class Evaluator:
         first_seed: what episode 0 is reset with.
         events: names in the last step's `info` to keep of each episode.
         episode_limit: steps after which an episode is broken off; None for `LONGEST_EPISODE`.
+        environments: how many to step side by side, ten at most; no number depends on it.
+        lent: the one to play in instead, which stays open.
 
     Raises:
         InputError: episodes or seeds that there cannot be.
@@ -64,6 +66,8 @@ class Evaluator:
         first_seed: int = EVALUATION_SEED,
         events: Sequence[str] = (),
         episode_limit: int | None = None,
+        environments: int = EPISODES_AT_ONCE,
+        lent: Environment | None = None,
     ) -> None:
         check_whole("episodes", episodes, 1, _SEED_LIMIT)
         check_whole("first_seed", first_seed, 0, _SEED_LIMIT - episodes)
@@ -71,7 +75,8 @@ class Evaluator:
         check_whole("episode_limit", self.episode_limit, 1, _SEED_LIMIT)
         self._task, self._environment_arguments = task, environment_arguments
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
-        self._environments: list[Environment] = []
+        self._lent, self._at_once = lent, min(environments, EPISODES_AT_ONCE, episodes)
+        self._environments = [lent] if lent else []
         self.info_names: set[str] = set()
         self.perturbed: dict[str, float] = {}
         self.watch: Callable[[np.ndarray], object] | None = None
@@ -108,7 +113,7 @@ class Evaluator:
 
     def batches(self, policies: int) -> list[Batch]:
         """Return (which policy, number of its first episode) of every batch, in order."""
-        return [(index, first) for index in range(policies) for first in range(0, self.episodes, EPISODES_AT_ONCE)]
+        return [(index, first) for index in range(policies) for first in range(0, self.episodes, self._at_once)]
 
     def run_batch(
         self,
@@ -125,9 +130,9 @@ class Evaluator:
             InputError, EvaluationFailure: as `run`.
             EvaluationStopped: `should_stop` said so.
         """
-        self._make_environments(min(EPISODES_AT_ONCE, self.episodes))
+        self._make_environments(self._at_once)
         check_contract(policy, self._environments[0])
-        numbers = range(first, min(first + EPISODES_AT_ONCE, self.episodes))
+        numbers = range(first, min(first + self._at_once, self.episodes))
         episodes = [
             Playing(environment, number, self._first_seed + number, self.episode_limit)
             for environment, number in zip(self._environments, numbers, strict=False)
@@ -183,7 +188,9 @@ class Evaluator:
         return episode.result(self._events)
 
     def close(self) -> None:
-        """Close the environments; another batch makes new ones."""
+        """Close the environments, but for one that is lent; another batch makes new ones."""
+        if self._lent:
+            return
         for environment in self._environments:
             environment.close()
         self._environments = []

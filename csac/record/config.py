@@ -45,6 +45,9 @@ class RunConfig:
     """Environment steps between evaluations; there is always one at the last step. 0: none at all."""
     evaluation_episodes: int = 10
     """Episodes per evaluation."""
+    evaluation_environments: int = 10
+    """Environments that an evaluation steps side by side, beside the training one; they stay open. 0: it uses the
+    training environment itself, once the episode there has ended."""
     evaluation_seed: int = EVALUATION_SEED
     """Resets the first evaluation episode; the next ones have the numbers after it."""
     checkpoint_interval: int = 50_000
@@ -81,6 +84,7 @@ _RANGES = (
     ("environments", 1, 1_000),
     ("evaluation_interval", 0, NEVER),
     ("evaluation_episodes", 1, MOST_EPISODES),
+    ("evaluation_environments", 0, 10),
     ("evaluation_seed", 0, 2**30 - 1),
     ("checkpoint_interval", 0, NEVER),
     ("keep_checkpoints", 0, NEVER),

@@ -227,6 +227,16 @@ class SeedEnvironments:
             return False
         return True
 
+    def begin_again(self) -> np.ndarray:
+        """Start the episodes in progress anew: observations [seed, observation]."""
+        self._begun = {place: begun - 1 for place, begun in self._begun.items()}
+        return self.reset()
+
+    @property
+    def is_at_start(self) -> bool:
+        """Whether no environment has made a step of its episode."""
+        return not any(self._lengths.values())
+
     @property
     def is_any_alive(self) -> bool:
         """Whether a seed still steps, or its failure is yet to be reported."""

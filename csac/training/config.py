@@ -35,6 +35,7 @@ class TrainOptions(TypedDict, total=False):
     device: Literal["cpu", "gpu", "cuda"]
     evaluation_interval: int
     evaluation_episodes: int
+    evaluation_environments: int
     evaluation_seed: int
     checkpoint_interval: int
     keep_checkpoints: int

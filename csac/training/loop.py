@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 
-from csac.deploy.contract import Contract
-from csac.deploy.policy import Policy
-from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
-from csac.evaluation.pool import EvaluationPool
 from csac.record.manifest import written
 from csac.record.recorder import Recorder
 from csac.record.run import MANIFEST, TABLES
@@ -20,6 +15,7 @@ from csac.tasks.perturbations import by_step, perturbations_of, values_at
 from csac.tasks.seeds import SeedEnvironments
 from csac.tasks.workers import choose_processes
 from csac.training.checkpoint import Writer
+from csac.training.evaluations import Evaluations, is_finite
 from csac.training.learner import Learner
 from csac.training.resume import ResumePoint
 from csac.types import Snapshot
@@ -27,10 +23,8 @@ from csac.types import Snapshot
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from csac.evaluation.evaluator import EvaluationEpisode
     from csac.record.run import RunDirectory
     from csac.training.program import Program, Watcher
-    from csac.types import PolicyNetwork
 
 METRICS_INTERVAL = 1_000
 LOOK_INTERVAL = 500  # steps between two looks at what is due: rows to write, a signal, a diverged seed
@@ -67,30 +61,12 @@ class Loop:
                 processes = choose_processes(program.task, arguments, self._turn, program.threads)
             self.environments = SeedEnvironments(program.task, arguments, seeds, self._turn, processes)
             stack.callback(self.environments.close)
-            self._base_evaluator = Evaluator(
-                *(program.task, arguments, self.config.evaluation_episodes, self.config.evaluation_seed),
-                self.config.events,
-            )
-            stack.callback(self._base_evaluator.close)
-            self.evaluator: Evaluator | EvaluationPool = self._base_evaluator
-            if program.evaluation_processes:
-                self.evaluator = pool = EvaluationPool(self._base_evaluator, program.evaluation_processes)
-                stack.callback(pool.close)
-                pool.start()
             self.learner = Learner(program.algorithm, self.environments.spec, seeds, self.steps)
-            self._contract = Contract(
-                self.environments.task_name,
-                program.algorithm.name,
-                self.learner.network.activation,
-                self.learner.network.head,
-                *self.environments.contract_parts,
-            )
             self._perturbations = perturbations_of(self.config.perturbations)
             self._changes = dict(by_step(self._perturbations))
-            self._pending: tuple[int, list[int], list[Policy], Any] | None = None
-            self._unheard = set(self.config.events) if not len(runs[0].evaluations) else set()
             self._begin(points)
             self.recorders = [Recorder(run, self.step, program.tensorboard, program.wandb) for run in runs]
+            self.evaluations = Evaluations(program, self.runs, self.recorders, self.environments, watcher, stack)
             self._saved_at, self._saved_time = self.step, time.monotonic()
             self.is_over = False
             self._opened = stack.pop_all()
@@ -111,8 +87,8 @@ class Loop:
             looks = self._is_due(LOOK_INTERVAL) or last
             if looks:
                 self._stop_diverged()
-            if self._is_due(self.config.evaluation_interval) or (last and self.config.evaluation_interval):
-                is_asked = self._evaluate() or is_asked
+            if (due := self._due_evaluation()) is not None:
+                is_asked = self._evaluate(due) or is_asked
             if looks:
                 is_asked = self._look() or is_asked or should_stop()
             if self._is_due(self.config.checkpoint_interval):
@@ -122,7 +98,7 @@ class Loop:
 
     def save(self) -> None:
         """Write a checkpoint of every run, seeds that have failed included. Raises OSError."""
-        self._settle()
+        self.evaluations.settle()
         self._stop_diverged()
         if self.step == self._saved_at or not self.environments.alive.any():
             return
@@ -212,53 +188,28 @@ class Loop:
         if not flat.dot(flat) < np.inf and not np.isfinite(self._actions[self.environments.alive]).all():
             self._stop_diverged()
 
-    def _evaluate(self) -> bool:
+    def _due_evaluation(self) -> int | None:
+        """Return the step of an evaluation that is to be made now, or None."""
+        interval = self.config.evaluation_interval
+        if not interval or self.step == self.steps:
+            return self.step if interval else None
+        if self.config.evaluation_environments:
+            return self.step if self._is_due(interval) else None
+        due = self.step - self.step % interval  # waits for the end of the episode in progress
+        return due if due > self.evaluations.step and self.environments.is_at_start else None
+
+    def _evaluate(self, step: int) -> bool:
         """Begin to evaluate the policies of now, on the task as it was in the last step; return whether to stop."""
-        is_asked = self._settle()
-        networks = self.learner.networks()
-        places = [i for i in np.flatnonzero(self.environments.alive).tolist() if _is_finite(networks[i])]
-        policies = [Policy(networks[i], self._contract, step=self.step) for i in places]
-        self._base_evaluator.perturb(values_at(self._perturbations, self.step - self._turn))
-        self._pending = (self.step, places, policies, self.evaluator.begin(policies))
-        return is_asked or (self._pending[3].is_over and self._settle())
-
-    def _settle(self) -> bool:
-        """Wait for the evaluation in progress, if there is one, and record it; return whether to stop."""
-        if not self._pending:
-            return False
-        (step, places, policies, pending), self._pending = self._pending, None
-        returns = {}
-        for place, policy, result in zip(places, policies, pending.results(), strict=True):
-            run = self.runs[place]
-            if isinstance(result, EvaluationFailure):
-                self._note(run, f"warning: seed {run.seed}: the evaluation at step {step:,} failed: {result}")
-                continue
-            returns[run.seed] = self._record_evaluation(place, step, policy, result)
-        for text in pending.notes:
-            self._note(self.runs[0], text)
-        self._tell_unheard()
-        return self.watcher.evaluated(step, returns) if returns else False
-
-    def _record_evaluation(self, place: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> float:
-        """Record a run's evaluation, and its policy where it is the best so far; return the mean return."""
-        run, recorder = self.runs[place], self.recorders[place]
-        recorder.add("evaluations", [episode.row(run.seed, step) for episode in episodes])
-        recorder.flush()
-        mean = float(np.mean([episode.episode_return for episode in episodes]))
-        is_best = mean > recorder.best
-        recorder.best = max(mean, recorder.best)
-        policy.write(run.policy_file("last"))
-        if is_best:
-            policy.write(run.policy_file("best"))
-        run.log(f"step {step}: mean return {mean:.1f}")
-        run.update_manifest(steps_done=max(step, run.manifest.steps_done))
-        if any(episode.length >= LONGEST_EPISODE for episode in episodes):
-            self._note(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
-        return mean
+        is_asked = self.evaluations.begin(step, self.learner.networks(), self.step - self._turn)
+        if not self.config.evaluation_environments:  # the training environment has played them
+            self.learner.break_off([0], self.step)
+            self._observations = self.environments.begin_again()
+            self._actions = self.learner.next_actions(self._observations, self.step)
+        return is_asked
 
     def _look(self) -> bool:
         """Write what waits, tell how far the seeds are, save by the clock; return whether to stop."""
-        is_asked = bool(self._pending and self._pending[3].is_over and self._settle())
+        is_asked = self.evaluations.is_over and self.evaluations.settle()
         for recorder in self.recorders:
             recorder.flush()
         alive = zip(self.runs, self.environments.alive.tolist(), strict=True)
@@ -271,7 +222,7 @@ class Loop:
 
     def _finish(self) -> None:
         """Save at the end, or where a stop was asked for; leave the newest policies."""
-        self._settle()
+        self.evaluations.settle()
         self._stop_diverged()
         for index, alive in enumerate(self.environments.alive.tolist()):
             self.recorders[index].flush()
@@ -288,8 +239,8 @@ class Loop:
 
     def _save_policy(self, index: int) -> None:
         network = self.learner.networks()[index]
-        if _is_finite(network):
-            Policy(network, self._contract, step=self.step).write(self.runs[index].policy_file("last"))
+        if is_finite(network):
+            self.evaluations.policy(network, self.step).write(self.runs[index].policy_file("last"))
 
     def _record_metrics(self) -> None:
         for index, metrics in enumerate(self.learner.metrics()):
@@ -318,14 +269,6 @@ class Loop:
         run.log(text)
         self.watcher.note(text)
 
-    def _tell_unheard(self) -> None:
-        """Say which events no evaluation episode has held, after the first evaluation, and what there is instead."""
-        there = self.evaluator.info_names
-        for name in sorted(self._unheard - there):
-            known = ", ".join(sorted(there)) or "nothing"
-            self._note(self.runs[0], f"note: no episode's last info holds a number called {name!r}; it holds {known}")
-        self._unheard = set()
-
     def _perturb(self, step: int) -> None:
         """Have the task as it is in the environment step after the first `step`."""
         if self._perturbations:
@@ -341,7 +284,3 @@ def _others(run: RunDirectory) -> dict[str, bytes]:
     paths = [*map(run.table, TABLES), run.policy_file("best")]
     contents = {path.name: path.read_bytes() for path in paths if path.exists()}
     return {**contents, MANIFEST: written(run.manifest)}
-
-
-def _is_finite(network: PolicyNetwork) -> bool:
-    return all(np.isfinite(array).all() for array in jax.tree.leaves(network.parameters))

@@ -111,8 +111,11 @@ class Plan(NamedTuple):
         processes = self.evaluation_processes
         if processes is None:
             pays = spare > 0 and not self.asks and 0 < config.evaluation_interval < config.steps
+            pays = pays and config.evaluation_environments > 0
             processes = min(batches, max(1, spare // len(directories))) if pays and can_be_sent(self.task) else 0
         check_whole("evaluation_processes", processes, 0, 1_000)
+        if not config.evaluation_environments and max(config.environments, *map(len, directories)) > 1:
+            raise InputError("evaluation_environments=0 is for one environment of one seed: have one seed per process")
         stepping = self.environment_processes if can_be_sent(self.task) else self.environment_processes or 0
         most = config.environments if config.environments > 1 else 0
         check_whole("environment_processes", stepping or 0, 0, most)

@@ -93,8 +93,9 @@ def train(
         on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation of a program's seeds.
         stop_when: called in the same way; those seeds end early, as finished, once it returns True.
         **options: what a run computes, as `csac.record.config.RunConfig` explains it: `steps`, `device`,
-            `environments`, `evaluation_interval`, `evaluation_episodes`, `evaluation_seed`, `checkpoint_interval`,
-            `keep_checkpoints`, `environment_arguments`, `perturbations`, `events`.
+            `environments`, `evaluation_interval`, `evaluation_episodes`, `evaluation_environments`,
+            `evaluation_seed`, `checkpoint_interval`, `keep_checkpoints`, `environment_arguments`, `perturbations`,
+            `events`.
 
     Raises:
         InputError: a mistake in the arguments; nothing has been written then.

@@ -23,6 +23,7 @@ TRAINED = {
     "first_seed": 0,
     "device": "cpu",
     "evaluation_interval": 5_000,
+    "evaluation_environments": 10,
     "evaluation_episodes": 10,
     "evaluation_seed": 1_000_000,
     "checkpoint_interval": 50_000,
@@ -43,7 +44,8 @@ TRAINED = {
 def test_train_passes_its_options_on(train_call):
     line = (
         "Hopper-v4 --steps 1e5 --seeds 3 --first-seed 7 --directory some/where --device gpu --seeds-per-process 2 "
-        "--evaluation-interval 1_000 --evaluation-episodes 4 --evaluation-processes 3 --events 'fell, slid' "
+        "--evaluation-interval 1_000 --evaluation-episodes 4 --evaluation-processes 3 "
+        "--evaluation-environments 2 --events 'fell, slid' "
         "--environments 4 --environment-processes 2 "
         "--checkpoint-interval 5e3 --keep-checkpoints 0 --resume --wandb --from a@5 "
         "--warmup-steps 2e3 --actor-hidden-sizes 8 9 "
@@ -63,6 +65,7 @@ def test_train_passes_its_options_on(train_call):
         "first_seed": 7,
         "device": "gpu",
         "evaluation_interval": 1_000,
+        "evaluation_environments": 2,
         "evaluation_episodes": 4,
         "evaluation_seed": 1_000_000,
         "checkpoint_interval": 5_000,

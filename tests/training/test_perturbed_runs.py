@@ -66,7 +66,7 @@ def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
         one.advance(30)
     assert perturbed.run.table("evaluations").read_bytes() == plain.run.table("evaluations").read_bytes()
     assert len(plain.run.evaluations) == 1
-    training, evaluation = perturbed.loop.environments.environments[0], perturbed.loop._base_evaluator._environments[0]
+    training, evaluation = perturbed.loop.environments.environments[0], perturbed.loop.evaluations._evaluator._environments[0]
     for environment in (training, evaluation):
         np.testing.assert_array_equal(model_of(environment).geom_friction, own)
     perturbed.advance(31)

@@ -1,0 +1,136 @@
+"""Evaluations while training: in between, beside it in other processes, or in the training environment itself."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from csac.deploy.contract import Contract
+from csac.deploy.policy import Policy
+from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
+from csac.evaluation.pool import EvaluationPool
+from csac.tasks.perturbations import perturbations_of, values_at
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from contextlib import ExitStack
+
+    from csac.evaluation.evaluator import EvaluationEpisode
+    from csac.record.recorder import Recorder
+    from csac.record.run import RunDirectory
+    from csac.tasks.seeds import SeedEnvironments
+    from csac.training.program import Program, Watcher
+    from csac.types import PolicyNetwork
+
+
+class Evaluations:
+    """Evaluates the policies of runs that are trained together, one evaluation at a time, and records each.
+
+    Args:
+        program: what is trained and how.
+        runs: the run directories; `recorders` write to them.
+        environments: those that are trained in.
+        watcher: who is told.
+        opened: closes what is opened here.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        runs: Sequence[RunDirectory],
+        recorders: Sequence[Recorder],
+        environments: SeedEnvironments,
+        watcher: Watcher,
+        opened: ExitStack,
+    ) -> None:
+        self.runs, self.recorders, self.environments, self.watcher = runs, recorders, environments, watcher
+        config = runs[0].config
+        self.evaluator = self._evaluator = Evaluator(
+            *(program.task, config.environment_arguments, config.evaluation_episodes, config.evaluation_seed),
+            config.events,
+            environments=config.evaluation_environments or 1,
+            lent=None if config.evaluation_environments else environments.environments[0],
+        )
+        opened.callback(self._evaluator.close)
+        if program.evaluation_processes and config.evaluation_environments:
+            self.evaluator = pool = EvaluationPool(self._evaluator, program.evaluation_processes)
+            opened.callback(pool.close)
+            pool.start()
+        self._algorithm = program.algorithm.name
+        self._perturbations = perturbations_of(config.perturbations)
+        self._pending: tuple[int, list[int], list[Policy], Any] | None = None
+        self.step = int(runs[0].evaluations["step"].max(initial=0))  # of the newest one
+        self._unheard = set(config.events) if not len(runs[0].evaluations) else set()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether an evaluation has been made that `settle` has not recorded yet."""
+        return bool(self._pending and self._pending[3].is_over)
+
+    def policy(self, network: PolicyNetwork, step: int) -> Policy:
+        """Return the policy that leaves training with this network."""
+        environments = self.environments
+        parts = environments.task_name, self._algorithm, network.activation, network.head
+        return Policy(network, Contract(*parts, *environments.contract_parts), step=step)
+
+    def begin(self, step: int, networks: Sequence[PolicyNetwork], task_step: int) -> bool:
+        """Begin to evaluate each seed's network after `step`, on the task of `task_step`; return whether to stop."""
+        is_asked, self.step = self.settle(), step
+        places = [i for i in np.flatnonzero(self.environments.alive).tolist() if is_finite(networks[i])]
+        policies = [self.policy(networks[i], step) for i in places]
+        self._evaluator.perturb(values_at(self._perturbations, task_step))
+        self._pending = (step, places, policies, self.evaluator.begin(policies))
+        return is_asked or (self.is_over and self.settle())
+
+    def settle(self) -> bool:
+        """Wait for the evaluation in progress, if there is one, and record it; return whether to stop."""
+        if not self._pending:
+            return False
+        (step, places, policies, pending), self._pending = self._pending, None
+        returns = {}
+        for place, policy, result in zip(places, policies, pending.results(), strict=True):
+            run = self.runs[place]
+            if isinstance(result, EvaluationFailure):
+                self._note(run, f"warning: seed {run.seed}: the evaluation at step {step:,} failed: {result}")
+                continue
+            returns[run.seed] = self._record(place, step, policy, result)
+        for text in pending.notes:
+            self._note(self.runs[0], text)
+        self._tell_unheard()
+        return self.watcher.evaluated(step, returns) if returns else False
+
+    def _record(self, place: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> float:
+        """Record a run's evaluation, and its policy where it is the best so far; return the mean return."""
+        run, recorder = self.runs[place], self.recorders[place]
+        recorder.add("evaluations", [episode.row(run.seed, step) for episode in episodes])
+        recorder.flush()
+        mean = float(np.mean([episode.episode_return for episode in episodes]))
+        is_best = mean > recorder.best
+        recorder.best = max(mean, recorder.best)
+        policy.write(run.policy_file("last"))
+        if is_best:
+            policy.write(run.policy_file("best"))
+        run.log(f"step {step}: mean return {mean:.1f}")
+        run.update_manifest(steps_done=max(step, run.manifest.steps_done))
+        if any(episode.length >= LONGEST_EPISODE for episode in episodes):
+            self._note(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
+        return mean
+
+    def _tell_unheard(self) -> None:
+        """Say which events no evaluation episode has held, after the first evaluation, and what there is instead."""
+        there = self.evaluator.info_names
+        for name in sorted(self._unheard - there):
+            known = ", ".join(sorted(there)) or "nothing"
+            self._note(self.runs[0], f"note: no episode's last info holds a number called {name!r}; it holds {known}")
+        self._unheard = set()
+
+    def _note(self, run: RunDirectory, text: str) -> None:
+        run.log(text)
+        self.watcher.note(text)
+
+
+def is_finite(network: PolicyNetwork) -> bool:
+    """Return whether every parameter is finite."""
+    return all(np.isfinite(array).all() for array in jax.tree.leaves(network.parameters))

@@ -1,0 +1,73 @@
+"""A task of which one instance can live is evaluated in the training environment, between its episodes."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.envs.mujoco.hopper_v4 import HopperEnv
+from gymnasium.wrappers import TimeLimit
+from resuming import LEARNERS, Crash, contents, crash_at, run
+
+from csac import InputError, load
+from csac.evaluation.evaluator import evaluate
+
+
+class OneHopper(HopperEnv):
+    """A second instance cannot be made."""
+
+    live = 0
+
+    def __init__(self):
+        super().__init__()
+        OneHopper.live += 1
+        assert OneHopper.live == 1, "the robot is in use"
+
+    def close(self):
+        OneHopper.live -= 1
+        super().close()
+
+
+def single():
+    return TimeLimit(OneHopper(), 50)
+
+
+HOPPER = partial(gymnasium.make, "Hopper-v4", max_episode_steps=50)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return run(tmp_path_factory.mktemp("single") / "run", task=HOPPER, evaluation_environments=0).runs[0]
+
+
+def test_evaluations_wait_for_the_end_of_the_episode(whole):
+    assert np.unique(whole.evaluations["step"]).tolist() == [100, 200, 300, 400, 500]
+    assert whole.rows("episodes")["length"].sum() + 50 > 500  # none was cut short but the last one
+    last = whole.evaluations[whole.evaluations["step"] == 500]
+    again = evaluate(load(whole), HOPPER, episodes=2, first_seed=whole.config.evaluation_seed)
+    np.testing.assert_array_equal(last["return"], again)
+
+
+def test_one_instance_is_enough(whole, tmp_path):
+    one = run(tmp_path / "run", task=single, evaluation_environments=0).runs[0]
+    assert OneHopper.live == 0
+    assert contents(one)["evaluations.csv"] == contents(whole)["evaluations.csv"]
+
+
+def test_it_resumes_exactly(whole, tmp_path):
+    with pytest.raises(Crash):
+        run(tmp_path / "again", task=HOPPER, evaluation_environments=0, on_evaluation=crash_at(300))
+    again = run(tmp_path / "again", task=HOPPER, evaluation_environments=0, resume=True)
+    assert contents(again.runs[0]) == contents(whole)
+
+
+def test_fewer_environments_give_the_same_numbers(tmp_path):
+    ten, one = (run(tmp_path / str(n), steps=200, evaluation_environments=n).runs[0] for n in (10, 1))
+    assert contents(ten) == contents(one)
+
+
+def test_several_seeds_cannot_share_it(tmp_path):
+    with pytest.raises(InputError, match="evaluation_environments=0"):
+        run(tmp_path / "run", LEARNERS[1], seeds=2, seeds_per_process=2, evaluation_environments=0)
