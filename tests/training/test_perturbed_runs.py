@@ -54,7 +54,7 @@ class Paused:
         while self.loop.step < until:
             self.loop._advance()
             if self.loop.step % 30 == 0:
-                self.loop._evaluate()
+                self.loop._evaluate(self.loop.step)
 
 
 def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
@@ -66,7 +66,10 @@ def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
         one.advance(30)
     assert perturbed.run.table("evaluations").read_bytes() == plain.run.table("evaluations").read_bytes()
     assert len(plain.run.evaluations) == 1
-    training, evaluation = perturbed.loop.environments.environments[0], perturbed.loop.evaluations._evaluator._environments[0]
+    training, evaluation = (
+        perturbed.loop.environments.environments[0],
+        perturbed.loop.evaluations._evaluator._environments[0],
+    )
     for environment in (training, evaluation):
         np.testing.assert_array_equal(model_of(environment).geom_friction, own)
     perturbed.advance(31)
