@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from csac.deploy.choosing import load
     from csac.deploy.policy import Policy
     from csac.evaluation.evaluator import evaluate, evaluate_episodes
+    from csac.training.callbacks import Callback, SaveEvery, StopAfterNoImprovement, StopOnReturn
     from csac.training.train import resume, train
     from csac.types import InputError
 
@@ -34,8 +35,12 @@ __all__ = [
     "SAC",
     "SD3",
     "TD3",
+    "Callback",
     "InputError",
     "Policy",
+    "SaveEvery",
+    "StopAfterNoImprovement",
+    "StopOnReturn",
     "__version__",
     "evaluate",
     "evaluate_episodes",
@@ -50,6 +55,10 @@ _MODULES = {
     "SAC": "csac.algorithms.sac",
     "SD3": "csac.algorithms.sd3",
     "TD3": "csac.algorithms.td3",
+    "Callback": "csac.training.callbacks",
+    "SaveEvery": "csac.training.callbacks",
+    "StopAfterNoImprovement": "csac.training.callbacks",
+    "StopOnReturn": "csac.training.callbacks",
     "InputError": "csac.types",
     "Policy": "csac.deploy.policy",
     "evaluate": "csac.evaluation.evaluator",

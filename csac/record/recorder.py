@@ -51,10 +51,11 @@ class Recorder:
         """Take rows of a table, to be written at the next `flush`."""
         self._waiting[table] += rows
 
-    def flush(self) -> None:
-        """Write the rows that wait. Raises OSError."""
-        for table in TABLES:
+    def flush(self, *tables: Table) -> None:
+        """Write the rows that wait, of all tables unless some are given. Raises OSError."""
+        for table in tables or TABLES:
             if rows := self._waiting.pop(table, []):
+                rows = _joined(rows) if table == "metrics" else rows
                 self.run.append(table, rows)
                 points = self._log.write(table, rows) if self._log else {}
                 if self._wandb:
@@ -80,3 +81,11 @@ class Recorder:
         except Exception as error:
             self._wandb = None
             self.run.log(f"W&B gets no more of this run: {type(error).__name__}: {error}")
+
+
+def _joined(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows with those of one step as one: an algorithm's metrics and what callbacks log."""
+    joined: dict[int, dict[str, Any]] = {}
+    for row in rows:
+        joined[row["step"]] = {**joined.get(row["step"], {}), **row}
+    return [joined[step] for step in sorted(joined)]

@@ -16,7 +16,7 @@ from csac.checks import check_path
 from csac.record import manifest as manifests
 from csac.record.files import create_atomically, write_atomically
 from csac.record.locks import is_locked, kept_from_children, take
-from csac.record.tables import COLUMNS, append_rows, read_rows, structured
+from csac.record.tables import COLUMNS, append_rows, continues, read_rows, structured
 from csac.types import Failure, InputError
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class RunDirectory:
         return self.path / f"{name}.csv"
 
     def append(self, name: Table, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Add rows to a table, flushed on return; the first rows written fix its columns (see `append_rows`)."""
+        """Add rows to a table, flushed on return (see `append_rows`)."""
         append_rows(self.table(name), COLUMNS[name], rows)
 
     def rows(self, name: Table) -> np.ndarray:
@@ -170,7 +170,7 @@ class RunDirectory:
             copy = manifest.with_name(path.name)
             content = copy.read_bytes() if copy.is_file() else b""
             known = path.read_bytes() if path.is_file() else b""
-            if not known.startswith(content) and _is_listed(copy, content):
+            if not continues(known, content) and _is_listed(copy, content):
                 warnings.warn(f"{path} has changed since the newest checkpoint: its copy there is read", stacklevel=4)
                 return copy
         return path

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from csac.record.files import check_name, name_aside
+from csac.record.files import check_name, name_aside, write_atomically
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -30,23 +30,37 @@ INTEGER_COLUMNS = frozenset({"seed", "step", "episode", "length"})
 def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
     """Add rows to the table at `path`: all of them or, on an error, none; flushed to the system on return.
 
-    The first rows written fix the header: `columns`, then whatever else they hold. A value is None (an empty cell), an
-    integer, a boolean, or a float, written with the fewest digits that give it back in its own precision. Raises
-    RuntimeError for a column that the header lacks, or a value that is no number.
+    The header is `columns`, then whatever else rows hold; the first that hold a new column have the table written anew
+    with it, empty in the rows before. A value is None (an empty cell), an integer, a boolean, or a float, written with
+    the fewest digits that give it back in its own precision. Raises RuntimeError for a value that is no number.
     """
     if not rows:
         return
     with open(path, "ab+") as file:
         drop_torn_line(file)
         file.seek(0)
-        header = _header(path, file.readline())
+        known = _header(path, file.readline())
+        header = list(dict.fromkeys([*(known or columns), *(column for row in rows for column in row)]))
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        if not header:
-            header = list(dict.fromkeys([*columns, *(column for row in rows for column in row)]))
+        if header != known:
             writer.writerow(header)
-        writer.writerows(_cells(path, header, row) for row in rows)
-        file.write(text.getvalue().encode())
+            text.writelines(line + "," * (len(header) - len(known)) + "\n" for line in file.read().decode().split())
+        writer.writerows([_cell(path, column, row.get(column)) for column in header] for row in rows)
+        if not known or header == known:
+            file.write(text.getvalue().encode())
+            return
+    write_atomically(path, text.getvalue().encode())
+
+
+def continues(table: bytes, before: bytes) -> bool:
+    """Return whether a table begins with what it was before, where columns may have come since then."""
+    if table.startswith(before):
+        return True
+    header, *rows = before.splitlines()
+    wider, *others = table.splitlines()[: len(rows) + 1] or [b""]
+    more = b"," * (wider.count(b",") - header.count(b","))
+    return wider.startswith(header + b",") and others == [row + more for row in rows]
 
 
 def _header(path: Path, line: bytes) -> list[str]:
@@ -138,12 +152,6 @@ def _short(error: Exception) -> str:
 
 def _float(cell: str) -> float:
     return float(cell) if cell else np.nan
-
-
-def _cells(path: Path, header: list[str], row: Mapping[str, Any]) -> list[str]:
-    if unknown := row.keys() - set(header):
-        raise RuntimeError(f"{path.name} has no column {sorted(unknown)}: the first rows written fix its columns")
-    return [_cell(path, column, row.get(column)) for column in header]
 
 
 def _cell(path: Path, column: str, value: Any) -> str:

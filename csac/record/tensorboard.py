@@ -88,7 +88,8 @@ class TensorBoardLog:
 
     def _metrics(self, rows: Sequence[Row]) -> dict[str, float]:
         row, elapsed = rows[-1], time.monotonic() - self._began
-        values = {f"train/{name}": float(value) for name, value in row.items() if name not in COLUMNS["metrics"]}
+        told = {name: value for name, value in row.items() if name not in COLUMNS["metrics"]}
+        values = {name if "/" in name else f"train/{name}": float(value) for name, value in told.items()}
         return {**values, "time/fps": (row["step"] - self._begin) / max(elapsed, 1e-9)}
 
     def _evaluations(self, rows: Sequence[Row]) -> dict[str, float]:

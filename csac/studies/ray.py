@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from csac.record.locks import is_locked
 from csac.record.run import LOCK, StorageFailure
+from csac.training.callbacks import Answer
 from csac.training.signals import stop_requested
 from csac.training.supervisor import record_failure
 from csac.types import InputError
@@ -18,6 +19,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from csac.training.callbacks import Event
     from csac.training.program import Program, Watcher
 
 RETRIES = 5  # of a run whose node or process was lost
@@ -168,9 +170,11 @@ class _QueueWatcher:
     def progress(self, steps: Mapping[int, int]) -> None:
         self._send("progress", dict(steps))
 
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
         self._send("evaluated", step, dict(returns))
-        return False
+
+    def call(self, event: Event) -> Answer:
+        return Answer()
 
     def failed(self, seed: int, step: int, reason: str) -> None:
         self._send("failed", seed, step, reason)

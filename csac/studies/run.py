@@ -16,6 +16,7 @@ from csac.record.statistics import last_evaluations
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import perturbations_of
 from csac.tasks.trust import remember
+from csac.training.callbacks import Answer
 from csac.training.config import algorithm_of, make_manifest
 from csac.training.program import Program
 from csac.training.signals import stop_requested
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from csac.studies.ray import Cluster
     from csac.studies.study import StudyRun
+    from csac.training.callbacks import Event
 
 
 class How(NamedTuple):
@@ -165,9 +167,12 @@ class RunProgress(NamedTuple):
         for step in steps.values():
             self.study.advanced(self.path, step)
 
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
-        """Take an evaluation, which nobody stops at."""
-        return False
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
+        """Nothing to do: the returns are shown at the end."""
+
+    def call(self, event: Event) -> Answer:
+        """Go on: a study has no callbacks."""
+        return Answer()
 
     def failed(self, seed: int, step: int, reason: str) -> None:
         """Take that the run failed."""

@@ -168,9 +168,14 @@ def check_events(events: Sequence[str]) -> None:
     if isinstance(events, str) or not isinstance(events, Iterable):
         raise InputError(f"events are a list of names such as ('collision',), not {events!r:.40}")
     for name in events:
-        is_word = isinstance(name, str) and name.isprintable() and name and not {*name} & {*" ,;\"'#"}
-        if not is_word or name in _RESERVED:
+        if not is_column(name):
             raise InputError(f"{name!r} cannot name an event: it is no plain word, or a column that there is anyway")
+
+
+def is_column(name: object) -> bool:
+    """Return whether a name can be a column beside those that tables and TensorBoard have anyway."""
+    is_word = isinstance(name, str) and name.isprintable() and name and not {*name} & {*" ,;\"'#"}
+    return bool(is_word) and name not in _RESERVED
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
 from csac.evaluation.pool import EvaluationPool
 from csac.tasks.perturbations import perturbations_of, values_at
+from csac.training.callbacks import mean_return
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from csac.record.run import RunDirectory
     from csac.tasks.seeds import SeedEnvironments
     from csac.training.program import Program, Watcher
+    from csac.training.teller import Teller
     from csac.types import PolicyNetwork
 
 
@@ -32,7 +34,7 @@ class Evaluations:
         program: what is trained and how.
         runs: the run directories; `recorders` write to them.
         environments: those that are trained in.
-        watcher: who is told.
+        watcher, teller: who is told; the latter may end training.
         opened: closes what is opened here.
     """
 
@@ -43,9 +45,11 @@ class Evaluations:
         recorders: Sequence[Recorder],
         environments: SeedEnvironments,
         watcher: Watcher,
+        teller: Teller,
         opened: ExitStack,
     ) -> None:
-        self.runs, self.recorders, self.environments, self.watcher = runs, recorders, environments, watcher
+        self.runs, self.recorders, self.environments = runs, recorders, environments
+        self.watcher, self._teller = watcher, teller
         config = runs[0].config
         self.evaluator = self._evaluator = Evaluator(
             *(program.task, config.environment_arguments, config.evaluation_episodes, config.evaluation_seed),
@@ -89,24 +93,28 @@ class Evaluations:
         if not self._pending:
             return False
         (step, places, policies, pending), self._pending = self._pending, None
-        returns = {}
+        results: dict[int, tuple[Policy, list[EvaluationEpisode]]] = {}
         for place, policy, result in zip(places, policies, pending.results(), strict=True):
             run = self.runs[place]
             if isinstance(result, EvaluationFailure):
                 self._note(run, f"warning: seed {run.seed}: the evaluation at step {step:,} failed: {result}")
                 continue
-            returns[run.seed] = self._record(place, step, policy, result)
+            self._record(place, step, policy, result)
+            results[place] = policy, result
         for text in pending.notes:
             self._note(self.runs[0], text)
         self._tell_unheard()
-        return self.watcher.evaluated(step, returns) if returns else False
+        if results:
+            means = {self.runs[place].seed: mean_return(episodes) for place, (_, episodes) in results.items()}
+            self.watcher.evaluated(step, means)
+        return self._teller.evaluated(step, results)
 
-    def _record(self, place: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> float:
-        """Record a run's evaluation, and its policy where it is the best so far; return the mean return."""
+    def _record(self, place: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> None:
+        """Record a run's evaluation, and its policy where it is the best so far."""
         run, recorder = self.runs[place], self.recorders[place]
         recorder.add("evaluations", [episode.row(run.seed, step) for episode in episodes])
-        recorder.flush()
-        mean = float(np.mean([episode.episode_return for episode in episodes]))
+        recorder.flush("evaluations")
+        mean = mean_return(episodes)
         is_best = mean > recorder.best
         recorder.best = max(mean, recorder.best)
         policy.write(run.policy_file("last"))
@@ -116,7 +124,6 @@ class Evaluations:
         run.update_manifest(steps_done=max(step, run.manifest.steps_done))
         if any(episode.length >= LONGEST_EPISODE for episode in episodes):
             self._note(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
-        return mean
 
     def _tell_unheard(self) -> None:
         """Say which events no evaluation episode has held, after the first evaluation, and what there is instead."""

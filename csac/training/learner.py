@@ -116,6 +116,11 @@ class Learner:
         parameters = jax.tree.map(np.array, self._axis.map(parameters_of)(self._states()))
         return [self.network._replace(parameters=self._axis.of(parameters, i)) for i in range(self._axis.seeds)]
 
+    @property
+    def metric_names(self) -> tuple[str, ...]:
+        """The names of the metrics."""
+        return self._one.metrics
+
     def metrics(self) -> list[dict[str, float]]:
         """Return each seed's metrics, averaged over the updates since `forget_metrics`; none if there were none."""
         if not self._updates_summed:

@@ -18,11 +18,13 @@ from csac.training.checkpoint import Writer
 from csac.training.evaluations import Evaluations, is_finite
 from csac.training.learner import Learner
 from csac.training.resume import ResumePoint
+from csac.training.teller import Teller
 from csac.types import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from csac.deploy.policy import Policy
     from csac.record.run import RunDirectory
     from csac.training.program import Program, Watcher
 
@@ -66,7 +68,9 @@ class Loop:
             self._changes = dict(by_step(self._perturbations))
             self._begin(points)
             self.recorders = [Recorder(run, self.step, program.tensorboard, program.wandb) for run in runs]
-            self.evaluations = Evaluations(program, self.runs, self.recorders, self.environments, watcher, stack)
+            told = self.runs, self.recorders
+            self.teller = Teller(program.hears, watcher.call, *told, self.learner.metric_names, self._policy)
+            self.evaluations = Evaluations(program, *told, self.environments, watcher, self.teller, stack)
             self._saved_at, self._saved_time = self.step, time.monotonic()
             self.is_over = False
             self._opened = stack.pop_all()
@@ -80,7 +84,7 @@ class Loop:
         is_asked = False
         self.watcher.turn(self.step)
         while self.step < self.steps and self.environments.is_any_alive and not is_asked:
-            self._advance()
+            is_asked = self._advance()
             last = self.step == self.steps
             if self._is_due(METRICS_INTERVAL) or last:
                 self._record_metrics()
@@ -165,8 +169,8 @@ class Loop:
 
         return fill
 
-    def _advance(self) -> None:
-        """Make one step of each environment, and learn from them."""
+    def _advance(self) -> bool:
+        """Make one step of each environment, and learn from them; return whether a callback ends the runs."""
         for change in [self._changes[step] for step in self._changes if 0 <= self.step - step < self._turn]:
             self._perturb(self.step)
             for run in self.runs:
@@ -187,6 +191,7 @@ class Loop:
         # One product finds a nan or an inf in a third of the time of np.isfinite().all().
         if not flat.dot(flat) < np.inf and not np.isfinite(self._actions[self.environments.alive]).all():
             self._stop_diverged()
+        return self.teller.after_step(self.step, self._turn, self.environments.alive, outcome.episodes)
 
     def _due_evaluation(self) -> int | None:
         """Return the step of an evaluation that is to be made now, or None."""
@@ -237,10 +242,13 @@ class Loop:
         saved.arrays["actions"] = self._actions[index]
         return saved
 
+    def _policy(self, index: int) -> Policy:
+        return self.evaluations.policy(self.learner.networks()[index], self.step)
+
     def _save_policy(self, index: int) -> None:
-        network = self.learner.networks()[index]
-        if is_finite(network):
-            self.evaluations.policy(network, self.step).write(self.runs[index].policy_file("last"))
+        policy = self._policy(index)
+        if is_finite(policy.network):
+            policy.write(self.runs[index].policy_file("last"))
 
     def _record_metrics(self) -> None:
         for index, metrics in enumerate(self.learner.metrics()):

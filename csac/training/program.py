@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from csac.checks import check_whole
 from csac.processes import core_quota, usable_cores
+from csac.training.callbacks import Hears
 from csac.training.devices import preallocates
 from csac.types import InputError
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from csac.record.config import RunConfig
     from csac.record.run import RunDirectory
     from csac.tasks.registry import Task
+    from csac.training.callbacks import Answer, Event
     from csac.types import Algorithm
 
 PROCESSES_PER_GPU = 4  # eight were in each other's way
@@ -37,8 +39,8 @@ class Program(NamedTuple):
     """How many share the environments; None chooses by what a step costs."""
     tensorboard: bool = True
     wandb: bool | str = False
-    asks: bool = False
-    """Whether an evaluation waits to hear if training goes on (`stop_when`)."""
+    hears: Hears = Hears()
+    """What callbacks are told of, which training waits for."""
     command: str | None = None
 
 
@@ -53,8 +55,12 @@ class Watcher(Protocol):
         """Take how many steps each seed has made."""
         ...
 
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
-        """Take the mean return of each seed's evaluation; return whether training is to end."""
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
+        """Take the mean return of each seed's evaluation."""
+        ...
+
+    def call(self, event: Event) -> Answer:
+        """Tell callbacks, and return what they have to say."""
         ...
 
     def failed(self, seed: int, step: int, reason: str) -> None:
@@ -97,7 +103,7 @@ class Plan(NamedTuple):
     tensorboard: bool
     wandb: bool | str
     command: str | None
-    asks: bool
+    hears: Hears
 
     def programs(
         self, directories: Sequence[Sequence[Path]], existing: Mapping[int, RunDirectory], config: RunConfig
@@ -110,7 +116,7 @@ class Plan(NamedTuple):
         spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
         processes = self.evaluation_processes
         if processes is None:
-            pays = spare > 0 and not self.asks and 0 < config.evaluation_interval < config.steps
+            pays = spare > 0 and not self.hears.evaluations and 0 < config.evaluation_interval < config.steps
             pays = pays and config.evaluation_environments > 0
             processes = min(batches, max(1, spare // len(directories))) if pays and can_be_sent(self.task) else 0
         check_whole("evaluation_processes", processes, 0, 1_000)
@@ -134,7 +140,7 @@ class Plan(NamedTuple):
                 stepping,
                 self.tensorboard,
                 self.wandb,
-                self.asks,
+                self.hears,
                 self.command,
             )
             for group in directories

@@ -14,6 +14,7 @@ from csac.record.files import write_atomically
 from csac.record.manifest import Continuation, Manifest, Origin
 from csac.record.run import TABLES, RunDirectory, now
 from csac.record.sets import RunSet
+from csac.record.tables import continues
 from csac.tasks.perturbations import continued, perturbations_of
 from csac.training.checkpoint import REPLAY, Checkpoint, Damaged, newest_sound, prune, steps_in, write_folder
 from csac.types import InputError
@@ -98,8 +99,9 @@ def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
         if not checkpoint or path.name not in checkpoint.files:
             path.unlink(missing_ok=True)
         elif not _cut_back(path, content := checkpoint.read(path.name)):
+            if not (path.is_file() and continues(path.read_bytes(), content)):
+                notes.append(f"warning: {path} had changed since the checkpoint; it is restored")
             write_atomically(path, content)
-            notes.append(f"warning: {path} had changed since the checkpoint; it is restored")
     best = run.policy_file("best")
     try:
         if checkpoint and best.name in checkpoint.files:

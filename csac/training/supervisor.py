@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from csac.processes import Child, die_with_parent, end, outlive_termination
 from csac.record.run import RunDirectory, StorageFailure
+from csac.training.callbacks import STOPPED
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from pathlib import Path
 
+    from csac.training.callbacks import Answer, Event
     from csac.training.program import Program, Watcher
 
 SECONDS_TO_CLOSE = 5.0  # that a process has to close its environments
@@ -70,8 +72,8 @@ def supervise(
                     worker.step, worker.has_turn = message[1], False
                 else:
                     answer = getattr(watcher_of(worker.program), message[0])(*message[1:])
-                    if message[0] == "evaluated" and worker.program.asks:
-                        worker.tell(("answer", bool(answer)))
+                    if message[0] == "call":
+                        worker.tell(("answer", answer))
     finally:
         for worker in running.values():
             worker.kill()
@@ -148,7 +150,7 @@ def _work(connection: Connection, program: Program) -> None:
 
     begin_with(program.threads)
 
-    watcher = _RemoteWatcher(connection, program.asks)
+    watcher = _RemoteWatcher(connection)
     try:
         train_program(program, watcher, watcher.stopped.is_set)
         connection.send(("over",))
@@ -175,8 +177,8 @@ def record_failure(program: Program, watcher: Watcher, error: Exception) -> None
 class _RemoteWatcher:
     """Hands what happens to the parent, and hears from it in a thread of its own."""
 
-    def __init__(self, connection: Connection, asks: bool) -> None:
-        self._connection, self._asks = connection, asks
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
         self.stopped = threading.Event()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._turns: queue.SimpleQueue[None] = queue.SimpleQueue()
@@ -190,9 +192,16 @@ class _RemoteWatcher:
     def progress(self, steps: Mapping[int, int]) -> None:
         self._connection.send(("progress", dict(steps)))
 
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
         self._connection.send(("evaluated", step, dict(returns)))
-        return self._asks and self._answers.get()
+
+    def call(self, event: Event) -> Answer:
+        is_heard = not self.stopped.is_set()
+        self._connection.send(("call", event))
+        answer = self._answers.get() if is_heard else STOPPED
+        if answer.failed:
+            self.stopped.set()
+        return answer
 
     def failed(self, seed: int, step: int, reason: str) -> None:
         self._connection.send(("failed", seed, step, reason))
@@ -211,7 +220,7 @@ class _RemoteWatcher:
                 continue
             if message[0] == "stop":
                 self.stopped.set()
-                self._answers.put(True)
+                self._answers.put(STOPPED)
             self._turns.put(None)
 
 

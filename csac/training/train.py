@@ -5,19 +5,18 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-import warnings
 from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from csac.checks import check_callable, check_flag, check_path
+from csac.checks import check_flag, check_path
 from csac.processes import core_quota, end_if_unguarded, usable_cores
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory
-from csac.record.statistics import last_evaluations
 from csac.record.wandb import import_wandb
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.tasks.trust import refuse_untrusted
+from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs, make_manifest
 from csac.training.devices import choose_device
@@ -27,16 +26,18 @@ from csac.training.resume import Source, as_begun, refuse_differences
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.supervisor import supervise
+from csac.training.watch import Watch
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from typing_extensions import Unpack
 
     from csac.console.progress import Reporter
     from csac.record.config import RunConfig
     from csac.tasks.registry import Task
+    from csac.training.callbacks import Callback
     from csac.training.config import TrainOptions
     from csac.types import Algorithm
 
@@ -63,6 +64,7 @@ def train(
     progress: bool = False,
     reporter: Reporter | None = None,
     command: str | None = None,
+    callbacks: Sequence[Callback] = (),
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
     **options: Unpack[TrainOptions],
@@ -90,6 +92,7 @@ def train(
         progress: whether to show progress on the terminal.
         reporter: what shows it, instead of the terminal's own.
         command: the command line, for the manifest.
+        callbacks: your own code, told how training goes (`csac.training.callbacks`), in this process.
         on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation of a program's seeds.
         stop_when: called in the same way; those seeds end early, as finished, once it returns True.
         **options: what a run computes, as `csac.record.config.RunConfig` explains it: `steps`, `device`,
@@ -101,6 +104,7 @@ def train(
         InputError: a mistake in the arguments; nothing has been written then.
         Interrupted: on SIGINT or SIGTERM, after everything was saved.
         StorageFailure: a run directory can no longer be written; it is as sound as if the run had been killed.
+        CallbackFailure: one of your own functions raised, after everything was saved.
     """
     end_if_unguarded()
     check_algorithm(algorithm)
@@ -110,7 +114,7 @@ def train(
         raise InputError("resume needs the `directory` of the runs (csac.resume(directory) does without a task)")
     if wandb:
         import_wandb()
-    watch = _Watch.make(reporter, progress, on_evaluation, stop_when)
+    watch = Watch(reporter, progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(options.get("device", "cpu"))
     place = None if directory is None else Path(os.path.abspath(directory))  # a task may change where we are
     wanted = labels(seeds, first_seed)
@@ -125,7 +129,7 @@ def train(
     existing = _existing(place, configs, resume, algorithm.cadence.has_schedule)
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task)
     processes = evaluation_processes, environment_processes
-    how = Plan(algorithm, task, *processes, tensorboard, wandb, command, stop_when is not None)
+    how = Plan(algorithm, task, *processes, tensorboard, wandb, command, watch.callbacks.hears)
     programs = how.programs([[place / f"seed-{seed}" for seed in group] for group in groups], existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
     for config in configs:
@@ -150,6 +154,7 @@ def resume(
     progress: bool = False,
     reporter: Reporter | None = None,
     command: str | None = None,
+    callbacks: Sequence[Callback] = (),
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
 ) -> RunSet:
@@ -161,14 +166,14 @@ def resume(
     Raises:
         InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
             call `train` with it and `resume=True` then.
-        Interrupted, StorageFailure: as `train`.
+        Interrupted, StorageFailure, CallbackFailure: as `train`.
     """
     runs = RunSet.open(directory)
     config = runs.config
     if config.task_is_callable:
         raise InputError(f"the task of {runs.path} is a Python function: call csac.train with it and resume=True")
     refuse_untrusted(config.task, runs.path, trust_task)
-    watch = _Watch.make(reporter, progress, on_evaluation, stop_when)
+    watch = Watch(reporter, progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
     algorithm = algorithm_of(config)
     for run in runs.runs:
@@ -182,7 +187,7 @@ def resume(
     has_wandb = any((run.path / "wandb").exists() for run in runs.runs)
     has_tensorboard = any(run.tensorboard.exists() for run in runs.runs)
     processes = evaluation_processes, environment_processes
-    how = Plan(algorithm, config.task, *processes, has_tensorboard, has_wandb, command, stop_when is not None)
+    how = Plan(algorithm, config.task, *processes, has_tensorboard, has_wandb, command, watch.callbacks.hears)
     programs = how.programs([[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
 
@@ -228,67 +233,7 @@ def _create_or_extend(
         source.copy_to(run)
 
 
-class _Watch:
-    """Tells the caller what happens: the reporter and the caller's own functions."""
-
-    def __init__(
-        self, reporter: Reporter | None, on_evaluation: OnEvaluation | None, stop_when: StopWhen | None
-    ) -> None:
-        self.reporter, self.on_evaluation, self.stop_when = reporter, on_evaluation, stop_when
-
-    @classmethod
-    def make(
-        cls, reporter: Reporter | None, progress: bool, on_evaluation: OnEvaluation | None, stop_when: StopWhen | None
-    ) -> _Watch:
-        """Return it, with a reporter on the terminal where progress is wanted. Raises InputError."""
-        check_flag("progress", progress)
-        check_callable("on_evaluation", on_evaluation)
-        check_callable("stop_when", stop_when)
-        if progress and reporter is None:
-            from csac.console.progress import Reporter
-
-            reporter = Reporter()
-        return cls(reporter, on_evaluation, stop_when)
-
-    def turn(self, step: int) -> None:
-        """Go on: nobody else trains in this process."""
-
-    def progress(self, steps: Mapping[int, int]) -> None:
-        """Show how many steps each seed has made."""
-        if self.reporter:
-            self.reporter.progress(steps)
-
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> bool:
-        """Show an evaluation, and ask whether training is to end."""
-        if self.reporter:
-            self.reporter.evaluated(step, returns)
-        if self.on_evaluation:
-            self.on_evaluation(step, dict(returns))
-        return bool(self.stop_when and self.stop_when(step, dict(returns)))
-
-    def failed(self, seed: int, step: int, reason: str) -> None:
-        """Show that a seed failed."""
-        if self.reporter:
-            self.reporter.failed(seed, step, reason)
-        else:
-            warnings.warn(f"seed {seed} failed at step {step}: {reason}", RuntimeWarning, stacklevel=2)
-
-    def note(self, text: str) -> None:
-        """Show a line."""
-        if self.reporter:
-            self.reporter.note(text)
-
-    def is_over(self, run: RunDirectory) -> bool:
-        """Return whether a run needs no more training: all its steps are made, or `stop_when` still says so."""
-        manifest = run.manifest
-        if manifest.state not in ("finished", "failed") or manifest.steps_done < run.config.steps:
-            stopped_early = manifest.state == "finished" and self.stop_when is not None
-            last = last_evaluations(run.evaluations, points=1) if stopped_early else {}
-            return bool(last and self.stop_when and self.stop_when(manifest.steps_done, last))
-        return manifest.state == "finished"
-
-
-def _run(runs: RunSet, programs: list[Program], watch: _Watch, notes: list[str]) -> RunSet:
+def _run(runs: RunSet, programs: list[Program], watch: Watch, notes: list[str]) -> RunSet:
     """Train every program that is not over, show it, and draw the curve. Raises as `train`."""
     done = {run.path for run in runs.runs if watch.is_over(run)}
     programs = [program for program in programs if not done.issuperset(program.directories)]
@@ -297,16 +242,22 @@ def _run(runs: RunSet, programs: list[Program], watch: _Watch, notes: list[str])
     if reporter:
         reporter.start(runs, notes)
     with closing(reporter) if reporter else nullcontext(), stop_requested(watch.note) as request:
+
+        def should_stop() -> bool:
+            return request.is_set() or watch.callbacks.failure is not None
+
         if len(programs) == 1:
             begin_with(programs[0].threads)
-            train_program(programs[0], watch, request.is_set)
+            train_program(programs[0], watch, should_stop)
         elif programs:
             turns = len(usable_cores()) // programs[0].threads if runs.config.device == "cpu" else None
-            supervise(programs, lambda _: watch, request.is_set, _workers(), turns)
+            supervise(programs, lambda _: watch, should_stop, _workers(), turns)
         runs = RunSet(runs.path, [RunDirectory.open(run.path) for run in runs.runs])
         draw_curve(RunSet.open(runs.path), watch.note)
         if reporter:
             reporter.finish(runs)
+    if failure := watch.callbacks.failure:
+        raise failure
     if request.is_set() and any(run.manifest.state in ("running", "interrupted") for run in runs.runs):
         raise Interrupted(runs, request.received[0])
     return runs

@@ -58,8 +58,8 @@ def contents(run: RunDirectory) -> dict[str, bytes]:
     return {name: (run.path / name).read_bytes() for name in FILES if (run.path / name).exists()}
 
 
-class Crash(Exception):
-    pass
+class Crash(BaseException):
+    """Ends a process as if it was killed: no callback's mistake, after which the run would be saved."""
 
 
 def crash_at(step: int):

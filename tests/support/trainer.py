@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from csac.record.config import RunConfig
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
+from csac.training.callbacks import Answer
 from csac.training.loop import Loop
 from csac.training.program import Program
 from csac.training.resume import ResumePoint
@@ -31,17 +32,16 @@ class Outcome(NamedTuple):
 
 
 class Silent:
-    """Watches and says nothing; stops at the first evaluation from `stop_at` on."""
-
-    def __init__(self, stop_at: int | None = None) -> None:
-        self.stop_at = stop_at
+    """Watches and says nothing."""
 
     def turn(self, step: int) -> None: ...
 
     def progress(self, steps: Any) -> None: ...
 
-    def evaluated(self, step: int, returns: Any) -> bool:
-        return self.stop_at is not None and step >= self.stop_at
+    def evaluated(self, step: int, returns: Any) -> None: ...
+
+    def call(self, event: Any) -> Answer:
+        return Answer()
 
     def failed(self, seed: int, step: int, reason: str) -> None: ...
 

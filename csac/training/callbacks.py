@@ -1,0 +1,262 @@
+"""Callbacks: the caller's own code, told how training goes. It may log numbers and end training.
+
+They run in the process that called `train`, one at a time, also where seeds train in processes of their own: a callback
+may be a closure, keeps its state, and sees every seed. Training waits for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from csac.checks import check_callable, check_whole
+from csac.evaluation.episode import EvaluationEpisode
+from csac.record.config import NEVER
+from csac.record.run import RunDirectory
+from csac.tasks.failures import raised
+from csac.tasks.registry import is_column
+from csac.types import Failure, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from csac.deploy.policy import Policy
+    from csac.tasks.seeds import FinishedEpisode
+
+
+class CallbackFailure(Failure):
+    """A callback raised. The runs were saved as at a Ctrl-C; the message is one line, `__cause__` what it raised."""
+
+
+@dataclass
+class Moment:
+    """Where a run is when a callback is told."""
+
+    seed: int
+    step: int
+    """Environment steps that the seed has made."""
+    directory: Path
+    """The run's directory."""
+    policy: Policy | None = None
+    """The policy of now, for a callback with `needs_policy`."""
+    scalars: dict[str, float] = field(default_factory=dict)
+    """What was logged so far."""
+    metrics: tuple[str, ...] = ()
+    """The metrics of the algorithm, whose names are taken."""
+
+    @property
+    def run(self) -> RunDirectory:
+        """The run: its tables as far as they are written; those of evaluations are whole."""
+        return RunDirectory.open(self.directory)
+
+    def log(self, name: str, value: float) -> None:
+        """Log a number: a column of metrics.csv, a curve of TensorBoard and W&B, `train/NAME` or NAME with a slash.
+
+        Raises:
+            InputError: the name is no plain word, or taken.
+        """
+        if not is_column(name) or name in self.metrics:
+            raise InputError(f"{name!r} cannot name a scalar: it is no plain word, or a column that there is anyway")
+        self.scalars[name] = float(value)
+
+
+class Callback:
+    """What is told of training. Override the methods that you want; one that returns False ends the run, as finished.
+
+    Seeds that share a program (`seeds_per_process`) end together.
+    """
+
+    interval: int = 1_000
+    """Environment steps of a seed between two calls of `on_step`."""
+    needs_policy: bool = False
+    """Whether moments hold the policy, which takes a copy of it each time."""
+
+    def on_step(self, moment: Moment) -> bool | None:
+        """Hear that `interval` further steps are made, and learnt from."""
+
+    def on_episode(self, moment: Moment, episode: FinishedEpisode) -> bool | None:
+        """Hear of a training episode that ended: `episode_return`, `length`, `events`."""
+
+    def on_evaluation(self, moment: Moment, episodes: Sequence[EvaluationEpisode]) -> bool | None:
+        """Hear of an evaluation; `moment.step` is when the policy was as evaluated."""
+
+
+class StopOnReturn(Callback):
+    """Ends a run once the mean return of an evaluation is at least `threshold`."""
+
+    def __init__(self, threshold: float) -> None:
+        self.threshold = threshold
+
+    def on_evaluation(self, moment: Moment, episodes: Sequence[EvaluationEpisode]) -> bool:
+        """Compare the mean with the threshold."""
+        return mean_return(episodes) < self.threshold
+
+
+class StopAfterNoImprovement(Callback):
+    """Ends a run after so many evaluations in a row without a new best mean return; a resume counts on.
+
+    Args:
+        evaluations: how many.
+        after: steps before which no run ends.
+    """
+
+    def __init__(self, evaluations: int, after: int = 0) -> None:
+        check_whole("evaluations", evaluations, 1, NEVER)
+        self.evaluations, self.after = evaluations, after
+
+    def on_evaluation(self, moment: Moment, episodes: Sequence[EvaluationEpisode]) -> bool:
+        """Count the evaluations since the best one."""
+        rows = moment.run.evaluations
+        steps = np.unique(rows["step"][rows["step"] <= moment.step])
+        means = [rows["return"][rows["step"] == step].mean() for step in steps]
+        return moment.step < self.after or len(means) - 1 - int(np.argmax(means)) < self.evaluations
+
+
+class SaveEvery(Callback):
+    """Saves the policy every `steps` steps, as `policies/step_<n>` in the run's directory; `csac.load` reads it."""
+
+    needs_policy = True
+
+    def __init__(self, steps: int) -> None:
+        self.interval = steps
+
+    def on_step(self, moment: Moment) -> None:
+        """Save it."""
+        assert moment.policy
+        moment.policy.save(moment.directory / "policies" / f"step_{moment.step}")
+
+
+def mean_return(episodes: Iterable[EvaluationEpisode]) -> float:
+    """Return the mean return of episodes."""
+    return float(np.mean([episode.episode_return for episode in episodes]))
+
+
+class Hears(NamedTuple):
+    """What callbacks want to be told of."""
+
+    intervals: tuple[int, ...] = ()
+    episodes: bool = False
+    evaluations: bool = False
+    policies: bool = False
+
+
+class Event(NamedTuple):
+    """What callbacks are told of at once: a moment of each seed of a program that it concerns."""
+
+    method: str
+    """Of `Callback`."""
+    moments: list[Moment]
+    arguments: list[tuple[Any, ...]]
+    """What the method is given beside the moment, for each."""
+    intervals: tuple[int, ...] = ()
+    """Those that are over, of `on_step`."""
+
+
+class Answer(NamedTuple):
+    """What callbacks have to say: who ends the runs, or nothing, and the scalars of each moment."""
+
+    stopped_by: str = ""
+    scalars: tuple[dict[str, float], ...] = ()
+    failed: bool = False
+    """Whether one of them raised, now or before."""
+
+
+STOPPED = Answer("a stop of all runs")
+
+
+class Callbacks:
+    """A caller's callbacks, and its functions `on_evaluation` and `stop_when`. The first that raises is the last told.
+
+    Raises:
+        InputError: something that is no callback.
+    """
+
+    def __init__(
+        self,
+        callbacks: Iterable[Callback] = (),
+        on_evaluation: Callable[[int, dict[int, float]], Any] | None = None,
+        stop_when: Callable[[int, dict[int, float]], Any] | None = None,
+    ) -> None:
+        check_callable("on_evaluation", on_evaluation)
+        check_callable("stop_when", stop_when)
+        if isinstance(callbacks, Callback) or not isinstance(callbacks, list | tuple):
+            raise InputError(f"callbacks are a list such as [StopOnReturn(3_000)], not {callbacks!r:.40}")
+        self.callbacks = tuple(callbacks)
+        for callback in self.callbacks:
+            if not isinstance(callback, Callback):
+                raise InputError(f"{callback!r:.60} is no callback: derive its class from csac.Callback, and call it")
+            check_whole(f"{type(callback).__name__}.interval", callback.interval, 1, NEVER)
+        self.on_evaluation, self.stop_when = on_evaluation, stop_when
+        self.failure: CallbackFailure | None = None
+
+    @property
+    def hears(self) -> Hears:
+        """What they want to be told of."""
+        overridden = {name: [c for c in self.callbacks if _overrides(c, name)] for name in _METHODS}
+        has_function = self.on_evaluation is not None or self.stop_when is not None
+        return Hears(
+            tuple(sorted({callback.interval for callback in overridden["on_step"]})),
+            bool(overridden["on_episode"]),
+            bool(overridden["on_evaluation"]) or has_function,
+            any(callback.needs_policy for callback in self.callbacks),
+        )
+
+    def call(self, event: Event) -> Answer:
+        """Tell all of them, and return what they have to say."""
+        stopped_by = [self._tell(callback, event) for callback in self.callbacks if _wants(callback, event)]
+        if event.method == "on_evaluation":
+            moments = zip(event.moments, event.arguments, strict=True)
+            returns = {moment.seed: mean_return(episodes) for moment, (episodes,) in moments}
+            step = event.moments[0].step
+            self._guarded("on_evaluation", self.on_evaluation, step, dict(returns))
+            if self._guarded("stop_when", self.stop_when, step, dict(returns)):
+                stopped_by.append("stop_when")
+        stopper = str(self.failure) if self.failure else next(filter(None, stopped_by), "")
+        return Answer(stopper, tuple(moment.scalars for moment in event.moments), self.failure is not None)
+
+    def still_stop(self, run: RunDirectory) -> bool:
+        """Return whether a run that ended early would end again at its last evaluation."""
+        if run.manifest.state != "finished" or not self.hears.evaluations or not len(run.evaluations):
+            return False
+        rows, names = run.evaluations, run.evaluations.dtype.names or ()
+        episodes = [
+            EvaluationEpisode(*row[2:6], events=dict(zip(names[6:], row[6:], strict=True)))  # as `row` gives them
+            for row in rows[rows["step"] == rows["step"][-1]].tolist()
+        ]
+        callbacks = Callbacks([c for c in self.callbacks if not c.needs_policy], None, self.stop_when)
+        moment = Moment(run.seed, int(rows["step"][-1]), run.path)
+        return bool(callbacks.call(Event("on_evaluation", [moment], [(episodes,)])).stopped_by)
+
+    def _tell(self, callback: Callback, event: Event) -> str:
+        """Return what ends the runs: the callback's name, or nothing."""
+        name, goes_on = type(callback).__name__, True
+        for moment, arguments in zip(event.moments, event.arguments, strict=True):
+            told = self._guarded(f"{name}.{event.method}", getattr(callback, event.method), moment, *arguments)
+            goes_on = goes_on and (told is None or bool(told))
+        return "" if goes_on else name
+
+    def _guarded(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
+        """Return what a caller's function returns, None where it raises or something has raised before."""
+        if function is None or self.failure:
+            return None
+        try:
+            return function(*arguments)
+        except Exception as error:
+            self.failure = CallbackFailure(f"{name} raised {raised(error)}")
+            self.failure.__cause__ = error
+            return None
+
+
+_METHODS = ("on_step", "on_episode", "on_evaluation")
+
+
+def _overrides(callback: Callback, method: str) -> bool:
+    return getattr(type(callback), method) is not getattr(Callback, method)
+
+
+def _wants(callback: Callback, event: Event) -> bool:
+    is_due = event.method != "on_step" or callback.interval in event.intervals
+    return is_due and _overrides(callback, event.method)

@@ -1,0 +1,67 @@
+"""Who is told what happens in training, in the process that called `train`: the reporter and the callbacks."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+from csac.checks import check_flag
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from csac.console.progress import Reporter
+    from csac.record.run import RunDirectory
+    from csac.training.callbacks import Answer, Callbacks, Event
+
+
+class Watch:
+    """Tells the caller what happens, with a reporter on the terminal where `progress` is wanted. Raises InputError."""
+
+    def __init__(self, reporter: Reporter | None, progress: bool, callbacks: Callbacks) -> None:
+        check_flag("progress", progress)
+        if progress and reporter is None:
+            from csac.console.progress import Reporter
+
+            reporter = Reporter()
+        self.reporter, self.callbacks = reporter, callbacks
+
+    def turn(self, step: int) -> None:
+        """Go on: nobody else trains in this process."""
+
+    def progress(self, steps: Mapping[int, int]) -> None:
+        """Show how many steps each seed has made."""
+        if self.reporter:
+            self.reporter.progress(steps)
+
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
+        """Show an evaluation."""
+        if self.reporter:
+            self.reporter.evaluated(step, returns)
+
+    def call(self, event: Event) -> Answer:
+        """Tell the callbacks; show who ends the runs."""
+        answer = self.callbacks.call(event)
+        if answer.stopped_by:
+            seeds = ", ".join(str(moment.seed) for moment in event.moments)
+            self.note(f"seed {seeds}: stopped early at step {event.moments[0].step:,} ({answer.stopped_by})")
+        return answer
+
+    def failed(self, seed: int, step: int, reason: str) -> None:
+        """Show that a seed failed."""
+        if self.reporter:
+            self.reporter.failed(seed, step, reason)
+        else:
+            warnings.warn(f"seed {seed} failed at step {step}: {reason}", RuntimeWarning, stacklevel=2)
+
+    def note(self, text: str) -> None:
+        """Show a line."""
+        if self.reporter:
+            self.reporter.note(text)
+
+    def is_over(self, run: RunDirectory) -> bool:
+        """Return whether a run needs no more training: all its steps are made, or a callback still ends it there."""
+        manifest = run.manifest
+        if manifest.state not in ("finished", "failed") or manifest.steps_done < run.config.steps:
+            return self.callbacks.still_stop(run)
+        return manifest.state == "finished"
