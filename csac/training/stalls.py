@@ -34,7 +34,7 @@ def stalls_noted(progress: Callable[[], int], note: Callable[[str], None], who: 
             now = progress()
             is_told = is_told and now == before
             place = _place_in_environment(sys._current_frames().get(thread)) if now == before else None
-            if place and not is_told:
+            if place is not None and not is_told:  # in a process of its own there is no place
                 note(f"{who}: at step {now:,} for {SECONDS / 60:.0f} minutes, inside the environment{place}")
                 is_told = True
             before = now
