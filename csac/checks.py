@@ -11,11 +11,11 @@ import numpy as np
 
 from csac.types import InputError
 
-_CONTROLS = re.compile(rb"\\u00(0[0-8bcef]|1[0-9a-f]|7f|[89][0-9a-f])|\x7f|\xc2[\x80-\x9f]", re.IGNORECASE)
+_CONTROLS = re.compile(rb"\\u(?:0000)?00(0[0-8bcef]|1[0-9a-f]|7f|[89][0-9a-f])|\x7f|\xc2[\x80-\x9f]", re.IGNORECASE)
 
 
 def without_controls(content: bytes) -> bytes:
-    """Return JSON whose texts move no terminal: a stranger's file may hold its escape sequences."""
+    """Return JSON or TOML whose texts move no terminal: a stranger's file may hold its escape sequences."""
     return _CONTROLS.sub(rb"\\ufffd", content)
 
 
@@ -45,7 +45,7 @@ def check_path(name: str, value: object) -> None:
     """Raise InputError for what names no file or directory."""
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{name} is a path such as 'runs/first', not {value!r:.40}")
-    if not str(value) or "\0" in str(value):
+    if not str(value) or re.search(r"[\x00-\x1f\x7f-\x9f]", str(value)):  # such a name could move a terminal
         raise InputError(f"{name} cannot be {value!r:.40}: give a path such as 'runs/first'")
 
 

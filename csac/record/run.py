@@ -192,7 +192,7 @@ class RunDirectory:
         Raises:
             InputError: another process holds it, or the file system has none to give.
         """
-        for path in self.path.iterdir():
+        for path in [*self.path.iterdir(), *self.checkpoints.glob("*")]:
             if path.is_symlink():  # what it points to would be overwritten
                 raise InputError(f"{path} is a link: replace it by what it points to")
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)

@@ -120,7 +120,8 @@ def read_rows(path: str | Path) -> np.ndarray:
         raise InputError(f"{path} is not a CSV file ({error}); give one csac wrote") from None
     if not header and not body:
         return structured(COLUMNS.get(path.stem, ("seed", "step")), [])
-    if len(set(header)) < len(header) or not {"seed", "step"} <= set(header):
+    is_plain = all(name.isprintable() for name in header)  # it moves no terminal
+    if len(set(header)) < len(header) or not {"seed", "step"} <= set(header) or not is_plain:
         raise InputError(
             f"{path} is not a table of a run: its header is {','.join(header)[:100]!r}; give one that csac wrote"
         )

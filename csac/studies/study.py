@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from csac.algorithms import ALGORITHMS
-from csac.checks import check_whole, did_you_mean
+from csac.checks import check_whole, did_you_mean, without_controls
 from csac.presets import hyperparameters as preset_of
 from csac.record import manifest as manifests
 from csac.record.config import NEVER, RunConfig
@@ -234,7 +234,7 @@ def find(name: str) -> Study:
 def read_study(path: Path) -> Study:
     """Return the study in a TOML file; docs/studies.md says what it may hold. Raises InputError."""
     try:
-        told = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        told = tomllib.loads(without_controls(path.read_bytes()).decode("utf-8-sig"))
         _refuse_unknown(told, _names(Study), "a study has no")
         for method in told.get("methods", []):
             _refuse_unknown(method, _names(Method), "a method has no")

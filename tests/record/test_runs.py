@@ -39,6 +39,29 @@ def test_a_strangers_manifest_moves_no_terminal():
     assert read(written(one)).failure == one.failure
 
 
+def test_a_strangers_folder_and_header_move_no_terminal(tmp_path):
+    RunDirectory.create(tmp_path / "run", manifest()).append("evaluations", [{**row(1, 1.0), "\x1b[2J": 1}])
+    with pytest.raises(InputError, match=r"x1b\[2J") as told:
+        _ = RunDirectory.open(tmp_path / "run").evaluations
+    assert "\x1b" not in str(told.value)
+    (tmp_path / "run").rename(tmp_path / "\x1b[2J")
+    damaged: list[InputError] = []
+    assert not find_sets(tmp_path, damaged.append)
+    assert len(damaged) == 1
+    assert "\x1b" not in str(damaged[0])
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links")
+@pytest.mark.parametrize("name", ["log.txt", "checkpoint", "checkpoint/replay"])
+def test_a_strangers_link_is_not_followed(tmp_path, name):
+    run = RunDirectory.create(tmp_path / "run", manifest())
+    link = run.path / name
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(tmp_path)
+    with pytest.raises(InputError, match=f"{name} is a link"), run.locked():
+        raise AssertionError
+
+
 @pytest.mark.parametrize(
     ("content", "name"),
     [

@@ -139,6 +139,11 @@ def test_a_mistake_is_one_line_that_names_it(tmp_path, text, named):
     assert "\n" not in str(told.value)
 
 
+def test_a_strangers_study_moves_no_terminal(tmp_path):
+    study = study_of(tmp_path, 'title = "\\u001b[2J\\U0000009bx"\ntasks = ["Ant-v4"]\n' + METHOD)
+    assert study.title == "\ufffd[2J\ufffdx"
+
+
 def test_there_is_no_such_study():
     with pytest.raises(InputError, match="did you mean mujoco"):
         find("mujocco")
