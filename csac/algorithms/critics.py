@@ -1,4 +1,4 @@
-"""Two critics Q(s, a) that learn side by side: how they are made, what they say and what they gradient_step."""
+"""Two critics Q(s, a) that learn side by side: how they are made, read and trained."""
 
 from __future__ import annotations
 

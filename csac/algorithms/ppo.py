@@ -38,7 +38,7 @@ from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, 
 
 
 class Parameters(NamedTuple):
-    """What gradient_steps, all by one optimiser."""
+    """The parameters trained by one optimiser."""
 
     actor: MLP  # [observation] -> mean [action]
     critic: MLP  # [observation] -> [1]

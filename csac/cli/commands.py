@@ -200,16 +200,16 @@ def _study(words: list[str]) -> int:
 
 def _tune(options: Any, command: str) -> int:
     from csac.console.tables import make_console
-    from csac.record.config import RunConfig
+    from csac.record.config import TUNING_EVALUATION_SEED, RunConfig
     from csac.studies.search import Search, space_of
-    from csac.studies.tune import EVALUATION_SEED, tune
+    from csac.studies.tune import tune
     from csac.training.config import labels
 
     learner = learner_of(options)
     given = [word.partition("=")[0][2:].replace("-", "_") for word in shlex.split(command) if word.startswith("--")]
     wanted = [name.replace("-", "_") for name in options.search] or None
     own = {item.name: getattr(options, item.name) for item in dataclasses.fields(RunConfig)}
-    config = RunConfig(**{**own, "seed": options.first_seed, "evaluation_seed": EVALUATION_SEED})
+    config = RunConfig(**{**own, "seed": options.first_seed, "evaluation_seed": TUNING_EVALUATION_SEED})
     labels(options.seeds, options.first_seed)
     search = Search(config=config, seeds=options.seeds, algorithm=learner, space=space_of(learner, wanted, given))
     return tune(search, options.home(), options.trials, command, make_console())

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-EVALUATION_SEED = 3_000_000  # resets the first evaluation episode of trials: no report uses these episodes
 STARTUP_TRIALS = 5  # that are never pruned, and that must be complete before any is
 SHARE_UNPRUNED = 0.25  # of a trial's steps, at its beginning
 SHOWN = 10  # trials in the table at the end

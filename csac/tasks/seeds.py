@@ -15,11 +15,6 @@ from csac.tasks.registry import Task
 from csac.tasks.workers import Workers
 from csac.types import Snapshot
 
-# What episode 0 of an evaluation is reset with; the next ones with the numbers after it.
-EVALUATION_SEED = 1_000_000  # in training: the curves
-FRESH_EVALUATION_SEED = 2_000_000  # of finished policies: what nothing was chosen by
-TUNING_EVALUATION_SEED = 3_000_000  # in training for `csac tune`: what hyperparameters are chosen by
-
 FIRST_TRAINING_SEED = 2**30  # above every evaluation seed, and with as many again still a C int
 
 

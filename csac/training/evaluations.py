@@ -66,6 +66,7 @@ class Evaluations:
         self._perturbations = perturbations_of(config.perturbations)
         self._pending: tuple[int, list[int], list[Policy], Any] | None = None
         self.step = int(runs[0].evaluations["step"].max(initial=0))  # of the newest one
+        self.wants_stop = False  # whether the watcher has said so of an evaluation
         self._unheard = set(config.events) if not len(runs[0].evaluations) else set()
 
     @property
@@ -79,19 +80,21 @@ class Evaluations:
         parts = environments.task_name, self._algorithm, network.activation, network.head
         return Policy(network, Contract(*parts, *environments.contract_parts), step=step)
 
-    def begin(self, step: int, networks: Sequence[PolicyNetwork], task_step: int) -> bool:
-        """Begin to evaluate each seed's network after `step`, on the task of `task_step`; return whether to stop."""
-        is_asked, self.step = self.settle(), step
+    def begin(self, step: int, networks: Sequence[PolicyNetwork], task_step: int) -> None:
+        """Begin to evaluate each seed's network after `step`, on the task of `task_step`."""
+        self.settle()
+        self.step = step
         places = [i for i in np.flatnonzero(self.environments.alive).tolist() if is_finite(networks[i])]
         policies = [self.policy(networks[i], step) for i in places]
         self._evaluator.perturb(values_at(self._perturbations, task_step))
         self._pending = (step, places, policies, self.evaluator.begin(policies))
-        return is_asked or (self.is_over and self.settle())
+        if self.is_over:
+            self.settle()
 
-    def settle(self) -> bool:
-        """Wait for the evaluation in progress, if there is one, and record it; return whether to stop."""
+    def settle(self) -> None:
+        """Wait for the evaluation in progress, if there is one, and record it."""
         if not self._pending:
-            return False
+            return
         (step, places, policies, pending), self._pending = self._pending, None
         results: dict[int, tuple[Policy, list[EvaluationEpisode]]] = {}
         for place, policy, result in zip(places, policies, pending.results(), strict=True):
@@ -107,7 +110,7 @@ class Evaluations:
         if results:
             means = {self.runs[place].seed: mean_return(episodes) for place, (_, episodes) in results.items()}
             self.watcher.evaluated(step, means)
-        return self._teller.evaluated(step, results)
+        self.wants_stop = self._teller.evaluated(step, results) or self.wants_stop
 
     def _record(self, place: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> None:
         """Record a run's evaluation, and its policy where it is the best so far."""

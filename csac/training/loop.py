@@ -36,14 +36,14 @@ SECONDS_BETWEEN_CHECKPOINTS = 600.0
 class Loop:
     """Trains runs side by side that differ by their seeds alone.
 
-    Strict order: whatever updates the step before an action has brought are made before it. Evaluations may run in
+    Strict order: all updates due after a step finish before the next action is chosen. Evaluations may run in
     processes beside this one while training goes on; their numbers are the same.
 
     Args:
         program: what is trained and how.
         runs: the run directories, locked by this process.
         points: where each run goes on, all at one step.
-        watcher: who is told.
+        watcher: receives progress, results and notes.
 
     Raises:
         InputError: a checkpoint does not fit, or the task cannot be made.
@@ -81,22 +81,24 @@ class Loop:
         Raises:
             OSError: a run directory can no longer be written.
         """
-        is_asked = False
+        is_stopping = False
         self.watcher.turn(self.step)
-        while self.step < self.steps and self.environments.is_any_alive and not is_asked:
-            is_asked = self._advance()
-            last = self.step == self.steps
-            if self._is_due(METRICS_INTERVAL) or last:
+        while self.step < self.steps and self.environments.is_any_alive and not is_stopping:
+            is_stopping = self._advance()
+            is_last = self.step == self.steps
+            if self._is_due(METRICS_INTERVAL) or is_last:
                 self._record_metrics()
-            looks = self._is_due(LOOK_INTERVAL) or last
-            if looks:
+            is_look_due = self._is_due(LOOK_INTERVAL) or is_last
+            if is_look_due:
                 self._stop_diverged()
             if (due := self._due_evaluation()) is not None:
-                is_asked = self._evaluate(due) or is_asked
-            if looks:
-                is_asked = self._look() or is_asked or should_stop()
+                self._evaluate(due)
+            if is_look_due:
+                self._look()
+                is_stopping = should_stop() or is_stopping
             if self._is_due(self.config.checkpoint_interval):
                 self.save()
+            is_stopping = is_stopping or self.evaluations.wants_stop
         self._finish()
         self.is_over = True
 
@@ -203,18 +205,18 @@ class Loop:
         due = self.step - self.step % interval  # waits for the end of the episode in progress
         return due if due > self.evaluations.step and self.environments.is_at_start else None
 
-    def _evaluate(self, step: int) -> bool:
-        """Begin to evaluate the policies of now, on the task as it was in the last step; return whether to stop."""
-        is_asked = self.evaluations.begin(step, self.learner.networks(), self.step - self._turn)
+    def _evaluate(self, step: int) -> None:
+        """Begin to evaluate the current policies, on the task as it was in the last step."""
+        self.evaluations.begin(step, self.learner.networks(), self.step - self._turn)
         if not self.config.evaluation_environments:  # the training environment has played them
             self.learner.break_off([0], self.step)
             self._observations = self.environments.begin_again()
             self._actions = self.learner.next_actions(self._observations, self.step)
-        return is_asked
 
-    def _look(self) -> bool:
-        """Write what waits, tell how far the seeds are, save by the clock; return whether to stop."""
-        is_asked = self.evaluations.is_over and self.evaluations.settle()
+    def _look(self) -> None:
+        """Write waiting rows, report progress, save by the clock, wait for the next turn on the cores."""
+        if self.evaluations.is_over:
+            self.evaluations.settle()
         for recorder in self.recorders:
             recorder.flush()
         alive = zip(self.runs, self.environments.alive.tolist(), strict=True)
@@ -223,7 +225,6 @@ class Loop:
             self.save()
         if self.step < self.steps:
             self.watcher.turn(self.step)
-        return is_asked
 
     def _finish(self) -> None:
         """Save at the end, or where a stop was asked for; leave the newest policies."""
@@ -278,7 +279,7 @@ class Loop:
         self.watcher.note(text)
 
     def _perturb(self, step: int) -> None:
-        """Have the task as it is in the environment step after the first `step`."""
+        """Apply the perturbations in force after `step` steps."""
         if self._perturbations:
             self.environments.perturb(values_at(self._perturbations, step))
 

@@ -116,7 +116,7 @@ def train(
         import_wandb()
     watch = Watch(reporter, progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(options.get("device", "cpu"))
-    place = None if directory is None else Path(os.path.abspath(directory))  # a task may change where we are
+    place = None if directory is None else Path(os.path.abspath(directory))  # the task may chdir
     wanted = labels(seeds, first_seed)
     source = None
     if start_from is not None and resume and place and all(is_run(place / f"seed-{seed}") for seed in wanted):
@@ -139,7 +139,7 @@ def train(
     runs = RunSet(place, [RunDirectory.open(place / f"seed-{seed}") for seed in wanted])
     try:
         return _run(runs, programs, watch, notes)
-    except InputError:  # such as a script without a guard: once mended, it begins in the same directory
+    except InputError:  # so that the corrected call can use the directory
         _remove_unbegun(place, [run for run in runs.runs if run.seed not in existing])
         raise
 
@@ -176,12 +176,8 @@ def resume(
     watch = Watch(reporter, progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
     algorithm = algorithm_of(config)
-    for run in runs.runs:
-        if steps is not None:
-            wanted = dataclasses.replace(run.config, steps=steps)
-            refuse_differences(run, wanted, algorithm.cadence.has_schedule)
-            with run.locked():
-                run.update_manifest(config=wanted)
+    if steps is not None:
+        _extend(runs, steps, algorithm.cadence.has_schedule)
     existing = {run.seed: run for run in runs.runs}
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
     has_wandb = any((run.path / "wandb").exists() for run in runs.runs)
@@ -199,6 +195,16 @@ def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
             shutil.rmtree(run.path)
     with suppress(OSError):
         place.rmdir()
+
+
+def _extend(runs: RunSet, steps: int, has_schedule: bool) -> None:
+    """Give every run so many steps. Raises InputError before any is changed."""
+    wanted = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
+    for run, config in zip(runs.runs, wanted, strict=True):
+        refuse_differences(run, config, has_schedule)
+    for run, config in zip(runs.runs, wanted, strict=True):
+        with run.locked():
+            run.update_manifest(config=config)
 
 
 def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_schedule: bool) -> dict[int, RunDirectory]:

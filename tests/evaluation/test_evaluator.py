@@ -23,10 +23,10 @@ from csac.evaluation.evaluator import (
     evaluate,
     evaluate_episodes,
 )
+from csac.record.config import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
 from csac.tasks.physics import Noise
 from csac.tasks.registry import Task
-from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 
 

@@ -18,9 +18,9 @@ from csac.console.progress import Reporter
 from csac.evaluation.episode import _number
 from csac.evaluation.evaluator import Evaluator
 from csac.evaluation.play import evaluate_run
+from csac.record.config import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.record.run import RunDirectory
 from csac.record.tables import read_rows
-from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.training.train import resume, train
 from csac.types import InputError
 

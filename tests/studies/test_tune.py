@@ -14,12 +14,12 @@ from studying import write_run
 from csac.algorithms import ALGORITHMS, CSAC, SAC, TD3
 from csac.cli import main
 from csac.console.tables import make_console
-from csac.record.config import RunConfig
+from csac.record.config import TUNING_EVALUATION_SEED, RunConfig
 from csac.record.run import is_run
 from csac.record.sets import RunSet
 from csac.studies import tune as module
 from csac.studies.search import SPACES, Search, draw, space_of
-from csac.studies.tune import EVALUATION_SEED, tune
+from csac.studies.tune import tune
 from csac.training.signals import Interrupted
 from csac.types import InputError
 
@@ -30,7 +30,7 @@ WORDS += ["--actor-hidden-sizes", "8", "--critic-hidden-sizes", "8"]
 
 
 def search(seeds=2, first_seed=1_000, algorithm=None, space=None, **changes):
-    options = {"steps": 1_000, "evaluation_interval": 100, "evaluation_seed": EVALUATION_SEED, **changes}
+    options = {"steps": 1_000, "evaluation_interval": 100, "evaluation_seed": TUNING_EVALUATION_SEED, **changes}
     algorithm = algorithm or SAC(warmup_steps=100, entropy_weight=0.2)
     config = RunConfig(task="Pendulum-v1", algorithm=algorithm.name, seed=first_seed, **options)
     space = space or {"discount": SPACES["sac"]["discount"]}
@@ -141,7 +141,7 @@ def test_trials_begin_with_what_is_given_and_the_best_is_told(tmp_path, trained,
     assert states(tmp_path / "tune") == ["COMPLETE"] * 4
     (first, directory, options), *others = trained.found
     assert (first.discount, directory.name) == (0.99, "trial-0")
-    assert (options["evaluation_seed"], options["resume"], options["device"]) == (EVALUATION_SEED, True, "cpu")
+    assert (options["evaluation_seed"], options["resume"], options["device"]) == (TUNING_EVALUATION_SEED, True, "cpu")
     discounts = [algorithm.discount for algorithm, _, _ in trained.found]
     assert len(set(discounts)) == 4
     best = max(discounts)

@@ -16,9 +16,10 @@ import probes
 import pytest
 from gymnasium import spaces
 
+from csac.record.config import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
 from csac.tasks.failures import EnvironmentFailure, one_line
-from csac.tasks.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED, SeedEnvironments, training_seed
+from csac.tasks.seeds import SeedEnvironments, training_seed
 from csac.types import InputError, Spec
 
 UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)
