@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from benchmarks import checkpoint, gpu, growth, limit, peers, policy, start, stepping
+from benchmarks import checkpoint, gpu, growth, limit, peers, policy, start, stepping, vector
 from benchmarks import set as seeds
 from benchmarks.measuring import usable_cores
 from benchmarks.part import Options, Part, shown
@@ -26,6 +26,7 @@ SUITES = {
     "checkpoint": checkpoint,
     "policy": policy,
     "stepping": stepping,
+    "vector": vector,
 }
 PARTS: list[Part] = [part for suite in SUITES.values() for part in suite.PARTS]
 

@@ -127,13 +127,18 @@ def time_command(command: Sequence[str], cores: int | None = None, **variables: 
 
 
 def csac_command(
-    algorithm: str, *options: str, preset: str = "paper", seeds: int = 1, device: str = "cpu"
+    algorithm: str,
+    *options: str,
+    preset: str = "paper",
+    seeds: int = 1,
+    device: str = "cpu",
+    task: str = stamps.TASK,
 ) -> list[str]:
     """Return `csac train` at a preset's settings, without evaluation, and with a short warm-up."""
     given = {"algorithm": algorithm, "preset": preset, "seeds": seeds, "device": device, "directory": "run"}
     given |= {"steps": NEVER, "evaluation-interval": NEVER} | ({} if algorithm == "ppo" else {"warmup-steps": 250})
     words = [word for name, value in given.items() for word in (f"--{name}", str(value))]
-    return [sys.executable, "-m", "csac", "train", stamps.TASK, *words, *options]
+    return [sys.executable, "-m", "csac", "train", task, *words, *options]
 
 
 def time_training(
@@ -141,9 +146,10 @@ def time_training(
 ) -> dict[str, float]:
     """Train with these commands side by side until the window is over, and return what was measured.
 
-    Its `steps_per_second` are of all seeds together; `start_seconds` go from launch to the first update of every seed;
-    `peak_mib` is the resident memory of all processes, where what they share counts for each; `other_load` is how many
-    cores the rest of the machine, its hypervisor included, kept busy meanwhile.
+    Its `steps_per_second` are of all seeds together, and the `steps` counted took `cpu_seconds` of all processes;
+    `start_seconds` go from launch to the first update of every seed; `peak_mib` is the resident memory of all
+    processes, where what they share counts for each; `other_load` is how many cores the rest of the machine, its
+    hypervisor included, kept busy meanwhile.
 
     Raises:
         ProcessFailure: a command ended before its window did.
@@ -152,12 +158,19 @@ def time_training(
         told = {stamps.FOLDER: written, stamps.EVERY: str(window.every), "XDG_STATE_HOME": written, **variables}
         launched, busy = time.monotonic(), busy_seconds()
         with started(launches, surroundings(device, **told)) as (folder, processes):
+            used = [(launched, 0.0)]  # when, and the CPU seconds by then
             while (speed := speed_of(read_stamps(Path(written)), window, seeds, launched)) is None:
                 if ended := [process for process in processes if process.poll() is not None]:
                     raise failure(folder, ended[0])
+                if time.monotonic() - used[-1][0] > 1.0:  # not often: it takes a hundredth of a second
+                    used.append((time.monotonic(), sum(map(_cpu_seconds, _families(processes)))))
                 time.sleep(0.2)
-            family = [member for process in processes for member in _family(process.pid)]
-            others = busy_seconds() - busy - sum(map(_cpu_seconds, family))
+            family = _families(processes)
+            used.append((time.monotonic(), sum(map(_cpu_seconds, family))))
+            end = min(stamp[-1, 1] for stamp in read_stamps(Path(written)) if stamp[-1, 0] > window.settled)
+            begin_and_end = np.interp([end - speed["seconds"], end], *zip(*used, strict=True))
+            speed["cpu_seconds"] = float(np.diff(begin_and_end)[0])
+            others = busy_seconds() - busy - used[-1][1]
             load = max(0.0, others / (time.monotonic() - launched))
             own = {path.name.partition("-")[0] for path in Path(written).glob("*-*")}
             return {**speed, "processes": len(own), "peak_mib": sum(map(_peak_mib, family)), "other_load": load}
@@ -191,9 +204,9 @@ def busy_seconds() -> float:
     return times.user + times.nice + times.system + times.irq + times.softirq + times.steal
 
 
-def _family(process: int) -> list[psutil.Process]:
-    parent = psutil.Process(process)
-    return [parent, *parent.children(recursive=True)]
+def _families(processes: Sequence[subprocess.Popen]) -> list[psutil.Process]:
+    parents = [psutil.Process(process.pid) for process in processes]
+    return [member for parent in parents for member in (parent, *parent.children(recursive=True))]
 
 
 def _cpu_seconds(process: psutil.Process) -> float:

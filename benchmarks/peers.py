@@ -121,10 +121,12 @@ def _versions() -> str:
     return subprocess.run([PYTHON, "-c", code, *PACKAGES], capture_output=True, text=True, check=True).stdout.strip()
 
 
-def ratios(rows: Sequence[Row], setting: str, contender: str, peer: str) -> list[float]:
-    """Return the ratio of steps per second, one for each repetition that has both."""
+def ratios(
+    rows: Sequence[Row], setting: str, contender: str, peer: str, column: str = "steps_per_second"
+) -> list[float]:
+    """Return the ratio of their speeds, one for each repetition that has both."""
     ours, theirs = (
-        {row["repetition"]: row["steps_per_second"] for row in rows if (row["setting"], row["contender"]) == key}
+        {row["repetition"]: row[column] for row in rows if (row["setting"], row["contender"]) == key}
         for key in ((setting, contender), (setting, peer))
     )
     return [ours[repetition] / theirs[repetition] for repetition in sorted(ours.keys() & theirs.keys())]

@@ -1,8 +1,9 @@
-"""HalfCheetah-v4 with a clock: every library trains on it, and is timed from outside by what it writes.
+"""Tasks with a clock: every library trains on them, and is timed from outside by what they write.
 
 `csac train benchmarks.stamps:Stamped/HalfCheetah-v4` and the peers' script write a line "steps seconds" for every
 `STAMP_EVERY` steps of an environment into a file of its own in the folder `STAMPS`. A step is over, and the update that
-belongs to it, when the next one begins. Only Gymnasium is imported here: the peers have no csac.
+belongs to it, when the next one begins. The peers have no csac: only Gymnasium is imported here, and with the slow task
+PyFlyt and a file of csac's that needs nothing else.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import gymnasium
 
 BASE = "HalfCheetah-v4"
 TASK = f"benchmarks.stamps:Stamped/{BASE}"
+WAYPOINTS = "benchmarks.stamps:Stamped/QuadX-Waypoints-v1"
 FOLDER, EVERY = "STAMPS", "STAMP_EVERY"  # environment variables
 
 _numbers = itertools.count()
@@ -44,4 +46,14 @@ def make(**arguments: Any) -> gymnasium.Env:
     return Stamped(gymnasium.make(BASE, **arguments))
 
 
+def make_waypoints(**arguments: Any) -> gymnasium.Env:
+    """Return a new slow environment with a clock, its observation flat."""
+    import PyFlyt.gym_envs  # noqa: F401
+
+    from csac.tasks.pybullet import FlatWaypoints
+
+    return Stamped(FlatWaypoints(gymnasium.make("PyFlyt/QuadX-Waypoints-v1", **arguments)))
+
+
 gymnasium.register(f"Stamped/{BASE}", entry_point="benchmarks.stamps:make")
+gymnasium.register("Stamped/QuadX-Waypoints-v1", entry_point="benchmarks.stamps:make_waypoints")

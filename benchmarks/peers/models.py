@@ -5,7 +5,7 @@ from importlib import import_module
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 OFF_POLICY = {
     "learning_rate": 3e-4,
@@ -38,12 +38,16 @@ SCALES = {"norm_obs": True, "norm_reward": True, "clip_obs": 10.0, "clip_reward"
 
 
 def make_model(library, algorithm, environment, seed, learning_starts, entropy_weight=0.2):
-    """Return the model: `library` is sb3 or sbx, `algorithm` sac, td3 or ppo; an `auto` entropy weight begins at 1."""
+    """Return the model: `library` is sb3 or sbx, `algorithm` sac, td3 or ppo; an `auto` entropy weight begins at 1.
+
+    PPO takes several environments too, as a `VecEnv`: its rollouts have the same steps of all.
+    """
     module = import_module({"sb3": "stable_baselines3", "sbx": "sbx"}[library])
     common = {"seed": seed, "device": "cpu"}
     if algorithm == "ppo":
-        scaled = VecNormalize(DummyVecEnv([lambda: Monitor(environment)]), **SCALES)
-        return module.PPO("MlpPolicy", scaled, **PPO, **common)
+        several = environment if isinstance(environment, VecEnv) else DummyVecEnv([lambda: Monitor(environment)])
+        rollout = {**PPO, "n_steps": PPO["n_steps"] // several.num_envs}
+        return module.PPO("MlpPolicy", VecNormalize(several, **SCALES), **rollout, **common)
     common["learning_starts"] = learning_starts
     if algorithm == "td3":
         shape = environment.action_space.shape
