@@ -168,7 +168,8 @@ def time_training(
             family = _families(processes)
             used.append((time.monotonic(), sum(map(_cpu_seconds, family))))
             end = min(stamp[-1, 1] for stamp in read_stamps(Path(written)) if stamp[-1, 0] > window.settled)
-            begin_and_end = np.interp([end - speed["seconds"], end], *zip(*used, strict=True))
+            times, seconds = zip(*used, strict=True)
+            begin_and_end = np.interp([end - speed["seconds"], end], times, seconds)
             speed["cpu_seconds"] = float(np.diff(begin_and_end)[0])
             others = busy_seconds() - busy - used[-1][1]
             load = max(0.0, others / (time.monotonic() - launched))

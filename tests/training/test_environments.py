@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,7 @@ from csac.algorithms import PPO, SAC
 from csac.algorithms.memory import unpack
 from csac.algorithms.ppo import value_at
 from csac.record.run import RunDirectory
+from csac.tasks import workers
 from csac.tasks.seeds import SeedEnvironments, training_seed
 from csac.types import Cadence, Spec
 
@@ -162,9 +164,20 @@ def test_the_death_of_a_process_is_the_failure_of_its_seeds():
     assert not environments.is_any_alive
 
 
+def test_processes_are_chosen_by_cores_and_by_what_a_step_costs(monkeypatch):
+    monkeypatch.setattr(workers, "SECONDS_THAT_PAY", 0.0)
+    assert [workers.choose_processes(probes.Endless, {}, *given) for given in ((8, 2), (2, 4), (8, 1), (1, 8))] == [
+        *(2, 2, 0, 0)
+    ]
+    assert workers.choose_processes(probes.Failing, {}, 8, 2) == 0  # it fails where its failure is told
+    monkeypatch.setattr(workers, "SECONDS_THAT_PAY", 60.0)
+    assert workers.choose_processes(probes.Endless, {}, 8, 2) == 0
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"task": lambda: gymnasium.make_vec("Hopper-v4", 2)}, "makes several environments at once"),
         ({"steps": 502}, "multiple of environments"),
         ({"algorithm": PPO(rollout_steps=66, minibatches=2), "steps": 500}, "environments must divide rollout_steps"),
         ({"environment_processes": 5}, "environment_processes"),
