@@ -74,7 +74,8 @@ def measure(case: Case, options: Options) -> list[Row]:
 def window(case: Case, options: Options) -> Window:
     """Return when steps are counted, those of each environment: PPO's windows are whole rollouts with their updates."""
     if case.setting == SAC:
-        return Window(options.lasting(5.0), warmup=250, settled=-(-500 // case.environments), every=20)
+        warmup, settled = (-(-steps // case.environments) for steps in (250, 500))
+        return Window(options.lasting(5.0), warmup, settled, every=20)
     turns = ROLLOUT_STEPS // case.environments
     return Window(options.lasting(5.0), warmup=turns, settled=turns, every=turns)
 
