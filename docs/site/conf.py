@@ -34,6 +34,9 @@ autodoc_default_options = {"members": True}
 
 # The side of each page. What stands in docs/ and in no list comes last, so that a new page is seen at once.
 NAVIGATION = {
+    "Tutorials": [
+        f"docs/tutorials/{name}" for name in ("first-controller", "your-own-environment", "from-training-to-a-robot")
+    ],
     "Use": [
         "docs/python",
         "docs/saving-and-resuming",
