@@ -13,6 +13,17 @@ if TYPE_CHECKING:
 
     from csac.types import Algorithm
 
+# Actor and critics have the same activation, and no layer norm.
+_ALIKE: Mapping[str, Any] = MappingProxyType(
+    {
+        "actor_activation": None,
+        "critic_activation": None,
+        "layer_norm": False,
+        "actor_layer_norm": None,
+        "critic_layer_norm": None,
+    }
+)
+
 # The paper's "Common hyper-parameter settings of compared approaches": its columns CSAC, SAC and TD3 are equal.
 _PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
     {
@@ -30,6 +41,8 @@ _PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
         "update_interval": 1,
         "max_gradient_norm": 0.0,
         "learning_rate_schedule": "constant",
+        "activation": "relu",
+        **_ALIKE,
     }
 )
 
@@ -65,6 +78,8 @@ _PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "learning_rate": 3e-4,
             "learning_rate_schedule": "linear",
             "hidden_sizes": (64, 64),
+            "activation": "tanh",
+            **_ALIKE,
             "discount": 0.99,
             "trace_decay": 0.95,
             "rollout_steps": 2048,

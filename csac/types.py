@@ -11,6 +11,9 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = Any  # a JAX array while learning, a NumPy array in what leaves
 Metrics: TypeAlias = dict[str, Any]  # name -> scalar JAX array
+Activation: TypeAlias = Literal["relu", "tanh", "elu", "silu", "gelu"]  # gelu: with tanh, as in its paper
+
+LAYER_NORM_EPSILON = 1e-5  # added to variances, as by PyTorch
 
 
 class InputError(ValueError):
@@ -46,10 +49,16 @@ class Transition(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """One affine layer: `x @ weight + bias`."""
+    """One affine layer, h = x @ weight + bias.
+
+    A hidden one may have layer norm before its activation (Ba et al. 2016): scale * (h - mean) / √(var + ε) + shift,
+    with the mean and the variance of its own outputs.
+    """
 
     weight: Array  # [in, out]
     bias: Array  # [out]
+    scale: Array | None = None  # [out]
+    shift: Array | None = None  # [out]
 
 
 class Normaliser(NamedTuple):
@@ -63,8 +72,8 @@ class Normaliser(NamedTuple):
 class PolicyParameters(NamedTuple):
     """The arrays of a policy.
 
-    With several actors there is one critic for each, an MLP with ReLU from (observation, action) to [1]: the action
-    taken is the one that its own actor's critic values most, the first of equals.
+    With several actors there is one critic for each, an MLP from (observation, action) to [1]: the action taken is the
+    one that its own actor's critic values most, the first of equals.
     """
 
     actors: tuple[tuple[Layer, ...], ...]
@@ -83,8 +92,9 @@ class PolicyNetwork(NamedTuple):
     """
 
     parameters: PolicyParameters
-    activation: Literal["relu", "tanh"] = "relu"
+    activation: Activation = "relu"
     head: Literal["tanh_gaussian", "tanh", "clipped_gaussian"] = "tanh_gaussian"
+    critic_activation: Activation = "relu"
 
 
 class Snapshot(NamedTuple):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms.networks import MLP, gradient_step, make_mlp
+from csac.algorithms.networks import MLP, PLAIN, Hidden, gradient_step, make_mlp
 from csac.algorithms.normalisation import Moments, fold, normalised_pass
 from csac.algorithms.shapes import Action, Actions, Key, Observation, Scalar
 from csac.types import Metrics, Spec, Transition
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 Critics: TypeAlias = tuple[MLP, MLP]
 
 
-def make_critic(key: Key, spec: Spec, hidden_sizes: Sequence[int]) -> MLP:
+def make_critic(key: Key, spec: Spec, hidden_sizes: Sequence[int], hidden: Hidden = PLAIN) -> MLP:
     """Return one random critic, a map from [observation + action] to [1]."""
-    return make_mlp(key, spec.observation_size + spec.action_size, hidden_sizes, 1)
+    return make_mlp(key, spec.observation_size + spec.action_size, hidden_sizes, 1, hidden)
 
 
-def make_critics(key: Key, spec: Spec, hidden_sizes: Sequence[int]) -> Critics:
+def make_critics(key: Key, spec: Spec, hidden_sizes: Sequence[int], hidden: Hidden = PLAIN) -> Critics:
     """Return two independent critics."""
     first_key, second_key = jax.random.split(key)
-    return make_critic(first_key, spec, hidden_sizes), make_critic(second_key, spec, hidden_sizes)
+    return make_critic(first_key, spec, hidden_sizes, hidden), make_critic(second_key, spec, hidden_sizes, hidden)
 
 
 def q_value(critic: MLP, observation: Observation, action: Action) -> Scalar:

@@ -12,38 +12,60 @@ import optax
 from jaxtyping import Array, Float
 
 from csac.algorithms.shapes import Count, Key, Scalar
-from csac.types import Layer, Metrics
+from csac.types import LAYER_NORM_EPSILON, Activation, Layer, Metrics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
 BATCH = "batch"  # the axis of examples, for losses that look at a whole batch
 
+ACTIVATIONS = {
+    "relu": jax.nn.relu,
+    "tanh": jnp.tanh,
+    "elu": jax.nn.elu,
+    "silu": jax.nn.silu,
+    "gelu": partial(jax.nn.gelu, approximate=True),
+}
+
 Schedule: TypeAlias = Literal["constant", "linear", "cosine"]
 
 
+class Hidden(NamedTuple):
+    """What a hidden layer does with its affine outputs."""
+
+    activation: Activation = "relu"
+    layer_norm: bool = False
+
+
+PLAIN = Hidden()
+
+
 class MLP(eqx.Module):
-    """A multilayer perceptron with ReLU or tanh between its layers, for one example."""
+    """A multilayer perceptron for one example."""
 
     layers: tuple[Layer, ...]
-    activation: Literal["relu", "tanh"] = eqx.field(static=True, default="relu")
+    activation: Activation = eqx.field(static=True, default="relu")
 
     def __call__(self, inputs: Float[Array, " in"]) -> Float[Array, " out"]:
         """Return the last layer's outputs, which have no activation."""
         for layer in self.layers[:-1]:
-            inputs = self.activate(inputs @ layer.weight + layer.bias)
+            inputs = self.activate(layer, inputs @ layer.weight + layer.bias)
         return inputs @ self.layers[-1].weight + self.layers[-1].bias
 
-    def activate(self, values: Float[Array, " width"]) -> Float[Array, " width"]:
-        """Return what a hidden layer passes on."""
-        return jax.nn.relu(values) if self.activation == "relu" else jnp.tanh(values)
+    def activate(self, layer: Layer, values: Float[Array, " width"]) -> Float[Array, " width"]:
+        """Return what a hidden layer passes on of its affine outputs."""
+        if layer.scale is not None:
+            centred = values - jnp.mean(values)
+            values = centred / jnp.sqrt(jnp.mean(centred**2) + LAYER_NORM_EPSILON) * layer.scale + layer.shift
+        return ACTIVATIONS[self.activation](values)
 
 
-def make_mlp(key: Key, input_size: int, hidden_sizes: Sequence[int], output_size: int) -> MLP:
+def make_mlp(key: Key, input_size: int, hidden_sizes: Sequence[int], output_size: int, hidden: Hidden = PLAIN) -> MLP:
     """Return an MLP with weights and biases uniform in ±1/sqrt(inputs), as PyTorch (and so SB3) draws them."""
     sizes = (input_size, *hidden_sizes, output_size)
     keys = jax.random.split(key, len(sizes) - 1)
-    return MLP(tuple(_make_layer(k, n_in, n_out) for k, n_in, n_out in zip(keys, sizes[:-1], sizes[1:], strict=True)))
+    layers = [_make_layer(k, n_in, n_out) for k, n_in, n_out in zip(keys, sizes[:-1], sizes[1:], strict=True)]
+    return MLP(_normed(layers, hidden), hidden.activation)
 
 
 def _make_layer(key: Key, n_in: int, n_out: int) -> Layer:
@@ -53,10 +75,20 @@ def _make_layer(key: Key, n_in: int, n_out: int) -> Layer:
     return Layer(weight, jax.random.uniform(bias_key, (n_out,), minval=-bound, maxval=bound))
 
 
+def _normed(layers: Sequence[Layer], hidden: Hidden) -> tuple[Layer, ...]:
+    """Return the layers, the hidden ones with layer norm where that is asked for."""
+    if not hidden.layer_norm:
+        return tuple(layers)
+    normed = (
+        layer._replace(scale=jnp.ones_like(layer.bias), shift=jnp.zeros_like(layer.bias)) for layer in layers[:-1]
+    )
+    return *normed, layers[-1]
+
+
 def make_orthogonal_mlp(
-    key: Key, input_size: int, hidden_sizes: Sequence[int], output_size: int, output_gain: float
+    key: Key, input_size: int, hidden_sizes: Sequence[int], output_size: int, hidden: Hidden, output_gain: float
 ) -> MLP:
-    """Return an MLP with tanh, orthogonal weights of gain √2 (`output_gain` in the last layer) and no biases yet."""
+    """Return an MLP with orthogonal weights of gain √2 (`output_gain` in the last layer) and no biases yet."""
     sizes = (input_size, *hidden_sizes, output_size)
     gains = (2.0**0.5,) * len(hidden_sizes) + (output_gain,)
     keys = jax.random.split(key, len(gains))
@@ -64,7 +96,7 @@ def make_orthogonal_mlp(
         Layer(jax.nn.initializers.orthogonal(gain)(k, (n_in, n_out)), jnp.zeros(n_out))
         for k, gain, n_in, n_out in zip(keys, gains, sizes[:-1], sizes[1:], strict=True)
     ]
-    return MLP(tuple(layers), activation="tanh")
+    return MLP(_normed(layers, hidden), hidden.activation)
 
 
 def polyak(targets: Any, sources: Any, rate: float) -> Any:

@@ -41,7 +41,7 @@ def moments_of(inputs: Sequence[Float[Array, " in"]], centred: bool = True) -> M
 def fold_layer(layer: Layer, moments: Moments) -> Layer:
     """Return the layer x ↦ [(x - mean) / √(variance + ε)] W + b as one affine layer of x."""
     weight = layer.weight / jnp.sqrt(moments.variance + EPSILON)[:, None]
-    return Layer(weight, layer.bias - moments.mean @ weight)
+    return layer._replace(weight=weight, bias=layer.bias - moments.mean @ weight)
 
 
 def fold(network: MLP, moments: Sequence[Moments]) -> MLP:
@@ -67,7 +67,7 @@ def normalised_pass(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> Pass
     moments, folded = [], []
     for layer in network.layers:
         if folded:
-            inputs = [network.activate(values) for values in inputs]
+            inputs = [network.activate(folded[-1], values) for values in inputs]
         moments.append(moments_of(inputs, centred=layer is not network.layers[-1]))
         folded.append(fold_layer(layer, moments[-1]))
         inputs = [values @ folded[-1].weight + folded[-1].bias for values in inputs]

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from csac.algorithms.architecture import Architecture
 from csac.algorithms.critics import make_critics
 from csac.algorithms.hyperparameters import (
     COUNT,
@@ -35,7 +36,7 @@ UPDATES = Limit(lambda value: 0.01 <= value <= 1_000, "from 0.01 to 1,000")
 
 
 @dataclass(frozen=True)
-class OffPolicy:
+class OffPolicy(Architecture):
     """What CSAC, SAC, TD3 and SD3 share."""
 
     discount: Annotated[float, DISCOUNT] = 0.99
@@ -126,8 +127,8 @@ class TwinCritics(OffPolicy):
         planned = self.updates(spec, steps)
         actor_adam = self.optimiser(self.actor_learning_rate, planned // self.policy_delay)
         actor_key, critics_key = jax.random.split(key)
-        actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, actor_outputs)
-        critics = make_critics(critics_key, spec, self.critic_hidden_sizes)
+        actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, actor_outputs, self.actor_hidden)
+        critics = make_critics(critics_key, spec, self.critic_hidden_sizes, self.critic_hidden)
         return {
             "actor": actor,
             "critics": critics,
@@ -160,4 +161,6 @@ def improve_delayed(
 
 def policy_network(actor: MLP, statistics: Statistics | None, head: Literal["tanh_gaussian", "tanh"]) -> PolicyNetwork:
     """Return the actor's layers, and what it sees observations by."""
-    return PolicyNetwork(PolicyParameters((actor.layers,), normaliser=normaliser_of(statistics)), head=head)
+    return PolicyNetwork(
+        PolicyParameters((actor.layers,), normaliser=normaliser_of(statistics)), actor.activation, head
+    )

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
+from csac.algorithms.architecture import Architecture
 from csac.algorithms.distributions import Gaussian
 from csac.algorithms.hyperparameters import (
     COUNT,
@@ -34,7 +35,17 @@ from csac.algorithms.networks import (
 from csac.algorithms.returns import advantages_of, discounted_returns, explained_variance
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar, Scalars
 from csac.algorithms.statistics import EPSILON, Statistics, normalise
-from csac.types import Cadence, InputError, Metrics, Normaliser, PolicyNetwork, PolicyParameters, Spec, Transition
+from csac.types import (
+    Activation,
+    Cadence,
+    InputError,
+    Metrics,
+    Normaliser,
+    PolicyNetwork,
+    PolicyParameters,
+    Spec,
+    Transition,
+)
 
 
 class Parameters(NamedTuple):
@@ -68,7 +79,7 @@ class Sample(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PPO:
+class PPO(Architecture):
     """Proximal Policy Optimisation."""
 
     learning_rate: Annotated[float, POSITIVE] = 3e-4
@@ -100,7 +111,9 @@ class PPO:
     normalise_advantages: bool = True
     """Whether to normalise the advantages of each minibatch to mean 0 and standard deviation 1."""
     hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (64, 64)
-    """Widths of the hidden layers, with tanh, of the actor and of the critic."""
+    """Widths of the hidden layers of the actor and of the critic."""
+    activation: Activation = "tanh"
+    """Activation of the hidden layers."""
     normalise_observations: bool = True
     """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
     normalise_rewards: bool = True
@@ -237,9 +250,10 @@ class PPO:
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return random networks, a policy near N(0, 1) everywhere, and statistics of nothing."""
         actor_key, critic_key = jax.random.split(key)
+        sizes = spec.observation_size, self.hidden_sizes
         parameters = Parameters(
-            actor=make_orthogonal_mlp(actor_key, spec.observation_size, self.hidden_sizes, spec.action_size, 0.01),
-            critic=make_orthogonal_mlp(critic_key, spec.observation_size, self.hidden_sizes, 1, 1.0),
+            actor=make_orthogonal_mlp(actor_key, *sizes, spec.action_size, self.actor_hidden, 0.01),
+            critic=make_orthogonal_mlp(critic_key, *sizes, 1, self.critic_hidden, 1.0),
             log_std=jnp.zeros(spec.action_size),
         )
         return State(

@@ -131,8 +131,9 @@ class SD3(OffPolicy):
     def _make_pair(self, key: Key, spec: Spec, steps: int) -> Pair:
         planned = self.updates(spec, steps)
         actor_key, critic_key = jax.random.split(key)
-        actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, spec.action_size)
-        critic = make_critic(critic_key, spec, self.critic_hidden_sizes)
+        widths = self.actor_hidden_sizes
+        actor = make_mlp(actor_key, spec.observation_size, widths, spec.action_size, self.actor_hidden)
+        critic = make_critic(critic_key, spec, self.critic_hidden_sizes, self.critic_hidden)
         return Pair(
             actor=actor,
             critic=critic,
@@ -159,7 +160,7 @@ class SD3(OffPolicy):
         parameters = PolicyParameters(
             tuple(actor.layers for actor in actors), tuple(critic.layers for critic in critics)
         )
-        return PolicyNetwork(parameters, head="tanh")
+        return PolicyNetwork(parameters, actors[0].activation, "tanh", critics[0].activation)
 
 
 def softmax_operator(

@@ -47,6 +47,7 @@ def header(policy: Policy, guards: Guards, control_rate: float | None) -> str:
     """Return the header that runs a policy."""
     contract, (observation_size, action_size) = policy.contract, policy.contract.spec[:2]
     parameters = deterministic(policy.network.parameters, action_size)
+    networks = parameters.actors + parameters.critics
     tensors = to_tensors(parameters) | {
         "low": contract.action_low,
         "high": contract.action_high,
@@ -70,7 +71,9 @@ def header(policy: Policy, guards: Guards, control_rate: float | None) -> str:
         actors=parameters.actors,
         critics=parameters.critics,
         activation=contract.activation,
-        activations=sorted({contract.activation, "relu"} if parameters.critics else {contract.activation}),
+        critic_activation=contract.critic_activation,
+        activations=sorted({contract.activation, *([contract.critic_activation] if parameters.critics else [])}),
+        has_layer_norm=any(layer.scale is not None for layers in networks for layer in layers),
         is_clipped=contract.head == "clipped_gaussian",
         has_normaliser=parameters.normaliser is not None,
     )

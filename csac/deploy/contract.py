@@ -15,7 +15,7 @@ import numpy as np
 
 from csac.checks import without_controls
 from csac.record.files import write_atomically
-from csac.types import InputError, Spec
+from csac.types import Activation, InputError, Spec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,7 +25,6 @@ SCHEMA_VERSION = 2
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 BOUNDS_ROUNDING = 1e-6  # of a bound: a few times what float32 rounds by
 
-Activation = Literal["relu", "tanh"]
 Head = Literal["tanh_gaussian", "tanh", "clipped_gaussian"]
 
 
@@ -62,6 +61,7 @@ class Contract:
     action_shape: tuple[int, ...]
     action_low: np.ndarray
     action_high: np.ndarray
+    critic_activation: Activation = "relu"
 
     @property
     def spec(self) -> Spec:
@@ -104,6 +104,7 @@ class Contract:
             "algorithm": self.algorithm,
             "activation": self.activation,
             "head": self.head,
+            **({} if self.critic_activation == "relu" else {"critic_activation": self.critic_activation}),
             "observation_parts": [{"key": key, "shape": list(shape)} for key, shape in self.observation_parts],
             "action_shape": list(self.action_shape),
             "action_low": self.action_low.tolist(),
@@ -154,7 +155,8 @@ def _flat(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray | None:
 def _contract(fields: Any) -> Contract:
     if fields["schema_version"] != SCHEMA_VERSION:
         raise ValueError(f"schema_version {fields['schema_version']!r} where this csac reads {SCHEMA_VERSION}")
-    names = {"activation": get_args(Activation), "head": get_args(Head)}
+    fields = {"critic_activation": "relu", **fields}
+    names = {"activation": get_args(Activation), "critic_activation": get_args(Activation), "head": get_args(Head)}
     for name, known in names.items():
         if fields[name] not in known:
             raise ValueError(f"{name} {fields[name]!r} is not known")
@@ -169,9 +171,8 @@ def _contract(fields: Any) -> Contract:
         raise ValueError("action bounds and action_shape disagree")
     if not (np.isfinite([low, high]).all() and (low <= high).all()):
         raise ValueError("action bounds are not finite or not in order")
-    return Contract(
-        fields["task"], fields["algorithm"], fields["activation"], fields["head"], parts, action_shape, low, high
-    )
+    given = {name: fields[name] for name in ("task", "algorithm", *names)}
+    return Contract(**given, observation_parts=parts, action_shape=action_shape, action_low=low, action_high=high)
 
 
 def _shape(numbers: Any) -> tuple[int, ...]:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.deploy.parameters import deterministic
-from csac.types import InputError
+from csac.deploy.policy import GELU_CUBE, GELU_SCALE
+from csac.types import LAYER_NORM_EPSILON, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -123,9 +124,25 @@ class _Graph:
 
     def network(self, layers: tuple[Layer, ...], inputs: str, activation: str) -> str:
         """Return the output of an MLP."""
-        for index, (weight, bias) in enumerate(layers):
-            inputs = self.add("Gemm", [inputs if index == 0 else self.add(activation, [inputs]), weight, bias])
+        for index, (weight, bias, scale, shift) in enumerate(layers):
+            inputs = inputs if index == 0 else self.activated(inputs, activation)
+            inputs = self.add("Gemm", [inputs, weight, bias])
+            if scale is not None:
+                inputs = self.add("LayerNormalization", [inputs, scale, shift], epsilon=LAYER_NORM_EPSILON)
         return inputs
+
+    def activated(self, name: str, activation: str) -> str:
+        """Return the activation of values; this version of ONNX has no SiLU and no GELU."""
+        match activation:
+            case "silu":
+                return self.add("Mul", [name, self.add("Sigmoid", [name])])
+            case "gelu":
+                cube = self.add("Mul", [self.add("Mul", [name, name]), self.add("Mul", [name, GELU_CUBE])])
+                inner = self.add("Mul", [self.add("Add", [name, cube]), GELU_SCALE])
+                return self.add(
+                    "Mul", [self.add("Mul", [name, 0.5]), self.add("Add", [self.add("Tanh", [inner]), 1.0])]
+                )
+        return self.add(activation.capitalize(), [name])
 
     def is_finite(self, name: str) -> str:
         """Return whether all numbers of a row are finite, [n, 1]."""
@@ -140,12 +157,12 @@ def _action(graph: _Graph, policy: Policy) -> str:
     if (normaliser := parameters.normaliser) is not None:
         inputs = graph.add("Div", [graph.add("Sub", [inputs, normaliser.mean]), normaliser.std])
         inputs = graph.clip(inputs, -normaliser.limit, normaliser.limit)
-    actions = [graph.network(layers, inputs, contract.activation.capitalize()) for layers in parameters.actors]
+    actions = [graph.network(layers, inputs, contract.activation) for layers in parameters.actors]
     is_clipped = contract.head == "clipped_gaussian"
     actions = [graph.clip(name, -1.0, 1.0) if is_clipped else graph.add("Tanh", [name]) for name in actions]
     action, best = actions[0], ""
     for layers, candidate in zip(parameters.critics, actions, strict=bool(parameters.critics)):
-        value = graph.network(layers, graph.add("Concat", [inputs, candidate], axis=1), "Relu")
+        value = graph.network(layers, graph.add("Concat", [inputs, candidate], axis=1), contract.critic_activation)
         if best:
             # As for NumPy, a NaN is above all: what goes wrong is for the guards to see.
             is_first_nan = graph.add("And", [graph.add("IsNaN", [value]), graph.add("Equal", [best, best])])

@@ -38,6 +38,7 @@ def to_tensors(parameters: PolicyParameters) -> dict[str, Any]:
         for number, layers in enumerate(networks)
         for index, layer in enumerate(layers)
         for name, array in layer._asdict().items()
+        if array is not None
     }
     if parameters.normaliser is not None:
         tensors |= {f"normaliser.{name}": array for name, array in parameters.normaliser._asdict().items()}
@@ -62,6 +63,6 @@ def _networks(tensors: Mapping[str, np.ndarray], kind: str) -> Networks:
     while (prefix := f"{kind}.{len(networks)}") + ".0.weight" in tensors:
         layers: list[Layer] = []
         while (name := f"{prefix}.{len(layers)}") + ".weight" in tensors and name + ".bias" in tensors:
-            layers.append(Layer(tensors[name + ".weight"], tensors[name + ".bias"]))
+            layers.append(Layer(*(tensors.get(f"{name}.{part}") for part in Layer._fields)))
         networks.append(tuple(layers))
     return tuple(networks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,13 +12,14 @@ import safetensors.numpy
 from csac.checks import check_flag, check_path
 from csac.deploy.contract import CONTRACT, Contract, check_checksum, read_json, write_with_checksum
 from csac.deploy.parameters import copied, from_tensors, to_tensors
-from csac.types import InputError, Layer, Normaliser, PolicyNetwork
+from csac.types import LAYER_NORM_EPSILON, InputError, Layer, Normaliser, PolicyNetwork
 
 if TYPE_CHECKING:
-    from csac.deploy.contract import Activation
+    from csac.types import Activation
 
 POLICY = "policy.safetensors"  # in the folder of a policy that was saved by itself, and of an artefact
 LOG_STD_RANGE = (-20.0, 2.0)
+GELU_SCALE, GELU_CUBE = (2 / math.pi) ** 0.5, 0.044715  # Hendrycks and Gimpel 2016, section 2
 
 _STREAM = 0x706F6C69  # far from what a task that spawns generators of its own would use: 0, 1, 2, ...
 
@@ -54,7 +56,8 @@ class Policy:
     def _check(self) -> None:
         """Raise InputError if the layers do not fit each other or the contract."""
         (observation_size, action_size), network = self.contract.spec[:2], self.network
-        if (network.activation, network.head) != (self.contract.activation, self.contract.head):
+        kinds = (network.activation, network.head, network.critic_activation)
+        if kinds != (self.contract.activation, self.contract.head, self.contract.critic_activation):
             raise InputError(f"the policy is {network.activation}/{network.head}, not as its contract says")
         try:
             given = np.zeros((1, observation_size), np.float32), False, np.zeros((1, action_size), np.float32)
@@ -109,7 +112,7 @@ class Policy:
                 return self._action(self._actors[0], inputs, noise)[None], None
             actions = [self._action(actor, inputs, noise) for actor in self._actors]
             values = [
-                _outputs(critic, np.concatenate([inputs, action], axis=1))[:, 0]
+                _outputs(critic, np.concatenate([inputs, action], axis=1), self.network.critic_activation)[:, 0]
                 for critic, action in zip(self.network.parameters.critics, actions, strict=True)
             ]
             return np.stack(actions), np.stack(values)
@@ -168,7 +171,8 @@ class Policy:
             with safetensors.safe_open(path, "numpy") as file:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
                 step = (file.metadata() or {}).get("step")
-            network = PolicyNetwork(from_tensors(tensors), agreement.activation, agreement.head)
+            kinds = agreement.activation, agreement.head, agreement.critic_activation
+            network = PolicyNetwork(from_tensors(tensors), *kinds)
             return Policy(network, agreement, seed, None if step is None else int(step))
         except (safetensors.SafetensorError, ValueError) as error:  # InputError is a ValueError
             raise InputError(f"{path} is not a policy of {place.name} ({error}): restore both from a copy") from error
@@ -183,7 +187,7 @@ class _Actor(NamedTuple):
 
 
 def _split_actor(layers: tuple[Layer, ...], contract: Contract) -> _Actor:
-    (weight, bias), size = layers[-1], contract.spec.action_size
+    weight, bias, size = *layers[-1][:2], contract.spec.action_size
     mean = Layer(np.ascontiguousarray(weight[:, :size]), bias[:size])
     return _Actor(layers[:-1], mean, Layer(np.ascontiguousarray(weight[:, size:]), bias[size:]))
 
@@ -195,15 +199,32 @@ def _normalised(observations: np.ndarray, normaliser: Normaliser) -> np.ndarray:
 
 def _hidden(layers: tuple[Layer, ...], inputs: np.ndarray, activation: Activation) -> np.ndarray:
     """Return the activations [n, width] after the last of these layers."""
-    for weight, bias in layers:
-        inputs = inputs @ weight
-        inputs += bias
-        if activation == "relu":
-            np.maximum(inputs, 0, out=inputs)
-        else:
-            np.tanh(inputs, out=inputs)
+    for layer in layers:
+        inputs = inputs @ layer.weight
+        inputs += layer.bias
+        if layer.scale is not None:
+            inputs -= inputs.mean(axis=1, keepdims=True)
+            inputs /= np.sqrt((inputs**2).mean(axis=1, keepdims=True) + LAYER_NORM_EPSILON)
+            inputs *= layer.scale
+            inputs += layer.shift
+        inputs = _activated(inputs, activation)
     return inputs
 
 
-def _outputs(layers: tuple[Layer, ...], inputs: np.ndarray) -> np.ndarray:
-    return _hidden(layers[:-1], inputs, "relu") @ layers[-1].weight + layers[-1].bias
+def _activated(values: np.ndarray, activation: Activation) -> np.ndarray:
+    """Return the activation of `values`, which may be overwritten."""
+    match activation:
+        case "relu":
+            return np.maximum(values, 0, out=values)
+        case "tanh":
+            return np.tanh(values, out=values)
+        case "elu":
+            return np.where(values > 0, values, np.expm1(values))
+        case "silu":
+            return values / (1 + np.exp(-values))
+        case "gelu":
+            return 0.5 * values * (1 + np.tanh(GELU_SCALE * (values + GELU_CUBE * values**3)))
+
+
+def _outputs(layers: tuple[Layer, ...], inputs: np.ndarray, activation: Activation) -> np.ndarray:
+    return _hidden(layers[:-1], inputs, activation) @ layers[-1].weight + layers[-1].bias

@@ -26,7 +26,11 @@ if TYPE_CHECKING:
     from csac.training.config import TrainOptions
 
 # What a checkpoint's networks and optimisers are made for.
-_LEARNT_WITH = ("normalise_observations", "learning_rate_schedule")
+_KINDS = ("activation", "layer_norm")
+_LEARNT_WITH = (
+    *("normalise_observations", "learning_rate_schedule"),
+    *(f"{network}{kind}" for network in ("", "actor_", "critic_") for kind in _KINDS),
+)
 
 # What may differ when a run goes on; with any other value it would be another run.
 _MAY_DIFFER = ("steps", "device", "checkpoint_interval", "keep_checkpoints")

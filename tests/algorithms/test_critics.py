@@ -58,22 +58,22 @@ def test_moments_about_zero():
 def test_a_folded_layer_normalises_its_inputs():
     # Standard deviations 2 and 0.5: (6 - 4) / 2 · 2 + (1 - 2) / 0.5 · 3 + 1 = 2 - 6 + 1
     moments = Moments(jnp.array([4.0, 2.0]), jnp.array([4.0, 0.25]) - EPSILON)
-    weight, bias = fold_layer(Layer(jnp.array([[2.0], [3.0]]), jnp.array([1.0])), moments)
+    weight, bias, *_ = fold_layer(Layer(jnp.array([[2.0], [3.0]]), jnp.array([1.0])), moments)
     assert float((jnp.array([6.0, 1.0]) @ weight + bias)[0]) == pytest.approx(-3.0)
 
 
 def test_a_unit_that_is_silent_in_the_batch_is_not_blown_up():
-    weight, _ = fold_layer(Layer(jnp.ones((1, 1)), jnp.zeros(1)), Moments(jnp.zeros(1), jnp.zeros(1)))
+    weight, *_ = fold_layer(Layer(jnp.ones((1, 1)), jnp.zeros(1)), Moments(jnp.zeros(1), jnp.zeros(1)))
     assert float(weight[0, 0]) == pytest.approx(1 / math.sqrt(1e-3))
 
 
 def normalised_values(critic: Any, inputs: Any) -> Any:
     """What one critic says of inputs [example, in], each layer's at mean 0, but for the last's, and mean square 1."""
-    for weight, bias in critic.layers[:-1]:
+    for weight, bias, *_ in critic.layers[:-1]:
         inputs = inputs - inputs.mean(0, keepdims=True)
         inputs = inputs / jnp.sqrt((inputs**2).mean(0, keepdims=True) + EPSILON)
         inputs = jnp.maximum(inputs @ weight + bias[None], 0.0)
-    weight, bias = critic.layers[-1]
+    weight, bias, *_ = critic.layers[-1]
     return (inputs / jnp.sqrt((inputs**2).mean(0, keepdims=True) + EPSILON) @ weight + bias[None])[:, 0]
 
 

@@ -10,13 +10,14 @@ import sys
 import numpy as np
 import pytest
 from artefacts import exported, leave, needs_compiler, observations, together
-from policies import ALGORITHMS, DICT_PARTS, algorithm_policy, contract, random_layers, random_policy
+from policies import ALGORITHMS, DICT_PARTS, algorithm_policy, contract, random_layers, random_policy, with_hidden
 
 from csac.deploy.artefact import open_artefact
 from csac.deploy.c import compile_c
 from csac.deploy.choosing import load
 from csac.deploy.guards import make_guards
 from csac.deploy.policy import Policy
+from csac.deploy.verify import compare_actions
 from csac.types import InputError, PolicyParameters
 
 
@@ -38,6 +39,27 @@ def test_a_dict_is_flattened_before_and_an_action_gets_its_shape_after(tmp_path,
     expected = policy.predict(observation)[0]
     np.testing.assert_allclose(artefact.predict(observation)[0], expected, atol=1e-5)
     np.testing.assert_allclose(artefact.act(np.array([0.1, 0.2, 0.3, 0.4, 0.5])), expected.reshape(-1), atol=1e-5)
+
+
+HIDDEN = [("relu", "tanh"), ("tanh", "elu"), ("elu", "silu"), ("silu", "gelu"), ("gelu", "relu")]
+
+
+@pytest.mark.parametrize("kinds", HIDDEN, ids="-".join)
+def test_activations_and_layer_norm_leave_with_the_policy(tmp_path, format, kinds):
+    policy, plain = with_hidden(algorithm_policy("sd3"), *kinds), algorithm_policy("sd3")
+    artefact = exported(tmp_path, policy, format)
+    assert compare_actions(artefact, policy).observations > 900
+    given = observations(5)
+    assert np.abs(policy.predict(given)[0] - plain.predict(given)[0]).max() > 0.1
+    again = load(tmp_path)
+    np.testing.assert_array_equal(again.predict(given)[0], policy.predict(given)[0])
+
+
+def test_a_contract_of_before_has_critics_with_relu(tmp_path):
+    policy = algorithm_policy("sd3")
+    leave(tmp_path, policy, "numpy")
+    assert "critic_activation" not in json.loads((tmp_path / "contract.json").read_text())
+    assert load(tmp_path).contract.critic_activation == "relu"
 
 
 def test_a_policy_of_one_layer_leaves_too(tmp_path, format):

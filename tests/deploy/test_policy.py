@@ -19,10 +19,10 @@ from manifests import make_set
 from policies import DICT_PARTS, contract, random_layers, random_network, random_policy
 
 from csac.deploy import contract as contracts
-from csac.deploy.contract import Activation, Contract, sha256_of, write_with_checksum
+from csac.deploy.contract import Contract, sha256_of, write_with_checksum
 from csac.deploy.policy import Policy
 from csac.record.files import write_atomically
-from csac.types import InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
+from csac.types import Activation, InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
 
 
 def hand_made(activation: Activation = "relu", log_std_bias=0.0, **settings) -> Policy:
@@ -187,7 +187,9 @@ def test_layers_that_do_not_fit_are_refused(change):
         Policy(network._replace(parameters=network.parameters._replace(**change)), contract())
 
 
-@pytest.mark.parametrize("change", [{"activation": "tanh"}, {"activation": "gelu"}, {"head": "tanh"}])
+@pytest.mark.parametrize(
+    "change", [{"activation": "tanh"}, {"activation": "swish"}, {"critic_activation": "swish"}, {"head": "tanh"}]
+)
 def test_a_network_that_its_contract_does_not_describe_is_refused(change):
     with pytest.raises(InputError, match="not as its contract says"):
         Policy(random_network(Spec(2, 1))._replace(**change), contract())
@@ -309,7 +311,8 @@ def test_whenever_a_writer_is_killed_its_files_match(tmp_path, monkeypatch):
     "change",
     [
         {"schema_version": 1},
-        {"activation": "gelu"},
+        {"activation": "swish"},
+        {"critic_activation": "swish"},
         {"head": None},
         {"observation_parts": []},
         {"observation_parts": [{"key": None, "shape": [2.5]}]},

@@ -259,7 +259,8 @@ def csac(line: str) -> int:
 
 def test_a_run_is_trained_exported_and_described(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    algorithm = CSAC(batch_size=8, actor_hidden_sizes=(8,), critic_hidden_sizes=(8,), warmup_steps=64)
+    sizes: dict[str, Any] = {"batch_size": 8, "actor_hidden_sizes": (8,), "critic_hidden_sizes": (8,)}
+    algorithm = CSAC(actor_activation="gelu", layer_norm=True, warmup_steps=64, **sizes)
     train(algorithm, "Follow-v0", steps=64, seeds=1, directory="run", evaluation_interval=64, evaluation_episodes=2)
     policy, given = load("run"), np.random.default_rng(0).uniform(-1, 1, 5).astype(np.float32)
     for name in ("numpy", "c") if HAS_COMPILER else ("numpy",):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
-from csac.deploy.contract import Activation, Contract, Head
+from csac.deploy.contract import Contract, Head
 from csac.deploy.policy import Policy
-from csac.types import Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
+from csac.types import Activation, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
 
 Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
 
@@ -26,8 +27,8 @@ def contract(
     head: Head = "tanh_gaussian",
 ) -> Contract:
     size = math.prod(action_shape)
-    bounds = [np.full(size, bound, np.float32) for bound in (low, high)]
-    return Contract("Task-v0", "csac", activation, head, parts, action_shape, *bounds)
+    least, most = (np.full(size, bound, np.float32) for bound in (low, high))
+    return Contract("Task-v0", "csac", activation, head, parts, action_shape, least, most)
 
 
 def random_layers(*sizes: int, seed: int = 0) -> tuple[Layer, ...]:
@@ -77,3 +78,19 @@ def algorithm_policy(algorithm: str, parts: Parts = ((None, (5,)),), action_shap
     return Policy(
         PolicyNetwork(parameters, agreement.activation, agreement.head), replace(agreement, algorithm=algorithm)
     )
+
+
+def with_hidden(policy: Policy, activation: Activation, critic_activation: Activation) -> Policy:
+    """The policy with these activations, and with layer norm in each hidden layer of its actors and critics."""
+    generator = np.random.default_rng(7)
+
+    def normed(layers: tuple[Layer, ...]) -> tuple[Layer, ...]:
+        drawn = [generator.uniform(0.5, 1.5, (2, *layer.bias.shape)) for layer in layers[:-1]]
+        hidden = (layer._replace(scale=x[0], shift=x[1] - 1) for layer, x in zip(layers[:-1], drawn, strict=True))
+        return *hidden, layers[-1]
+
+    given = policy.network.parameters
+    parameters = given._replace(actors=(*map(normed, given.actors),), critics=(*map(normed, given.critics),))
+    kinds: dict[str, Any] = {"activation": activation, "critic_activation": critic_activation}
+    network = policy.network._replace(parameters=parameters, **kinds)
+    return Policy(network, replace(policy.contract, **kinds))

@@ -25,7 +25,8 @@ class Policy:
         self.tensors = _tensors(content)
         self.low, self.high = (np.array(self.contract[name], np.float32) for name in ("action_low", "action_high"))
         self.half, self.centre = 0.5 * self.high - 0.5 * self.low, 0.5 * self.high + 0.5 * self.low
-        self.activate = {"tanh": np.tanh, "relu": _relu}[self.contract["activation"]]
+        self.activate = _ACTIVATIONS[self.contract["activation"]]
+        self.activate_critic = _ACTIVATIONS[self.contract.get("critic_activation", "relu")]
         self.guards = {key: np.array(v, np.float32) for key, v in self.contract["guards"].items() if v is not None}
         self.reset()
 
@@ -61,7 +62,8 @@ class Policy:
             output = self._outputs(f"actor.{len(actions)}", inputs, self.activate)[: len(self.low)]
             actions.append(head(output))
         if len(actions) > 1:
-            values = [self._outputs(f"critic.{i}", np.append(inputs, a), _relu)[0] for i, a in enumerate(actions)]
+            seen = [np.append(inputs, action) for action in actions]
+            values = [self._outputs(f"critic.{i}", each, self.activate_critic)[0] for i, each in enumerate(seen)]
         return actions[np.argmax(values)] if values else actions[0]
 
     def _outputs(self, network, inputs, activate):
@@ -70,12 +72,20 @@ class Policy:
         while f"{network}.{index}.weight" in self.tensors:
             inputs = inputs if index == 0 else activate(inputs)
             inputs = inputs @ self.tensors[f"{network}.{index}.weight"] + self.tensors[f"{network}.{index}.bias"]
+            if f"{network}.{index}.scale" in self.tensors:  # layer norm
+                inputs = (inputs - inputs.mean()) / np.sqrt(inputs.var() + 1e-5)
+                inputs = inputs * self.tensors[f"{network}.{index}.scale"] + self.tensors[f"{network}.{index}.shift"]
             index += 1
         return inputs
 
 
-def _relu(x):
-    return np.maximum(x, 0.0)
+_ACTIVATIONS = {
+    "relu": lambda x: np.maximum(x, 0.0),
+    "tanh": np.tanh,
+    "elu": lambda x: np.where(x > 0.0, x, np.expm1(x)),
+    "silu": lambda x: x / (1.0 + np.exp(-x)),
+    "gelu": lambda x: 0.5 * x * (1.0 + np.tanh(0.7978845608028654 * (x + 0.044715 * x**3))),
+}
 
 
 def _tensors(content):

@@ -1,0 +1,39 @@
+"""What networks are like, in all algorithms: the hyperparameters of actor and critics beside their sizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from csac.algorithms.networks import Hidden
+from csac.types import Activation
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Options of the hidden layers of actor and critics."""
+
+    activation: Activation = "relu"
+    """Activation of the hidden layers."""
+    layer_norm: bool = False
+    """Whether hidden layers are normalised over their outputs before the activation."""
+    actor_activation: Activation | None = None
+    """Activation of the actor, if it is another."""
+    critic_activation: Activation | None = None
+    """Activation of the critics, if it is another."""
+    actor_layer_norm: bool | None = None
+    """Whether the actor has layer norm, if the critics do otherwise."""
+    critic_layer_norm: bool | None = None
+    """Whether the critics have layer norm, if the actor does otherwise."""
+
+    @property
+    def actor_hidden(self) -> Hidden:
+        """What the actor's hidden layers do."""
+        return self._hidden(self.actor_activation, self.actor_layer_norm)
+
+    @property
+    def critic_hidden(self) -> Hidden:
+        """What each critic's hidden layers do."""
+        return self._hidden(self.critic_activation, self.critic_layer_norm)
+
+    def _hidden(self, activation: Activation | None, layer_norm: bool | None) -> Hidden:
+        return Hidden(activation or self.activation, self.layer_norm if layer_norm is None else layer_norm)

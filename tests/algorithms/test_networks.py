@@ -1,0 +1,74 @@
+"""Activations and layer norm, by hand and in every algorithm."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from equations import SPEC, begin
+
+from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
+from csac.algorithms.networks import MLP
+from csac.algorithms.normalisation import fold, normalised_pass
+from csac.types import Activation, Layer
+
+# At -1 and 2: e⁻¹ - 1; x / (1 + e⁻ˣ); ½ x (1 + tanh(√(2/π) (x + 0.044715 x³))).
+KNOWN = {
+    "relu": (0.0, 2.0),
+    "tanh": (-0.7615942, 0.9640276),
+    "elu": (-0.6321206, 2.0),
+    "silu": (-0.2689414, 1.7615942),
+    "gelu": (-0.1588080, 1.9545977),
+}
+IDENTITY = Layer(jnp.eye(2), jnp.zeros(2))
+TINY: dict[str, Any] = {"actor_hidden_sizes": (4,), "critic_hidden_sizes": (4,)}
+
+
+@pytest.mark.parametrize("activation", get_args(Activation))
+def test_activations_by_hand(activation):
+    outputs = MLP((IDENTITY, IDENTITY), activation)(jnp.array([-1.0, 2.0]))
+    assert outputs.tolist() == pytest.approx(KNOWN[activation], abs=1e-6)
+
+
+def test_layer_norm_by_hand():
+    # Of (1, 3) the mean is 2 and the variance 1: ±1/√1.00001, scaled and shifted, then the ReLU.
+    normed = Layer(jnp.eye(2), jnp.array([1.0, 3.0]), jnp.array([2.0, 3.0]), jnp.array([0.5, -1.0]))
+    outputs = MLP((normed, IDENTITY))(jnp.zeros(2))
+    assert outputs.tolist() == pytest.approx([0.0, 3.0 / 1.00001**0.5 - 1.0])
+
+
+def networks_of(state: Any) -> tuple[MLP, MLP]:
+    """An actor and a critic of an algorithm's state."""
+    state = getattr(state, "parameters", getattr(state, "first", state))
+    return state.actor, state.critics[1] if hasattr(state, "critics") else state.critic
+
+
+@pytest.mark.parametrize("algorithm", [CSAC, SAC, TD3, SD3, PPO], ids=lambda algorithm: algorithm.name)
+def test_actor_and_critics_are_as_they_are_asked_for(algorithm):
+    sizes: dict[str, Any] = {"hidden_sizes": (4,)} if algorithm is PPO else TINY
+    both = algorithm(activation="gelu", layer_norm=True, **sizes)
+    own = algorithm(activation="silu", actor_activation="elu", critic_layer_norm=True, **sizes)
+    for learner, activations, norms in ((both, ("gelu", "gelu"), (True, True)), (own, ("elu", "silu"), (False, True))):
+        networks = networks_of(state := begin(learner, SPEC))
+        assert tuple(network.activation for network in networks) == activations
+        assert tuple(network.layers[0].scale is not None for network in networks) == norms
+        assert all(network.layers[-1].scale is None for network in networks)
+        policy = learner.policy(state)
+        assert policy.activation == activations[0]
+        assert policy.critic_activation == (activations[1] if algorithm is SD3 else "relu")
+
+
+def test_layer_norm_begins_as_plain_normalisation():
+    actor = begin(SAC(layer_norm=True, **TINY), SPEC).actor
+    assert (actor.layers[0].scale.tolist(), actor.layers[0].shift.tolist()) == ([1.0] * 4, [0.0] * 4)
+
+
+def test_batch_normalisation_folds_into_layers_with_layer_norm():
+    (critic, _) = begin(SAC(activation="gelu", layer_norm=True, **TINY), SPEC).critics
+    inputs = jnp.asarray(np.random.default_rng(0).normal(size=(6, 5)), jnp.float32)
+    passed = jax.vmap(lambda one: normalised_pass(critic, [one]), axis_name="batch")(inputs)
+    folded = fold(critic, jax.tree.map(lambda leaf: leaf[0], passed.moments))
+    np.testing.assert_allclose(jax.vmap(folded)(inputs), passed.outputs[0], rtol=1e-5, atol=1e-5)
