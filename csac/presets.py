@@ -40,14 +40,16 @@ _PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
         "updates_per_step": 1,
         "update_interval": 1,
         "max_gradient_norm": 0.0,
+        "n_steps": 1,
         "learning_rate_schedule": "constant",
+        "exploration_noise": "white",
         "activation": "relu",
         **_ALIKE,
     }
 )
 
 # What the table does not say of TD3 and SD3, and the papers of both say alike.
-_NOISE: Mapping[str, Any] = MappingProxyType({"exploration_noise": 0.1, "target_noise": 0.2, "target_noise_clip": 0.5})
+_NOISE: Mapping[str, Any] = MappingProxyType({"exploration_std": 0.1, "target_noise": 0.2, "target_noise_clip": 0.5})
 
 _PAPER: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {

@@ -73,4 +73,6 @@ def called_in_python(name: str, known: Collection[str]) -> str:
 
 def written_in_python(name: str, value: object) -> str:
     """Return how a value of former versions is written now, or nothing."""
+    if name == "exploration_noise" and isinstance(value, float):
+        return f"write exploration_std={value}"
     return f"write {_FORMERLY[name, value]}" if isinstance(value, str) and (name, value) in _FORMERLY else ""

@@ -46,6 +46,7 @@ class Transition(NamedTuple):
     next_observation: Array  # [observation]
     terminated: Array  # [] 0 or 1
     truncated: Array  # [] 0 or 1
+    steps: Array | None = None  # [] how many environment steps it sums up, the last of which ended so; None is one
 
 
 class Layer(NamedTuple):

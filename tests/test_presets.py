@@ -70,7 +70,7 @@ def test_paper_td3_has_the_papers_table_and_its_own_noise():
     given = presets.hyperparameters("paper", "td3", "Walker2d-v4")
 
     assert {name: given[name] for name in PAPER_TABLE} == PAPER_TABLE
-    assert (given["exploration_noise"], given["target_noise"], given["target_noise_clip"]) == (0.1, 0.2, 0.5)
+    assert (given["exploration_std"], given["target_noise"], given["target_noise_clip"]) == (0.1, 0.2, 0.5)
     assert given["policy_delay"] == 2
 
 

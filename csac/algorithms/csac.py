@@ -95,7 +95,7 @@ class CSAC(TwinCritics):
         value = q_value - sigma * bounded(log_prob, self.target_log_prob_bound)
         if self.relative_entropy_form == "explicit":
             value = value - tau * bounded(relative_entropy, self.target_log_prob_bound)
-        return transition.reward + self.discount * (1.0 - transition.terminated) * value
+        return transition.reward + self.discount_after(transition) * value
 
     def actor_loss(
         self, actor: MLP, observation: Observation, noise: Action, *, reference: MLP, critics: Critics, weights: Weights
@@ -183,7 +183,7 @@ class CSAC(TwinCritics):
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return ã(s, ξ) to explore (Eq. actor), else tanh(mean)."""
         policy = policy_at(state.actor, normalise(state.observations, observation))
-        return policy.sample(jax.random.normal(key, policy.mean.shape)) if explore else policy.mode()
+        return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, and what it sees observations by."""

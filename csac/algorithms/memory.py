@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from csac.algorithms.shapes import Count, Key
 from csac.types import Transition
@@ -16,20 +18,24 @@ if TYPE_CHECKING:
     from csac.types import Spec
 
 
-class Replay(NamedTuple):
+@partial(jax.tree_util.register_dataclass, data_fields=["rows"], meta_fields=["n_steps", "discount"])
+@dataclass(frozen=True)
+class Replay:
     """A ring of transitions, each packed into one row, so that a step is one write and a batch is one gather.
 
     The number of transitions added so far is not kept here: it follows from the environment steps, which the
-    caller counts.
+    caller counts. Up to `n_steps` that follow each other are drawn as one, their rewards summed with this discount.
     """
 
     rows: Float[Array, "capacity 2*observation+action+3"]
+    n_steps: int = 1
+    discount: float = 1.0
 
     @classmethod
-    def create(cls, capacity: int, spec: Spec, together: int = 1) -> Replay:
+    def create(cls, capacity: int, spec: Spec, together: int = 1, *, n_steps: int = 1, discount: float = 1.0) -> Replay:
         """Return an empty ring for rows that are added `together` at a time; it holds a multiple of these."""
         capacity = -(-capacity // together) * together
-        return cls(jnp.zeros((capacity, row_width(spec)), jnp.float32))
+        return cls(jnp.zeros((capacity, row_width(spec)), jnp.float32), n_steps, discount)
 
     def add(self, rows: Float[Array, "n width"], count: Count) -> Replay:
         """Return the ring with packed rows [n, width] written over the oldest; `count` rows were added before them.
@@ -37,12 +43,40 @@ class Replay(NamedTuple):
         `n` divides both `count` and the capacity, so that rows added together lie together.
         """
         start = (count % self.rows.shape[0], 0)
-        return Replay(jax.lax.dynamic_update_slice(self.rows, rows, start))
+        return replace(self, rows=jax.lax.dynamic_update_slice(self.rows, rows, start))
 
     def draw(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
         """Return a batch drawn uniformly with replacement from the `count` rows added, or the newest `capacity`."""
         indices = jax.random.randint(key, (batch_size,), 0, jnp.minimum(count, self.rows.shape[0]))
-        return jax.vmap(unpack, in_axes=(0, None))(self.rows[indices], spec)
+        return self.at(indices, count, spec)
+
+    def at(self, indices: Int[Array, " batch"], count: Count, spec: Spec) -> Transition:
+        """Return the transitions that begin in these rows, none of which goes on beyond the newest of `count` rows."""
+        if self.n_steps == 1:
+            return jax.vmap(unpack, in_axes=(0, None))(self.rows[indices], spec)
+        capacity, ahead = self.rows.shape[0], spec.environments * jnp.arange(self.n_steps)
+        newest = (count - 1) % capacity
+
+        def window(index: Count) -> Transition:
+            steps = jax.vmap(unpack, in_axes=(0, None))(self.rows[(index + ahead) % capacity], spec)
+            return summed(steps, ahead <= (newest - index) % capacity, self.discount)
+
+        return jax.vmap(window)(indices)
+
+
+def summed(steps: Transition, is_there: Bool[Array, " n"], discount: float) -> Transition:
+    """Return the first of n environment steps and those that follow it as one: Σ γᵏ rₖ, and where they have led to.
+
+    A step follows the one before if that has not ended the episode, and has led to the observation that it begins with:
+    an episode that was broken off by a resume or a fork, or rows that were lost, leave no other trace.
+    """
+    ended = (steps.terminated[:-1] > 0) | (steps.truncated[:-1] > 0)
+    follows = jnp.all(steps.observation[1:] == steps.next_observation[:-1], axis=-1) & ~ended & is_there[1:]
+    belongs = jnp.concatenate([jnp.ones(1), jnp.cumprod(follows)])
+    length = jnp.sum(belongs)
+    reward = jnp.sum(belongs * discount ** jnp.arange(len(belongs)) * steps.reward)
+    last = jax.tree.map(lambda leaf: leaf[length.astype(int) - 1], steps)
+    return last._replace(observation=steps.observation[0], action=steps.action[0], reward=reward, steps=length)
 
 
 class Rollout(NamedTuple):
@@ -71,7 +105,7 @@ def row_width(spec: Spec) -> int:
 
 def pack(transition: Transition) -> np.ndarray:
     """Return transitions, NumPy arrays [seed, (environment,) ...], as rows [..., width], fields in their order."""
-    fields = [field.reshape(*transition.reward.shape, -1) for field in transition]
+    fields = [field.reshape(*transition.reward.shape, -1) for field in transition if field is not None]
     return np.concatenate(fields, axis=-1, dtype=np.float32, casting="unsafe")
 
 

@@ -13,6 +13,7 @@ import optax
 
 from csac.algorithms.architecture import Architecture
 from csac.algorithms.critics import make_critics
+from csac.algorithms.exploration import Noise, noise_of
 from csac.algorithms.hyperparameters import (
     COUNT,
     DISCOUNT,
@@ -25,9 +26,9 @@ from csac.algorithms.hyperparameters import (
 )
 from csac.algorithms.memory import Replay
 from csac.algorithms.networks import MLP, Schedule, copy_tree, follow, init_optimiser, make_mlp, make_optimiser
-from csac.algorithms.shapes import Count, Key
+from csac.algorithms.shapes import Action, Count, Key, Scalar
 from csac.algorithms.statistics import Statistics, normaliser_of
-from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec
+from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -43,6 +44,8 @@ class OffPolicy(Architecture):
     """Discount factor (gamma)."""
     target_rate: Annotated[float, RATE] = 0.005
     """Soft update rate of the target networks (rho of CSAC's paper, tau of the others')."""
+    n_steps: Annotated[int, COUNT] = 1
+    """Environment steps whose rewards a critic's target sums before it counts on the critics."""
     actor_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the actor."""
     critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
@@ -64,6 +67,8 @@ class OffPolicy(Architecture):
     update_interval: Annotated[int, COUNT] = 1
     """Environment steps between rounds of updates; 1 is strict order, larger is faster. Rounded up to whole turns of
     several environments."""
+    exploration_noise: Noise = "white"
+    """How exploration noise goes together over steps: not at all, over all time scales (pink), over some seven (ou)."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
     """Decay of the average gradient in the networks' Adam (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
@@ -93,10 +98,20 @@ class OffPolicy(Architecture):
         """Return how many updates a run of so many steps makes, which its schedule is for."""
         return self.cadence.side_by_side(spec.environments).updates(steps)
 
+    def noise(self, key: Key, size: int) -> Action:
+        """Return exploration noise, standard normal [size]."""
+        return noise_of(self.exploration_noise, key, size)
+
     def memory(self, spec: Spec, steps: int) -> Replay:
         """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
         together = self.cadence.side_by_side(spec.environments).update_interval
-        return Replay.create(min(self.replay_size, steps), spec, together)
+        returns: dict[str, Any] = {"n_steps": self.n_steps, "discount": self.discount}
+        return Replay.create(min(self.replay_size, steps), spec, together, **returns)
+
+    def discount_after(self, transition: Transition) -> Scalar:
+        """Return γ (1 - terminated), by which what follows a transition counts; γᵐ for γ where it sums up m steps."""
+        discount = self.discount if transition.steps is None else self.discount**transition.steps
+        return discount * (1.0 - transition.terminated)
 
     def optimiser(self, learning_rate: float, planned: int = 1) -> optax.GradientTransformation:
         """Return the networks' Adam. The number of steps `planned` counts where it begins: its state keeps it."""

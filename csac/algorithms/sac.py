@@ -55,7 +55,7 @@ class SAC(TwinCritics):
         policy = policy_at(actor, transition.next_observation)
         q_value = min_q(targets, transition.next_observation, policy.sample(noise))
         value = q_value - temperature * policy.log_prob(noise)
-        return transition.reward + self.discount * (1.0 - transition.terminated) * value
+        return transition.reward + self.discount_after(transition) * value
 
     def actor_loss(
         self, actor: MLP, observation: Observation, noise: Action, *, critics: Critics, temperature: Scalar
@@ -109,7 +109,7 @@ class SAC(TwinCritics):
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return a sampled action to explore, else tanh(mean)."""
         policy = policy_at(state.actor, normalise(state.observations, observation))
-        return policy.sample(jax.random.normal(key, policy.mean.shape)) if explore else policy.mode()
+        return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, and what it sees observations by."""

@@ -50,7 +50,7 @@ class SD3(OffPolicy):
     """Actions sampled around the target actor's action to value a state (the paper's K)."""
     importance_sampling: bool = False
     """Whether to divide each sample's weight by its density (as the paper derives it); its authors' code does not."""
-    exploration_noise: Annotated[float, NOT_NEGATIVE] = 0.1
+    exploration_std: Annotated[float, NOT_NEGATIVE] = 0.1
     """Standard deviation of the exploration noise."""
     target_noise: Annotated[float, NOT_NEGATIVE] = 0.2
     """Standard deviation of the noise on the target actors' actions (the paper's sigma)."""
@@ -85,7 +85,7 @@ class SD3(OffPolicy):
 
         log_weights = -log_density(noise) if self.importance_sampling else jnp.zeros(len(noise))
         softmax_value = softmax_operator(jax.vmap(value)(noise), self.inverse_temperature, log_weights)
-        return transition.reward + self.discount * (1.0 - transition.terminated) * softmax_value
+        return transition.reward + self.discount_after(transition) * softmax_value
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Update the first pair on half of the batch, then the second, which sees its new target, on the rest."""
@@ -152,7 +152,7 @@ class SD3(OffPolicy):
         action = jnp.where(first_value >= second_value, first, second)
         if not explore:
             return action
-        return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
+        return jnp.clip(action + self.exploration_std * self.noise(key, action.size), -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return both actors' and both critics' layers: the critics choose the actor."""

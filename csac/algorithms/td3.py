@@ -37,7 +37,7 @@ class TD3(TwinCritics):
 
     policy_delay: Annotated[int, COUNT] = 2
     """Critic updates per update of the actor and of the targets (the paper's d)."""
-    exploration_noise: Annotated[float, NOT_NEGATIVE] = 0.1
+    exploration_std: Annotated[float, NOT_NEGATIVE] = 0.1
     """Standard deviation of the exploration noise (the paper's sigma)."""
     target_noise: Annotated[float, NOT_NEGATIVE] = 0.2
     """Standard deviation of the noise on the target actor's actions (the paper's sigma tilde)."""
@@ -50,7 +50,7 @@ class TD3(TwinCritics):
         """Return y = r + γ min Q'(s', ã) at the smoothed action (Algorithm 1), and no future after a terminal step."""
         action = self.smoothed_action(target_actor, transition.next_observation, noise)
         value = min_q(targets, transition.next_observation, action)
-        return transition.reward + self.discount * (1.0 - transition.terminated) * value
+        return transition.reward + self.discount_after(transition) * value
 
     def smoothed_action(self, target_actor: MLP, observation: Observation, noise: Action) -> Action:
         """Return ã = clip(π'(s') + clip(σ̃ ξ, -c, c), -1, 1) for noise ξ ~ N(0, I) (Algorithm 1)."""
@@ -99,7 +99,7 @@ class TD3(TwinCritics):
         action = jnp.tanh(state.actor(normalise(state.observations, observation)))
         if not explore:
             return action
-        return jnp.clip(action + self.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
+        return jnp.clip(action + self.exploration_std * self.noise(key, action.size), -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, and what it sees observations by."""

@@ -27,7 +27,7 @@ Space = dict[str, Dimension]
 _RATE: Dimension = ("log", 3e-5, 3e-3)
 _DISCOUNT: Dimension = ("below 1", 0.95, 0.999)
 _ENTROPY: Space = {"entropy_weight": ("log", 0.01, 1.0), "weight_learning_rate": _RATE}
-_NOISE: Space = {"exploration_noise": ("log", 0.03, 0.5), "target_noise": ("log", 0.05, 0.5)}
+_NOISE: Space = {"exploration_std": ("log", 0.03, 0.5), "target_noise": ("log", 0.05, 0.5)}
 _OFF_POLICY: Space = {
     "actor_learning_rate": _RATE,
     "critic_learning_rate": _RATE,

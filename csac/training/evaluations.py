@@ -78,7 +78,11 @@ class Evaluations:
         """Return the policy that leaves training with this network."""
         environments = self.environments
         parts = environments.task_name, self._algorithm, network.activation, network.head
-        return Policy(network, Contract(*parts, *environments.contract_parts, network.critic_activation), step=step)
+        return Policy(
+            network,
+            Contract(*parts, *environments.contract_parts, critic_activation=network.critic_activation),
+            step=step,
+        )
 
     def begin(self, step: int, networks: Sequence[PolicyNetwork], task_step: int) -> None:
         """Begin to evaluate each seed's network after `step`, on the task of `task_step`."""

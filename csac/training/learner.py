@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from csac.algorithms.exploration import keys_of, uniform_of
 from csac.algorithms.memory import pack, row_width
 from csac.training.compilation import keep_programs
 from csac.training.packing import Packing, Parcel, SeedAxis, by_name
@@ -17,6 +18,7 @@ from csac.types import InputError, PolicyNetwork, Ring, Snapshot, Transition
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from csac.algorithms.exploration import Noise
     from csac.tasks.seeds import Steps
     from csac.types import Algorithm, PolicyParameters, Spec
 
@@ -168,12 +170,12 @@ class Learner:
             if problem := misfit(self.algorithm, self.spec, self._steps, seed):
                 raise InputError(f"the checkpoint does not fit: {problem}: go on with the csac that wrote it")
         memory = self._carry.memory
-        rows = np.zeros(memory.rows.shape, memory.rows.dtype)
-        memory = memory._replace(rows=None)  # a replay may fill half of what memory there is: never three at a time
+        rows, kind = np.zeros(memory.rows.shape, memory.rows.dtype), jax.tree.structure(memory)
+        memory = None  # a replay may fill half of what memory there is: never three at a time
         self._carry = self._carry._replace(memory=memory)
         for index, fill in enumerate(memories):
             fill(self._axis.of(rows, index))
-        memory = memory._replace(rows=jax.device_put(rows, may_alias=False))  # what is aliased cannot be donated
+        memory = jax.tree.unflatten(kind, [jax.device_put(rows, may_alias=False)])  # what is aliased cannot be donated
         lasting = _lasting(self._carry._replace(state=self._one.state))
         leaves = [jnp.array(self._axis.stack([seed.arrays[name] for seed in saved])) for name in by_name(lasting)]
         taken = Carry(memory=memory, **jax.tree.unflatten(jax.tree.structure(lasting), leaves))
@@ -188,7 +190,7 @@ class Learner:
     def break_off(self, indices: Sequence[int], step: int) -> None:
         """Mark the last transition of these seeds, after `step` steps, as truncated: what follows is another episode.
 
-        One that an update has learnt from already stays as it was. Only rollouts look across episodes.
+        One that an update has learnt from already stays as it was: a replay sees by itself what follows what.
         """
         if step % self._cadence.update_interval:
             self._waiting[indices, self._turn(step), -1] = 1.0  # `pack` ends with it
@@ -222,6 +224,7 @@ class OneSeed:
     def __init__(self, algorithm: Algorithm, spec: Spec, steps: int) -> None:
         self.algorithm, self.spec = algorithm, spec
         self.cadence = algorithm.cadence.side_by_side(spec.environments)
+        self.noise: Noise = getattr(algorithm, "exploration_noise", "white")
         # Both are asked for shapes and then to run: traced once.
         self._first = jax.jit(
             lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), inline=True
@@ -241,7 +244,10 @@ class OneSeed:
     def explore(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
         """Return a uniformly random action for each observation."""
         shape = (*observation.shape[:-1], self.spec.action_size)
-        return jax.random.uniform(_keys(carry.key, step)[2], shape, minval=-1.0, maxval=1.0)
+        if self.noise == "white":
+            return jax.random.uniform(_keys(carry.key, step)[2], shape, minval=-1.0, maxval=1.0)
+        keys = self._act_keys(carry.key, observation, step)
+        return self._each(lambda _, key: uniform_of(self.noise, key, shape[-1]), observation, keys)
 
     def act(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
         """Return the policy's action for each observation, to explore."""
@@ -289,11 +295,22 @@ class OneSeed:
         return (step - cadence.first_update) // cadence.update_interval * cadence.updates_per_interval
 
     def _act(self, state: Any, key_data: jax.Array, observation: jax.Array, step: jax.Array) -> jax.Array:
-        key = _keys(key_data, step)[2]
-        if observation.ndim == 1:
-            return self.algorithm.act(state, observation, key, True)
-        keys = jax.random.split(key, len(observation))
-        return jax.vmap(lambda one, key: self.algorithm.act(state, one, key, True))(observation, keys)
+        keys = self._act_keys(key_data, observation, step)
+        return self._each(lambda one, key: self.algorithm.act(state, one, key, True), observation, keys)
+
+    def _act_keys(self, key_data: jax.Array, observation: jax.Array, step: jax.Array) -> jax.Array:
+        """Return the keys to act by, of each environment where there are several; with correlated noise [..., n]."""
+        environments = self.spec.environments
+        if self.noise == "white":
+            key = _keys(key_data, step)[2]
+            return jax.random.split(key, environments) if observation.ndim > 1 else key
+        keys = keys_of(self.noise, jax.random.wrap_key_data(key_data), step, environments)
+        return keys if observation.ndim > 1 else keys[0]
+
+    @staticmethod
+    def _each(function: Callable, observation: jax.Array, keys: jax.Array) -> jax.Array:
+        """Return what a function gives for an observation, or for each [environment, ...] of several."""
+        return function(observation, keys) if observation.ndim == 1 else jax.vmap(function)(observation, keys)
 
 
 def misfit(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str | None:

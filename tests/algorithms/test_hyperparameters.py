@@ -36,7 +36,7 @@ OWN = {
         "reference_rate": [0.0, 1.5],
     },
     SAC: {"entropy_weight": ["fixed"], "initial_entropy_weight": [0.0], "target_entropy": [math.inf, "-3", -1e39]},
-    TD3: {"policy_delay": [0, 1.5], "target_noise_clip": [-0.5], "exploration_noise": [-0.1]},
+    TD3: {"policy_delay": [0, 1.5], "target_noise_clip": [-0.5], "exploration_std": [-0.1]},
     SD3: {"noise_samples": [0], "inverse_temperature": [-0.1, math.inf], "importance_sampling": [1]},
     PPO: {"normalise_rewards": [0, "no", None], "clip_range": [0.0], "entropy_weight": ["auto"]},
 }

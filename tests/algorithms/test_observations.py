@@ -40,7 +40,9 @@ def test_a_batch_is_seen_by_statistics_that_have_absorbed_it():
     np.testing.assert_allclose([statistics.mean[0], statistics.variance[0]], [2.0, 8.0], rtol=1e-6)
     np.testing.assert_allclose(batch.observation, [[0.0], [4.0 / 8.0**0.5]], atol=1e-6)
     np.testing.assert_allclose(batch.next_observation, [[3.0 / 8.0**0.5], [10.0]], atol=1e-6)  # 352 is too far
-    assert all(np.array_equal(ours, theirs) for ours, theirs in zip(batch, FAR, strict=True) if ours.ndim == 1)
+    assert all(
+        np.array_equal(ours, theirs) for ours, theirs in zip(batch[:-1], FAR[:-1], strict=True) if ours.ndim == 1
+    )
 
 
 def test_without_statistics_nothing_changes():

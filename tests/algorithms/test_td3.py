@@ -171,7 +171,7 @@ def test_seeds_side_by_side_still_choose_one_of_two_programs():
 
 
 def test_actions_explore_with_noise_within_the_bounds():
-    algorithm = TD3(exploration_noise=0.1, **LINEAR)
+    algorithm = TD3(exploration_std=0.1, **LINEAR)
     act = jax.vmap(algorithm.act, in_axes=(None, None, 0, None))
     keys = jax.random.split(jax.random.key(1), 4000)
     state = linear_state(algorithm)._replace(actor=always(0.4))

@@ -38,6 +38,10 @@ ADAPTIVE = CSAC(
     policy_delay=3,
     adam_momentum=0.5,
     learning_rate_schedule="cosine",
+    n_steps=3,
+    exploration_noise="pink",
+    activation="gelu",
+    critic_layer_norm=True,
     **SMALL,
 )
 SHORT: dict[str, Any] = {

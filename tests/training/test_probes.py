@@ -30,7 +30,7 @@ COMMON: dict[str, Any] = {
 }
 SETTINGS: dict[str, Any] = {**COMMON, "entropy_weight": 1e-3}
 # Noise enough to see all actions: critics are asked about those that the actor would not take, too.
-NOISY: dict[str, Any] = {**COMMON, "exploration_noise": 0.5}
+NOISY: dict[str, Any] = {**COMMON, "exploration_std": 0.5}
 
 
 @pytest.fixture(params=["csac", "sac", "csac-periodic", "csac-average", "td3", "sd3"])
