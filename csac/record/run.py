@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import multiprocessing
 import os
 import warnings
 from contextlib import contextmanager, suppress
@@ -86,7 +87,10 @@ class RunDirectory:
         reason = "does not exist"
         for place in (path / MANIFEST, *_copies(path)):
             try:
-                return cls(path, manifests.read(place.read_bytes()))
+                manifest = manifests.read(place.read_bytes())
+                if place.parent != path and not multiprocessing.parent_process():  # which has said so
+                    warnings.warn(f"{path / MANIFEST} is lost or damaged: a checkpoint's copy is read", stacklevel=2)
+                return cls(path, manifest)
             except (FileNotFoundError, NotADirectoryError):
                 reason = "holds no run" if path.exists() else reason
             except OSError as error:
@@ -164,13 +168,15 @@ class RunDirectory:
         return rows
 
     def _sound(self, name: Table) -> Path:
-        """Return the file of a table, or its copy in the newest checkpoint if it no longer begins with that."""
+        """Return the file of a table, or its copy in the newest checkpoint if it does not continue that."""
         path = self.table(name)
         for manifest in _copies(self.path)[:1]:
             copy = manifest.with_name(path.name)
             content = copy.read_bytes() if copy.is_file() else b""
             known = path.read_bytes() if path.is_file() else b""
-            if not continues(known, content) and _is_listed(copy, content):
+            is_saved = self.manifest.state == "finished" and self.manifest.steps_done == self.manifest.last_checkpoint
+            is_more = is_saved and known.count(b"\n") > content.count(b"\n")
+            if (is_more or not continues(known, content)) and _is_listed(copy, content):
                 warnings.warn(f"{path} has changed since the newest checkpoint: its copy there is read", stacklevel=4)
                 return copy
         return path

@@ -13,6 +13,7 @@ import csac
 from csac import InputError
 from csac.algorithms import PPO, SAC
 from csac.record.run import RunDirectory
+from csac.record.sets import find_sets
 from csac.training.checkpoint import steps_in
 
 CHANGES = ("friction=1.5@150", "action_noise=0.05@210", "observation_noise=0.01@330")
@@ -63,10 +64,22 @@ def test_a_table_that_was_cut_is_read_from_the_checkpoint(tmp_path):
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.warns(UserWarning, match=r"evaluations\.csv has changed"):
         assert repr(one.evaluations.tolist()) == before
+    path.write_bytes(whole + whole.splitlines(keepends=True)[-1])  # nothing comes after the end
+    with pytest.warns(UserWarning, match=r"evaluations\.csv has changed"):
+        assert repr(one.evaluations.tolist()) == before
     copy = one.checkpoints / "step_300" / path.name
     copy.write_bytes(whole[:30])  # is damaged itself, and not believed
     path.write_bytes(whole)
     assert repr(one.evaluations.tolist()) == before
+
+
+def test_a_manifest_that_is_lost_is_read_from_the_checkpoint(tmp_path):
+    one = run(tmp_path / "run", steps=300).runs[0]
+    (one.path / "manifest.json").unlink()
+    with pytest.warns(UserWarning, match=r"manifest\.json is lost or damaged"):
+        found = find_sets(tmp_path)
+    assert [runs.path for runs in found] == [one.path]
+    assert found[0].config == one.config
 
 
 def test_a_run_or_a_copy_of_it_is_resumed_alone(tmp_path):
