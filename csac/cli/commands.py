@@ -88,15 +88,15 @@ def _evaluate(options: Evaluate, _: str) -> int:
     from csac.record.sets import RunSet
     from csac.record.tables import COLUMNS, check_new, write_rows
 
-    given, console = dict(vars(options)), tables.make_console()
+    given, console, runs = dict(vars(options)), tables.make_console(), RunSet.open(options.directory)
     file, deterministic = given.pop("csv"), not given.pop("stochastic")
+    target = file and file.absolute()  # a task may change where we are
     notes = perturbation_notes(options.directory, options.perturbations)
     if file:
         check_new(file)
     with progress_shown(console, "evaluating", "episodes") as on_progress:
         results = dict(evaluate_run(**given, deterministic=deterministic, on_progress=on_progress))
     tables.print_lines(console, notes)
-    runs = RunSet.open(options.directory)
     for table in tables.evaluation_tables(results, runs.failures):
         console.print(table)
     failed = {seed: reason for seed, reason in runs.failures.items() if seed in results}
@@ -112,7 +112,7 @@ def _evaluate(options: Evaluate, _: str) -> int:
             rows += [episode.row(run.seed, step) for episode in results[run.seed]]
         if not rows:
             return complain(f"{file} is not written: every seed that was tested had failed in training", 1)
-        write_rows(file, COLUMNS["evaluations"], rows)
+        write_rows(target, COLUMNS["evaluations"], rows)
         tables.print_lines(console, [str(file)])
     return 0
 
@@ -140,10 +140,11 @@ def _export(options: Export, _: str) -> int:
     from csac.record.sets import RunSet
 
     console = make_console()
+    runs = RunSet.open(options.directory)
     with console.status("exporting") if console.is_interactive else nullcontext():
         exported = export_run(**vars(options))
     print_lines(console, [str(exported.place), *export_lines(exported.fields["verification"])])
-    notes = exported.notes + _unlearnt(RunSet.open(options.directory))
+    notes = exported.notes + _unlearnt(runs)
     print_lines(console, [f"note: {text}" for text in notes])
     return 0
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import trainer  # noqa: F401  (its cache of compiled programs)
+from gymnasium.envs.registration import EnvSpec
 from played import policy_for, run_of_task
+from probes import Endless
 from scalars import scalars
 
 from csac.algorithms import SAC
@@ -128,6 +132,23 @@ def test_evaluate_counts_cases_per_thousand(tmp_path, capsys):
     assert f"crashed {1000 * crashed:.1f} {1000 * crashed:.1f} {1000 * crashed:.1f} 0.0" in lines
     assert f"stops (mean) {stops:.3f} {stops:.3f} {stops:.3f} 0.000" in lines
     assert "'nothing'" in lines[-1]
+
+
+class Wandering(Endless):
+    """Changes the working directory in each reset."""
+
+    def first_observation(self):
+        os.chdir("/")
+        return super().first_observation()
+
+
+@pytest.mark.parametrize("line", ["evaluate run --processes 1 --csv place.csv", "export run --out place.csv"])
+def test_paths_are_those_of_where_the_command_was_typed(tmp_path, monkeypatch, line):
+    monkeypatch.setitem(gymnasium.registry, "Wandering-v0", EnvSpec("Wandering-v0", Wandering))
+    monkeypatch.chdir(tmp_path)
+    run_of_task(Path("run"), "Wandering-v0")
+    assert main([*line.split(), "--episodes", "1"]) == 0
+    assert (tmp_path / "place.csv").exists()
 
 
 def test_evaluate_writes_its_episodes_where_nothing_is(tmp_path, monkeypatch, capsys):
