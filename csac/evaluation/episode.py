@@ -51,7 +51,7 @@ class Playing:
     """One episode on its way. `generator` is what stochastic actions are drawn from."""
 
     def __init__(self, environment: Environment, number: int, seed: int, limit: int) -> None:
-        self.environment, self._number, self._seed, self._limit = environment, number, seed, limit
+        self.environment, self.number, self._seed, self._limit = environment, number, seed, limit
         self.generator = noise_generator(seed)
         self.ended = False
         self._return, self._length = 0.0, 0
@@ -78,7 +78,7 @@ class Playing:
     def result(self, events: Sequence[str]) -> EvaluationEpisode:
         """Return what there is to say of the episode, with the events of these names."""
         said = {name: _number(self.last_info.get(name)) for name in events}
-        return EvaluationEpisode(self._number, self._return, self._length, _success(self.last_info), said)
+        return EvaluationEpisode(self.number, self._return, self._length, _success(self.last_info), said)
 
     def info_names(self) -> set[str]:
         """Return the names of the numbers in the last step's `info`."""
@@ -86,8 +86,25 @@ class Playing:
         return {name for name, value in items if isinstance(name, str) and _number(value) is not None}
 
     def _failure(self, error: EnvironmentFailure) -> EvaluationFailure:
-        place = f"evaluation episode {self._number}, reset with seed {self._seed}, at step {self._length}"
+        place = f"evaluation episode {self.number}, reset with seed {self._seed}, at step {self._length}"
         return EvaluationFailure(f"{place}: {error}")
+
+
+def start(episodes: Sequence[Playing], rows: np.ndarray, ignores_seed: bool | None) -> bool | None:
+    """Put the first observations of new episodes into rows [episode, observation]; return whether seeds change nothing.
+
+    None where one episode cannot tell. If so, episode j begins as the j-th of its environment, which is to be new: a
+    generator that no seed reaches, made in a constructor, would give the same episode again and again.
+    """
+    for row, episode in zip(rows, episodes, strict=True):
+        row[:] = episode.start()
+    is_told = ignores_seed is not None or len(episodes) < 2
+    ignores_seed = ignores_seed if is_told else bool((rows == rows[0]).all())
+    if ignores_seed:
+        for row, episode in zip(rows, episodes, strict=True):
+            for _ in range(episode.number):
+                row[:] = episode.start()
+    return ignores_seed if is_told else ignores_seed and not (rows == rows[0]).all()  # else all begin alike
 
 
 def _number(value: Any) -> bool | float | None:

@@ -11,11 +11,12 @@ import numpy as np
 from csac.checks import check_flag, check_whole
 from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy
-from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, Playing
+from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, Playing, start
 from csac.evaluation.pending import EvaluationStopped, Pending
 from csac.record.config import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import constant_perturbations, values_at
+from csac.tasks.preflight import globals_seeded
 from csac.tasks.registry import check_events, events_of
 from csac.types import InputError
 
@@ -77,6 +78,7 @@ class Evaluator:
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
         self._lent, self._at_once = lent, min(environments, EPISODES_AT_ONCE, episodes)
         self._environments = [lent] if lent else []
+        self._ignores_seed: bool | None = None  # None before the first batch
         self.info_names: set[str] = set()
         self.perturbed: dict[str, float] = {}
         self.watch: Callable[[np.ndarray], object] | None = None
@@ -138,7 +140,8 @@ class Evaluator:
             for environment, number in zip(self._environments, numbers, strict=False)
         ]
         try:
-            self._play(policy, episodes, deterministic, should_stop)
+            with globals_seeded(self._first_seed + first):
+                self._play(policy, episodes, deterministic, should_stop)
         except EvaluationFailure:
             self.close()  # what has raised may be broken for good, and the next policy is to fail by itself alone
             raise
@@ -196,7 +199,7 @@ class Evaluator:
         self._environments = []
 
     def _make_environments(self, count: int) -> None:
-        if self._environments and self._environments[0].has_memory:
+        if self._environments and (self._environments[0].has_memory or self._ignores_seed):
             self.close()
         while len(self._environments) < count:
             environment = Environment(self._task, self._environment_arguments)
@@ -218,8 +221,7 @@ class Evaluator:
         observation_size, action_size = policy.contract.spec[:2]
         observations = np.zeros((EPISODES_AT_ONCE, observation_size), np.float32)
         noise = None if deterministic else np.zeros((EPISODES_AT_ONCE, action_size), np.float32)
-        for row, episode in enumerate(episodes):
-            observations[row] = episode.start()
+        self._ignores_seed = start(episodes, observations[: len(episodes)], self._ignores_seed)
         running, steps = list(enumerate(episodes)), 0
         while running:
             if should_stop and steps % STEPS_BETWEEN_STOPS == 0 and should_stop():

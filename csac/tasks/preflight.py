@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -82,6 +83,18 @@ def wrapper_warnings(environment: Environment) -> list[str]:
             )
         wrapper = wrapper.env
     return lines
+
+
+@contextmanager
+def globals_seeded(seed: int) -> Iterator[None]:
+    """Seed Python's and NumPy's global generators in this block, after which they go on as before."""
+    states = random.getstate(), np.random.get_state()
+    seed_globals(seed)
+    try:
+        yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])
 
 
 def seed_globals(seed: int) -> None:

@@ -120,6 +120,33 @@ def test_episode_j_is_reset_with_the_first_seed_plus_j():
     assert lengths == [expected(77 + number) for number in range(3)]
 
 
+class OwnGenerator(probes.ObservationReward):
+    """Draws from a generator that no reset seeds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.generator = np.random.default_rng(0)
+
+    def first_observation(self) -> np.ndarray:
+        return self.generator.normal(size=1).astype(np.float32)
+
+
+class GlobalGenerator(OwnGenerator):
+    """Draws from NumPy's global generator."""
+
+    def first_observation(self) -> np.ndarray:
+        return np.random.normal(size=1).astype(np.float32)
+
+
+@pytest.mark.parametrize("task", [OwnGenerator, GlobalGenerator])
+def test_episodes_of_a_task_that_ignores_its_seed_differ_and_can_be_repeated(task):
+    policy, evaluator = policy_for(task), Evaluator(task, episodes=25)
+    episodes = evaluator.run(policy)
+    assert len({episode.episode_return for episode in episodes}) == 25
+    assert evaluator.run(policy) == episodes
+    assert Evaluator(task, episodes=25).run_batch(policy, 20) == episodes[20:]
+
+
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_an_episode_depends_on_no_other(deterministic):
     policy = policy_for(Lottery, weight=0.7)
