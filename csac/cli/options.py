@@ -96,7 +96,8 @@ class Train(_Training):
         UseAppendAction[tuple[str, ...]], arg(name="perturb", metavar="KIND=VALUE[@STEP]", help=PERTURB)
     ] = ()
     events: Annotated[Names, arg(help_behavior_hint="(default: the task's own)")] = ()
-    """More names to record from the info of an evaluation episode's last step: each becomes a column and a curve."""
+    """More names to record from the info of an episode's last step, or NAME:sum, NAME:mean over all its steps: each
+    becomes a column and a curve, of evaluations and of training episodes."""
     seeds_per_process: Annotated[int | None, arg(help_behavior_hint="(default: 1 on a CPU, a few on a GPU)")] = None
     """Seeds that train in one program."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None

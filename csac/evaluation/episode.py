@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from csac.deploy.policy import noise_generator
+from csac.tasks.events import EpisodeEvents, numbers, numbers_in
 from csac.tasks.failures import EnvironmentFailure
 from csac.types import Failure
 
@@ -24,8 +25,8 @@ class EvaluationFailure(Failure):
 class EvaluationEpisode(NamedTuple):
     """One evaluation episode; `success` is the task's own verdict (1 or 0), or None where it gives none.
 
-    `events` are what the last step's `info` holds under the names asked for: a bool, a number, or None where it holds
-    neither.
+    `events` are what `info` holds under the names asked for (`csac.tasks.events`): a bool, a number, or None where it
+    holds neither.
     """
 
     episode: int
@@ -50,12 +51,15 @@ class EvaluationEpisode(NamedTuple):
 class Playing:
     """One episode on its way. `generator` is what stochastic actions are drawn from."""
 
-    def __init__(self, environment: Environment, number: int, seed: int, limit: int) -> None:
+    def __init__(
+        self, environment: Environment, number: int, seed: int, limit: int, events: Sequence[str] = ()
+    ) -> None:
         self.environment, self.number, self._seed, self._limit = environment, number, seed, limit
         self.generator = noise_generator(seed)
         self.ended = False
         self._return, self._length = 0.0, 0
         self.last_info: dict[str, Any] = {}
+        self._events = EpisodeEvents(events)
 
     def start(self) -> np.ndarray:
         """Reset the environment and return the first observation. Raises EvaluationFailure."""
@@ -70,20 +74,20 @@ class Playing:
             observation, reward, terminated, truncated, self.last_info = self.environment.step_environment_scale(action)
         except EnvironmentFailure as error:
             raise self._failure(error) from error
+        self._events.add(self.last_info)
         self._return += reward
         self._length += 1
         self.ended = terminated or truncated or self._length >= self._limit
         return observation
 
-    def result(self, events: Sequence[str]) -> EvaluationEpisode:
-        """Return what there is to say of the episode, with the events of these names."""
-        said = {name: _number(self.last_info.get(name)) for name in events}
+    def result(self) -> EvaluationEpisode:
+        """Return what there is to say of the episode."""
+        said = self._events.of(self.last_info, self._length)
         return EvaluationEpisode(self.number, self._return, self._length, _success(self.last_info), said)
 
     def info_names(self) -> set[str]:
         """Return the names of the numbers in the last step's `info`."""
-        items = self.last_info.items()
-        return {name for name, value in items if isinstance(name, str) and _number(value) is not None}
+        return set(numbers_in(self.last_info))
 
     def _failure(self, error: EnvironmentFailure) -> EvaluationFailure:
         place = f"evaluation episode {self.number}, reset with seed {self._seed}, at step {self._length}"
@@ -107,25 +111,7 @@ def start(episodes: Sequence[Playing], rows: np.ndarray, ignores_seed: bool | No
     return ignores_seed if is_told else ignores_seed and not (rows == rows[0]).all()  # else all begin alike
 
 
-def _number(value: Any) -> bool | float | None:
-    """Return a boolean or a finite number out of `info` as Python's own, and None for anything else."""
-    array = _numbers(value)
-    return None if array is None or array.size != 1 else array.item()
-
-
 def _success(info: dict[str, Any]) -> float | None:
     """Return 1 or 0 for what a task says of its success, and None where it is silent or says nothing that counts."""
-    verdicts = (_numbers(info.get(name)) for name in ("is_success", "success"))
+    verdicts = (numbers(info.get(name)) for name in ("is_success", "success"))
     return next((float(verdict.all()) for verdict in verdicts if verdict is not None), None)
-
-
-def _numbers(value: Any) -> np.ndarray | None:
-    """Return booleans or finite numbers as an array, and None for anything else."""
-    if value is None or isinstance(value, str | bytes):
-        return None
-    try:
-        array = np.asarray(value)
-    except Exception:  # `info` may hold anything
-        return None
-    is_number = array.size > 0 and array.dtype.kind in "buif" and np.isfinite(array).all()
-    return array if is_number else None

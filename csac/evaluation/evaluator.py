@@ -50,7 +50,7 @@ class Evaluator:
         environment_arguments: keyword arguments for the environment.
         episodes: how many.
         first_seed: what episode 0 is reset with.
-        events: names in the last step's `info` to keep of each episode.
+        events: what to keep of each episode's `info` (`csac.tasks.events`).
         episode_limit: steps after which an episode is broken off; None for `LONGEST_EPISODE`.
         environments: how many to step side by side, ten at most; no number depends on it.
         lent: the one to play in instead, which stays open.
@@ -136,7 +136,7 @@ class Evaluator:
         check_contract(policy, self._environments[0])
         numbers = range(first, min(first + self._at_once, self.episodes))
         episodes = [
-            Playing(environment, number, self._first_seed + number, self.episode_limit)
+            Playing(environment, number, self._first_seed + number, self.episode_limit, self._events)
             for environment, number in zip(self._environments, numbers, strict=False)
         ]
         try:
@@ -146,7 +146,7 @@ class Evaluator:
             self.close()  # what has raised may be broken for good, and the next policy is to fail by itself alone
             raise
         self.info_names.update(*(episode.info_names() for episode in episodes))
-        return [episode.result(self._events) for episode in episodes]
+        return [episode.result() for episode in episodes]
 
     def answer(
         self,
@@ -176,7 +176,7 @@ class Evaluator:
         """
         self._make_environments(1)
         environment = self._environments[0]
-        episode = Playing(environment, number, self._first_seed + number, self.episode_limit)
+        episode = Playing(environment, number, self._first_seed + number, self.episode_limit, self._events)
         episode.start()
         state, start = None, np.ones(1, bool)
         while not episode.ended:
@@ -188,7 +188,7 @@ class Evaluator:
             action, state = answer
             episode.step(action)
             start = np.zeros(1, bool)
-        return episode.result(self._events)
+        return episode.result()
 
     def close(self) -> None:
         """Close the environments, but for one that is lent; another batch makes new ones."""

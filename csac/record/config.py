@@ -62,7 +62,8 @@ class RunConfig:
     perturbations: tuple[str, ...] = ()
     """Changes of the task in mid-training, such as friction=1.5@300000."""
     events: tuple[str, ...] = ()
-    """Names in the last `info` of an evaluation episode; each is a column of evaluations.csv."""
+    """Names in the last `info` of an episode, or NAME:sum and NAME:mean over its steps; each is a column of
+    evaluations.csv and episodes.csv."""
     task_is_callable: bool = False
     """Whether the task is a Python function, which no manifest can name."""
 

@@ -43,8 +43,7 @@ class TensorBoardLog:
         self._writer: EventsWriter | None = EventsWriter(str(folder / "events"), f".{earlier}")
         self._begin, self._began = begin, time.monotonic()
         self._flushed = self._began
-        recent = [(row["return"], row["length"]) for row in before]
-        self._recent: deque[tuple[float, int]] = deque(recent, maxlen=EPISODES_AVERAGED)
+        self._recent: deque[Row] = deque(before, maxlen=EPISODES_AVERAGED)
         self._cases = set(cases)
         if begin or earlier:  # TensorBoard drops what was written after the step that the run goes on from
             self._add(Event(step=begin + 1, session_log=SessionLog(status=SessionLog.START)))
@@ -82,9 +81,11 @@ class TensorBoardLog:
             self.flush()
 
     def _episodes(self, rows: Sequence[Row]) -> dict[str, float]:
-        self._recent.extend((row["return"], row["length"]) for row in rows)
-        returns, lengths = np.array(self._recent).T
-        return {"rollout/ep_rew_mean": float(returns.mean()), "rollout/ep_len_mean": float(lengths.mean())}
+        self._recent.extend(rows)
+        tags = {"rollout/ep_rew_mean": "return", "rollout/ep_len_mean": "length"}
+        tags |= {f"rollout/{name}": name for name in rows[-1] if name not in COLUMNS["episodes"]}
+        told = {tag: np.array([row.get(name) for row in self._recent], float) for tag, name in tags.items()}
+        return {tag: float(np.nanmean(values)) for tag, values in told.items() if not np.isnan(values).all()}
 
     def _metrics(self, rows: Sequence[Row]) -> dict[str, float]:
         row, elapsed = rows[-1], time.monotonic() - self._began

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from csac.deploy.contract import ActionBounds
 from csac.tasks.environment import Environment
+from csac.tasks.events import EpisodeEvents
 from csac.tasks.failures import EnvironmentFailure
 from csac.tasks.registry import Task
 from csac.tasks.workers import Workers
@@ -33,6 +35,7 @@ class FinishedEpisode(NamedTuple):
     place: int
     episode_return: float
     length: int
+    events: Mapping[str, bool | float | None] = MappingProxyType({})
 
 
 class Failure(NamedTuple):
@@ -69,6 +72,7 @@ class SeedEnvironments:
         seeds: the seeds.
         environments: how many each seed has.
         processes: how many share the environments; 0 steps them here. What they compute is the same.
+        events: what to keep of an episode's `info`.
 
     Raises:
         InputError: as `Environment`.
@@ -81,6 +85,7 @@ class SeedEnvironments:
         seeds: Sequence[int],
         environments: int = 1,
         processes: int = 0,
+        events: Sequence[str] = (),
     ) -> None:
         axes = (len(seeds), environments) if environments > 1 else (len(seeds),)
         self._places: list[Place] = list(np.ndindex(*axes))
@@ -107,6 +112,8 @@ class SeedEnvironments:
         self._begun = dict.fromkeys(self._places, 0)
         self._returns = dict.fromkeys(self._places, 0.0)
         self._lengths = dict.fromkeys(self._places, 0)
+        self._events = events
+        self._said = {place: EpisodeEvents(events) for place in self._places}
         self._failures: list[Failure] = []
         self.refused: dict[int, str] = {}  # why the episode saved of the seed at this place was not restored
 
@@ -130,6 +137,7 @@ class SeedEnvironments:
         next_observation, reward = self._observation.copy(), self._reward.copy()
         terminated, truncated = np.zeros(reward.shape, bool), np.zeros(reward.shape, bool)
         ended: list[Place] = []
+        episodes: list[FinishedEpisode] = []
         if self._workers:
             for place in self._running:
                 self._at[place].ask("step_environment_scale", scaled[place])
@@ -139,13 +147,16 @@ class SeedEnvironments:
             except EnvironmentFailure as error:
                 self._fail(place, error)
                 continue
-            next_observation[place], reward[place], terminated[place], truncated[place], _ = step
+            next_observation[place], reward[place], terminated[place], truncated[place], info = step
             self._returns[place] += step[1]
             self._lengths[place] += 1
+            if self._events:
+                self._said[place].add(info)
             if step[2] or step[3]:
+                said = self._said[place].of(info, self._lengths[place])
+                episodes.append(FinishedEpisode(place[0], self._returns[place], self._lengths[place], said))
                 ended.append(place)
         self._observation, self._reward = next_observation.copy(), reward
-        episodes = [FinishedEpisode(place[0], self._returns[place], self._lengths[place]) for place in ended]
         self._reset([place for place in ended if place in self._running])
         failures, self._failures = self._failures, []
         for failure in failures:
@@ -184,6 +195,7 @@ class SeedEnvironments:
             "episodes_begun": self._begun[place],
             "episode_return": self._returns[place],
             "episode_length": self._lengths[place],
+            **({"events": self._said[place].sums} if self._said[place].sums else {}),
             "exact": inner is not None,
             "problem": problem,
             "environment": inner.values if inner else {},
@@ -216,6 +228,7 @@ class SeedEnvironments:
             self.stop(place[0])
         elif is_exact and self._is_restored(place, Snapshot(arrays, values["environment"])):
             self._returns[place], self._lengths[place] = values["episode_return"], values["episode_length"]
+            self._said[place] = EpisodeEvents(self._events, values.get("events"))
         else:
             self._begun[place] -= 1
             self._reset([place])
@@ -257,6 +270,7 @@ class SeedEnvironments:
         seeds = [training_seed(self.seeds[place[0]], self._begun[place], *place[1:]) for place in places]
         for place, seed in zip(places, seeds, strict=True):
             self._returns[place], self._lengths[place] = 0.0, 0
+            self._said[place] = EpisodeEvents(self._events)
             self._begun[place] += 1
             if self._workers:
                 self._at[place].ask("reset", seed)

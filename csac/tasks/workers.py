@@ -14,6 +14,7 @@ import numpy as np
 
 from csac.processes import Child, die_with_parent, end, outlive_termination
 from csac.tasks.environment import Environment
+from csac.tasks.events import numbers_in
 from csac.tasks.failures import EnvironmentFailure
 from csac.tasks.preflight import seed_globals
 from csac.tasks.registry import Task
@@ -129,7 +130,7 @@ def _outcome(function: Any, *arguments: Any) -> tuple[Any, Exception | None, str
     try:
         result = function(*arguments)
         if function.__name__ == "step_environment_scale":
-            result = (*result[:-1], {})  # its info may hold what cannot be sent
+            result = (*result[:-1], numbers_in(result[-1]))  # its info may hold what cannot be sent
         return result, None, ""
     except Exception as error:
         return None, error, "".join(traceback.format_exception(error)) if error.__cause__ else ""

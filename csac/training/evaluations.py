@@ -11,6 +11,7 @@ from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
 from csac.evaluation.pool import EvaluationPool
+from csac.tasks.events import info_name
 from csac.tasks.perturbations import perturbations_of, values_at
 from csac.training.callbacks import mean_return
 
@@ -67,7 +68,7 @@ class Evaluations:
         self._pending: tuple[int, list[int], list[Policy], Any] | None = None
         self.step = int(runs[0].evaluations["step"].max(initial=0))  # of the newest one
         self.wants_stop = False  # whether the watcher has said so of an evaluation
-        self._unheard = set(config.events) if not len(runs[0].evaluations) else set()
+        self._unheard = {info_name(event) for event in config.events} if not len(runs[0].evaluations) else set()
 
     @property
     def is_over(self) -> bool:

@@ -61,7 +61,9 @@ class Loop:
             processes = program.environment_processes
             if processes is None:
                 processes = choose_processes(program.task, arguments, self._turn, program.threads)
-            self.environments = SeedEnvironments(program.task, arguments, seeds, self._turn, processes)
+            self.environments = SeedEnvironments(
+                program.task, arguments, seeds, self._turn, processes, self.config.events
+            )
             stack.callback(self.environments.close)
             self.learner = Learner(program.algorithm, self.environments.spec, seeds, self.steps)
             self._perturbations = perturbations_of(self.config.perturbations)
@@ -185,7 +187,7 @@ class Loop:
             self._fail(failure.place, failure.reason, failure.details)
         for episode in outcome.episodes:
             row = {"seed": self.runs[episode.place].seed, "step": self.step}
-            row |= {"return": episode.episode_return, "length": episode.length}
+            row |= {"return": episode.episode_return, "length": episode.length, **episode.events}
             self.recorders[episode.place].add("episodes", [row])
         self._actions = self.learner.step(self._observations, self._actions, outcome, self.step)
         self._observations = outcome.observation

@@ -19,12 +19,12 @@ from scalars import scalars
 from csac.algorithms import SAC
 from csac.cli import main
 from csac.console.progress import Reporter
-from csac.evaluation.episode import _number
 from csac.evaluation.evaluator import Evaluator
 from csac.evaluation.play import evaluate_run
 from csac.record.config import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.record.run import RunDirectory
 from csac.record.tables import read_rows
+from csac.tasks import events
 from csac.training.train import resume, train
 from csac.types import InputError
 
@@ -46,9 +46,9 @@ class Unreadable:
 
 def test_info_may_hold_anything():
     odd = (Unreadable(), [[1], [1, 2]], "3", b"3", None, np.nan, np.array([1, 2]), {})
-    assert [_number(value) for value in odd] == [None] * len(odd)
+    assert [events.number(value) for value in odd] == [None] * len(odd)
     good = (True, np.bool_(False), 2, np.float32(0.5), np.array([7]))
-    assert [_number(value) for value in good] == [True, 0, 2, 0.5, 7]
+    assert [events.number(value) for value in good] == [True, 0, 2, 0.5, 7]
 
 
 @pytest.mark.parametrize("number", [0, 12])
@@ -82,9 +82,9 @@ def cases(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(SUPPORT)
         folder = tmp_path_factory.mktemp("cases")
-        events = ["crashed", "stops", "nothing", "stops"]
+        names = ["crashed", "stops", "nothing", "stops"]
         run = train(
-            TINY, "probes:Cases-v0", steps=40, directory=folder / "run", events=events, reporter=reporter, **SHORT
+            TINY, "probes:Cases-v0", steps=40, directory=folder / "run", events=names, reporter=reporter, **SHORT
         )
     return run, reporter
 
@@ -107,6 +107,40 @@ def test_events_are_curves_of_tensorboard(cases):
     assert found["eval/stops"] == [(20, mean), (40, mean)]
     assert {"eval/crashed", "eval/success_rate"} <= found.keys()
     assert "eval/nothing" not in found
+
+
+class Terms(Endless):
+    """Says the step and its square in every `info`, but for the square in the fifth step."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, _ = super().step(action)
+        info = {"step_of_10": self.steps, "square": "no number" if self.steps == 5 else self.steps**2}
+        return observation, reward, terminated, truncated, info
+
+    def get_snapshot(self):
+        return {}, {"steps": self.steps}
+
+    def set_snapshot(self, arrays, values):
+        self.steps = values["steps"]
+
+
+EXPECTED = {"step_of_10": 10, "step_of_10:sum": 55, "square:sum": 385 - 25, "square:mean": 36.0, "none:sum": None}
+
+
+@pytest.mark.parametrize("environments", [1, 2])
+def test_events_of_training_episodes_are_of_the_last_step_or_sums_or_means(tmp_path, environments):
+    settings = {**SHORT, "events": tuple(EXPECTED), "checkpoint_interval": 44, "environments": environments}
+    train(TINY, Terms, steps=44, directory=tmp_path / "run", **settings)
+    settings |= {"environment_processes": environments if environments > 1 else 0}
+    run = train(TINY, Terms, steps=80, directory=tmp_path / "run", resume=True, **settings).runs[0]
+    names = tuple(name for name in EXPECTED)
+    for rows, count in ((run.rows("episodes"), 8), (run.evaluations[-1:], 1)):
+        assert len(rows) == count
+        expected = np.array([np.nan if value is None else value for value in EXPECTED.values()], float)
+        np.testing.assert_array_equal(np.array(rows[list(names)].tolist()), np.tile(expected, (count, 1)))
+    curves = scalars(run.path / "tensorboard")
+    assert curves["rollout/square:mean"][-1] == (80, 36.0)
+    assert "rollout/none:sum" not in curves
 
 
 def test_a_name_that_nobody_says_is_noted_once(cases):

@@ -1,0 +1,66 @@
+"""What `info` says in an episode under the names that a user asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+
+class EpisodeEvents:
+    """The events of one episode: a number of its last step's `info`, or of all, as `NAME:sum` or `NAME:mean`.
+
+    Args:
+        names: those of the events.
+        sums: the sums so far, of an episode that goes on.
+    """
+
+    def __init__(self, names: Sequence[str], sums: Mapping[str, float] | None = None) -> None:
+        self._names = names
+        self._summed = [name for name in names if name.endswith((":sum", ":mean"))]
+        self.sums: dict[str, float] = dict(sums or {})
+
+    def add(self, info: Mapping[str, Any]) -> None:
+        """Take the `info` of a step."""
+        for name in self._summed:
+            value = number(info.get(name.rpartition(":")[0]))
+            if value is not None:
+                self.sums[name] = self.sums.get(name, 0.0) + float(value)
+
+    def of(self, info: Mapping[str, Any], length: int) -> dict[str, bool | float | None]:
+        """Return them by name after `length` steps, of which the last gave this `info`; None where it is silent."""
+        said: dict[str, bool | float | None] = {name: number(info.get(name)) for name in self._names}
+        for name in self._summed:
+            if name in self.sums:
+                said[name] = self.sums[name] / (length if name.endswith(":mean") else 1)
+        return said
+
+
+def info_name(event: str) -> str:
+    """Return the name in `info` that an event is of."""
+    return event.rpartition(":")[0] if event.endswith((":sum", ":mean")) else event
+
+
+def numbers_in(info: Mapping[Any, Any]) -> dict[str, bool | float]:
+    """Return the numbers of an `info` by name."""
+    named = {name: number(value) for name, value in info.items() if isinstance(name, str)}
+    return {name: value for name, value in named.items() if value is not None}
+
+
+def number(value: Any) -> bool | float | None:
+    """Return a boolean or a finite number out of `info` as Python's own, and None for anything else."""
+    array = numbers(value)
+    return None if array is None or array.size != 1 else array.item()
+
+
+def numbers(value: Any) -> np.ndarray | None:
+    """Return booleans or finite numbers as an array, and None for anything else."""
+    if value is None or isinstance(value, str | bytes):
+        return None
+    try:
+        array = np.asarray(value)
+    except Exception:  # `info` may hold anything
+        return None
+    is_number = array.size > 0 and array.dtype.kind in "buif" and np.isfinite(array).all()
+    return array if is_number else None
