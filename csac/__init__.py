@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from csac.deploy.policy import Policy
     from csac.evaluation.evaluator import evaluate, evaluate_episodes
     from csac.training.callbacks import Callback, SaveEvery, StopAfterNoImprovement, StopOnReturn
+    from csac.training.learnt import load_checkpoint
     from csac.training.train import resume, train
     from csac.types import InputError
 
@@ -45,6 +46,7 @@ __all__ = [
     "evaluate",
     "evaluate_episodes",
     "load",
+    "load_checkpoint",
     "resume",
     "train",
 ]
@@ -64,6 +66,7 @@ _MODULES = {
     "evaluate": "csac.evaluation.evaluator",
     "evaluate_episodes": "csac.evaluation.evaluator",
     "load": "csac.deploy.choosing",
+    "load_checkpoint": "csac.training.learnt",
     "train": "csac.training.train",
     "resume": "csac.training.train",
 }
