@@ -1,10 +1,9 @@
 """Conservative Soft Actor-Critic and its baselines in JAX.
 
-    from csac import CSAC, train, evaluate, load
+    from csac import CSAC, evaluate, train
 
-    run = train(CSAC(), "HalfCheetah-v4", steps=60_000, directory="runs/cheetah")
-    policy = load("runs/cheetah")
-    returns = evaluate(policy, "HalfCheetah-v4", episodes=100)
+    run = train(CSAC(), "HalfCheetah-v4", steps=60_000)
+    returns = evaluate(run.policy(), "HalfCheetah-v4", episodes=100)
 
 The names are resolved on first use: importing csac imports neither JAX nor Gymnasium.
 """

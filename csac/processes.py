@@ -137,6 +137,14 @@ def _let_through() -> None:
     signal.pthread_sigmask(signal.SIG_SETMASK, _forking.mask)
 
 
+def may_be_imported() -> bool:
+    """Return whether processes may import the user's script: it has a guard, or there is none, as in a notebook."""
+    file = getattr(sys.modules["__main__"], "__file__", None)
+    with suppress(OSError, ValueError):
+        return file is None or "__main__" in Path(file).read_text(encoding="utf-8")
+    return True
+
+
 def end_if_unguarded() -> None:
     """End this process at once, and silently, if it is importing the script of its parent: that one says why."""
     if getattr(multiprocessing.current_process(), "_inheriting", False):

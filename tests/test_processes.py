@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import types
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from csac.processes import (
     control_groups,
     core_quota,
     end,
+    may_be_imported,
     memory_left,
     move_to,
     outlive_termination,
@@ -70,6 +72,20 @@ def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
     assert "InputError: this script starts processes that import it" in lines[-1]
     assert sum(line.startswith("Traceback") for line in lines) == 1
     assert not (tmp_path / "run").exists()  # once mended, the script begins there
+
+
+@pytest.mark.parametrize(
+    ("script", "may"),
+    [("train()", False), ('if __name__ == "__main__":\n    train()', True), (None, True)],
+    ids=["bare", "guarded", "none"],
+)
+def test_processes_import_a_script_that_has_a_guard(monkeypatch, tmp_path, script, may):
+    main = types.ModuleType("__main__")
+    if script:
+        (tmp_path / "script.py").write_text(script)
+        main.__file__ = str(tmp_path / "script.py")
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    assert may_be_imported() is may
 
 
 def end_what_a_task_starts(connection: Connection) -> None:

@@ -55,7 +55,7 @@ def _train(options: Any, command: str) -> int:
 def _resume(options: Resume, command: str) -> int:
     from csac.training.train import resume
 
-    return _trained(resume, **vars(options), evaluation_processes=None, environment_processes=None, command=command)
+    return _trained(resume, **vars(options), command=command)
 
 
 def _leaving_at_once() -> Any:

@@ -105,7 +105,7 @@ class Train(_Training):
     environment_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by a step's cost)")] = None
     """Processes per program that share its --environments; 0 steps them in between. The results are the same."""
     wandb: Flag = False
-    """Also log to Weights & Biases: one run per seed, in the project WANDB_PROJECT or else csac (docs/python.md)."""
+    """Also log to Weights & Biases, in the project WANDB_PROJECT or csac (docs/callbacks-and-logging.md)."""
 
     def options(self) -> dict[str, Any]:
         """Return what `train` takes as keyword arguments."""

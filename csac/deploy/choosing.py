@@ -49,6 +49,14 @@ def load(directory: str | os.PathLike[str], seed: int | None = None, which: Whic
     return load_run(choose_run(RunSet.open(directory), seed), which)
 
 
+class TrainedRuns(RunSet):
+    """What `train` and `resume` return: runs, and their policies."""
+
+    def policy(self, seed: int | None = None, which: Which = "last") -> Policy:
+        """Return the policy that `load` would. Raises InputError as `load` does."""
+        return load(self, seed, which)
+
+
 def load_run(run: RunDirectory, which: Which = "last") -> Policy:
     """Return a policy of one run. Raises InputError where it has none, or a damaged file."""
     if not has_policy(run, which):

@@ -241,7 +241,7 @@ class Evaluator:
 def evaluate(
     policy: Any,
     task: Task,
-    episodes: int = 100,
+    episodes: int = 10,
     first_seed: int = FRESH_EVALUATION_SEED,
     deterministic: bool = True,
     environment_arguments: dict[str, Any] | None = None,
@@ -259,7 +259,7 @@ def evaluate(
 def evaluate_episodes(
     policy: Any,
     task: Task,
-    episodes: int = 100,
+    episodes: int = 10,
     first_seed: int = FRESH_EVALUATION_SEED,
     deterministic: bool = True,
     environment_arguments: dict[str, Any] | None = None,

@@ -42,8 +42,8 @@ class RunConfig:
     """Environment steps per seed, warm-up included."""
     environments: int = 1
     """Environments that each seed steps side by side; steps are those of all of them together."""
-    device: Literal["cpu", "gpu"] = "cpu"
-    """Device that the networks are trained on."""
+    device: Literal["cpu", "gpu", "cuda"] = "cpu"
+    """Device that the networks are trained on; cuda is gpu."""
     evaluation_interval: int = 5_000
     """Environment steps between evaluations; there is always one at the last step. 0: none at all."""
     evaluation_episodes: int = 10

@@ -29,7 +29,7 @@ class RunSet:
         self.path, self.runs = path, list(runs)
 
     def __repr__(self) -> str:
-        return f"RunSet({str(self.path)!r}, seeds {self.seeds})"
+        return f"{type(self).__name__}({str(self.path)!r}, seeds {self.seeds})"
 
     def __fspath__(self) -> str:
         return str(self.path)

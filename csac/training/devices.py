@@ -22,7 +22,7 @@ PRECISION = "highest"  # of a GPU's matrix products; by default JAX rounds their
 
 
 def choose_device(device: str) -> None:
-    """Compute on "cpu" or "gpu" in this process and in those that it starts.
+    """Compute on "cpu" or "gpu" ("cuda") in this process and in those that it starts.
 
     A CPU's programs are dispatched asynchronously, which is JAX's default: the client looks after a program's outputs
     while it runs already. `JAX_CPU_ENABLE_ASYNC_DISPATCH=0` changes that and no number.
@@ -36,6 +36,7 @@ def choose_device(device: str) -> None:
         InputError: there is no such device, this process has computed on another one, or JAX is set to numbers or keys
             that csac does not compute with.
     """
+    device = "gpu" if device == "cuda" else device
     if device not in PLATFORMS:
         raise InputError(f"device must be cpu or gpu, not {device!r}")
     config: Any = jax.config

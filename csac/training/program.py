@@ -6,8 +6,10 @@ import pickle
 import sys
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+import gymnasium
+
 from csac.checks import check_whole
-from csac.processes import core_quota, usable_cores
+from csac.processes import core_quota, may_be_imported, usable_cores
 from csac.training.callbacks import Hears
 from csac.training.devices import preallocates
 from csac.types import InputError
@@ -113,16 +115,17 @@ class Plan(NamedTuple):
         threads = max(1, cores // len(directories))
         recorded = [run.manifest.machine.cores for run in existing.values() if run.manifest.process is not None]
         threads = recorded[0] if recorded and recorded[0] <= cores else threads
+        has_processes = can_be_sent(self.task) and may_be_imported()
         spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
         processes = self.evaluation_processes
         if processes is None:
             pays = spare > 0 and not self.hears.evaluations and 0 < config.evaluation_interval < config.steps
             pays = pays and config.evaluation_environments > 0
-            processes = min(batches, max(1, spare // len(directories))) if pays and can_be_sent(self.task) else 0
+            processes = min(batches, max(1, spare // len(directories))) if pays and has_processes else 0
         check_whole("evaluation_processes", processes, 0, 1_000)
         if not config.evaluation_environments and max(config.environments, *map(len, directories)) > 1:
             raise InputError("evaluation_environments=0 is for one environment of one seed: have one seed per process")
-        stepping = self.environment_processes if can_be_sent(self.task) else self.environment_processes or 0
+        stepping = self.environment_processes if has_processes else self.environment_processes or 0
         most = config.environments if config.environments > 1 else 0
         check_whole("environment_processes", stepping or 0, 0, most)
         if (processes or stepping or len(directories) > 1) and not can_be_sent(self.task):
@@ -149,10 +152,14 @@ class Plan(NamedTuple):
 
 def can_be_sent(task: Task) -> bool:
     """Return whether another process can be sent the task; it cannot import what a notebook or a terminal defined."""
-    if getattr(task, "__module__", "") == "__main__" and not hasattr(sys.modules["__main__"], "__file__"):
-        return False
+    has_script, maker = hasattr(sys.modules["__main__"], "__file__"), task
+    if isinstance(task, str):
+        known = gymnasium.registry.get(task)
+        if has_script or known is None:
+            return True
+        maker = known.entry_point
     try:
-        pickle.dumps(task)
+        sent = pickle.dumps(maker)
     except Exception:
         return False
-    return True
+    return has_script or b"__main__" not in sent

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from csac.checks import check_flag, check_path
+from csac.deploy.choosing import TrainedRuns
 from csac.processes import core_quota, end_if_unguarded, usable_cores
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory
@@ -57,18 +58,18 @@ def train(
     resume: bool = False,
     start_from: str | Path | None = None,
     seeds_per_process: int | None = None,
-    evaluation_processes: int | None = 0,
-    environment_processes: int | None = 0,
+    evaluation_processes: int | None = None,
+    environment_processes: int | None = None,
     tensorboard: bool = True,
     wandb: bool | str = False,
-    progress: bool = False,
+    progress: bool = True,
     reporter: Reporter | None = None,
     command: str | None = None,
     callbacks: Sequence[Callback] = (),
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
     **options: Unpack[TrainOptions],
-) -> RunSet:
+) -> TrainedRuns:
     """Train independent seeds of an algorithm on a task and return their runs.
 
     Several seeds train in processes of their own, so a script needs the usual `if __name__ == "__main__":` guard.
@@ -83,13 +84,13 @@ def train(
         start_from: `DIRECTORY` or `DIRECTORY@STEP` of a set or a run: begin with copies of the seeds' checkpoints.
         seeds_per_process: seeds that share one program; by default 1 on a CPU, and a few on a GPU. With all of them
             training stays in this process.
-        evaluation_processes: processes in which a program evaluates while it trains on (a script needs the guard then);
-            0 evaluates in between, None chooses by the cores, as the command line does. The numbers are the same.
+        evaluation_processes: processes in which a program evaluates while it trains on; 0 evaluates in between, and so
+            does None where no core is to spare, or in a script without a guard. The numbers are the same.
         environment_processes: processes of a program that share its environments, at most as many (`environments`); 0
-            steps them here, None chooses by what a step costs, as the command line does. The numbers are the same.
+            steps them here, None chooses by what a step costs, and 0 without a guard. The numbers are the same.
         tensorboard: whether to write TensorBoard files.
         wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to.
-        progress: whether to show progress on the terminal.
+        progress: whether to show progress, as the command line does.
         reporter: what shows it, instead of the terminal's own.
         command: the command line, for the manifest.
         callbacks: your own code, told how training goes (`csac.training.callbacks`), in this process.
@@ -136,7 +137,7 @@ def train(
         source.refuse_misfit(config, algorithm.cadence.has_schedule) if source else None
     for config in configs:
         _create_or_extend(place, config, groups, existing.get(config.seed), source)
-    runs = RunSet(place, [RunDirectory.open(place / f"seed-{seed}") for seed in wanted])
+    runs = TrainedRuns(place, [RunDirectory.open(place / f"seed-{seed}") for seed in wanted])
     try:
         return _run(runs, programs, watch, notes)
     except InputError:  # so that the corrected call can use the directory
@@ -148,16 +149,16 @@ def resume(
     directory: str | Path,
     *,
     steps: int | None = None,
-    evaluation_processes: int | None = 0,
-    environment_processes: int | None = 0,
+    evaluation_processes: int | None = None,
+    environment_processes: int | None = None,
     trust_task: bool = False,
-    progress: bool = False,
+    progress: bool = True,
     reporter: Reporter | None = None,
     command: str | None = None,
     callbacks: Sequence[Callback] = (),
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
-) -> RunSet:
+) -> TrainedRuns:
     """Resume a run, or every run of a set, from its newest checkpoint; everything but `steps` comes from its manifest.
 
     `trust_task` lets the task import its module though nobody has named it here (`csac.tasks.trust`); the other
@@ -168,7 +169,7 @@ def resume(
             call `train` with it and `resume=True` then.
         Interrupted, StorageFailure, CallbackFailure: as `train`.
     """
-    runs = RunSet.open(directory)
+    runs = TrainedRuns.open(directory)
     config = runs.config
     if config.task_is_callable:
         raise InputError(f"the task of {runs.path} is a Python function: call csac.train with it and resume=True")
@@ -214,7 +215,7 @@ def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_sched
         path = place / f"seed-{config.seed}"
         if is_run(path):
             if not resume:
-                raise InputError(f"{path} already holds a run: resume it, or choose another directory")
+                raise InputError(f"{path} already holds a run: resume it, or leave the directory out for a new one")
             existing[config.seed] = run = RunDirectory.open(path)
             refuse_differences(run, config, has_schedule)
     known = (".", "seed-", "curve.png")
@@ -239,7 +240,7 @@ def _create_or_extend(
         source.copy_to(run)
 
 
-def _run(runs: RunSet, programs: list[Program], watch: Watch, notes: list[str]) -> RunSet:
+def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[str]) -> TrainedRuns:
     """Train every program that is not over, show it, and draw the curve. Raises as `train`."""
     done = {run.path for run in runs.runs if watch.is_over(run)}
     programs = [program for program in programs if not done.issuperset(program.directories)]
@@ -258,7 +259,7 @@ def _run(runs: RunSet, programs: list[Program], watch: Watch, notes: list[str]) 
         elif programs:
             turns = len(usable_cores()) // programs[0].threads if runs.config.device == "cpu" else None
             supervise(programs, lambda _: watch, should_stop, _workers(), turns)
-        runs = RunSet(runs.path, [RunDirectory.open(run.path) for run in runs.runs])
+        runs = TrainedRuns(runs.path, [RunDirectory.open(run.path) for run in runs.runs])
         draw_curve(RunSet.open(runs.path), watch.note)
         if reporter:
             reporter.finish(runs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,9 @@ import csac.evaluation.export as exporting
 import csac.evaluation.play as playing
 import csac.training.train as training
 from csac.algorithms import ALGORITHMS, CSAC, SAC
+from csac.cli.options import Evaluate
 from csac.cli.parsing import value_of
+from csac.evaluation.evaluator import evaluate, evaluate_episodes
 from csac.record.run import RunDirectory
 
 TRAINED = {
@@ -89,12 +92,25 @@ def test_train_without_options_uses_the_defaults(train_call):
     assert train_call("Hopper-v4") == {"algorithm": CSAC(), "task": "Hopper-v4", "command": command, **TRAINED}
 
 
+def test_python_has_the_defaults_of_the_command_line():
+    def defaults(function):
+        return {name: item.default for name, item in inspect.signature(function).parameters.items()}
+
+    here = defaults(training.train)
+    assert {name: value for name, value in here.items() if name in TRAINED} == {
+        name: value for name, value in TRAINED.items() if name in here
+    }
+    assert here["progress"] is defaults(training.resume)["progress"] is True
+    assert defaults(training.resume)["evaluation_processes"] is here["evaluation_processes"]
+    assert Evaluate.episodes == defaults(evaluate)["episodes"] == defaults(evaluate_episodes)["episodes"]
+
+
 def test_resume_passes_its_options_on(monkeypatch):
     calls = calls_of(monkeypatch, training, "resume", make_set(Path("runs"), [[1.0]]))
     line = "resume runs --steps 2e3 --trust-task"
     assert csac(line) == csac("resume runs") == 0
     assert calls == [
-        {"directory": Path("runs"), "evaluation_processes": None, "environment_processes": None, **options}
+        {"directory": Path("runs"), **options}
         for options in (
             {"steps": 2_000, "trust_task": True, "command": f"csac {line}"},
             {"steps": None, "trust_task": False, "command": "csac resume runs"},

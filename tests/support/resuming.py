@@ -50,10 +50,11 @@ SHORT: dict[str, Any] = {
     "tensorboard": False,
     "evaluation_processes": 0,
     "checkpoint_interval": 120,
+    "progress": False,
 }
 
 
-def run(directory: Path, algorithm=LEARNERS[0], steps: int = 500, task: Any = "Hopper-v4", **settings: Any):
+def run(directory: Path | None, algorithm=LEARNERS[0], steps: int = 500, task: Any = "Hopper-v4", **settings: Any):
     return train(algorithm, task, steps=steps, directory=directory, **{**SHORT, **settings})
 
 

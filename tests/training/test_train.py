@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import sys
+import types
 import warnings
+from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from probes import Probe
 from resuming import LEARNERS, SMALL, contents, run
 
@@ -16,6 +21,7 @@ import csac
 from csac import InputError
 from csac.algorithms import SAC
 from csac.record.sets import RunSet
+from csac.training.program import can_be_sent
 
 
 class Falling(Probe):
@@ -177,6 +183,29 @@ def test_what_is_there_already_is_not_overwritten(tmp_path):
     (tmp_path / "other" / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match="not empty"):
         run(tmp_path / "other", steps=200)
+
+
+def test_without_a_directory_each_call_makes_a_new_one_whose_policies_are_at_hand(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    one, other = (run(None, steps=200) for _ in range(2))
+    assert one.path != other.path
+    observation = np.zeros(11, np.float32)
+    ours, theirs = one.policy().predict(observation), csac.load(other, 0).predict(observation)
+    np.testing.assert_array_equal(ours[0], theirs[0])
+    with pytest.raises(InputError, match="no seed 7"):
+        one.policy(7)
+
+
+def test_what_a_notebook_defines_is_not_sent_to_a_process(monkeypatch):
+    notebook: Any = types.ModuleType("__main__")
+    exec("class Cell: ...", notebook.__dict__)
+    monkeypatch.setitem(sys.modules, "__main__", notebook)
+    monkeypatch.setitem(gymnasium.registry, "Cell-v0", EnvSpec("Cell-v0", notebook.Cell))
+    for task in (notebook.Cell, partial(notebook.Cell), "Cell-v0", lambda: None):
+        assert not can_be_sent(task)
+    assert can_be_sent("Pendulum-v1")
+    notebook.__file__ = "script.py"
+    assert can_be_sent(notebook.Cell)
 
 
 def test_a_task_that_changes_the_working_directory_moves_no_file(tmp_path, monkeypatch):
