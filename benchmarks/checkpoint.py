@@ -80,4 +80,4 @@ def render(rows: list[Row]) -> str:
     return formatted([row | size for row, size in zip(rows, sizes, strict=True)], columns)
 
 
-PARTS = [Part("checkpoint", "docs/saving-and-resuming.md", "seconds and bytes", ["one seed"], measure, render)]
+PARTS = [Part("checkpoint", "benchmarks/README.md", "seconds and bytes", ["one seed"], measure, render)]

@@ -16,7 +16,7 @@ from benchmarks.part import Options, Part
 from benchmarks.tables import Row
 from csac.types import InputError
 
-PAGE = "docs/gpu.md"
+PAGE = "benchmarks/README.md"
 
 
 class Case(NamedTuple):

@@ -101,4 +101,4 @@ def draw(rows: list[Row], path: Path) -> None:
 
 
 SIZES = [Size(axis, value) for axis, values in AXES.items() for value in values]
-PARTS = [Part("growth", "docs/performance.md", "a table for each axis", SIZES, measure, render, draw=draw)]
+PARTS = [Part("growth", "benchmarks/limit.md", "a table for each axis", SIZES, measure, render, draw=draw)]

@@ -15,7 +15,7 @@ from benchmarks.part import Options, Part
 from benchmarks.products import DOMINANT, Product, operations, update_products
 from benchmarks.tables import Row, grouped, table, with_range
 
-PAGE = "docs/performance.md"
+PAGE = "benchmarks/limit.md"
 PRODUCTS = {
     "forward, hidden layer": DOMINANT,
     "forward, a critic's first layer": Product(256, 23, 256),

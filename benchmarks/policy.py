@@ -115,6 +115,6 @@ def render_evaluations(rows: list[Row]) -> str:
 
 
 PARTS = [
-    Part("latency", "docs/deploy.md", "one action", LATENCIES, measure_latency, render_latencies, 3),
+    Part("latency", "benchmarks/README.md", "one action", LATENCIES, measure_latency, render_latencies, 3),
     Part("evaluation", "benchmarks/README.md", "ten episodes", EVALUATIONS, measure_evaluation, render_evaluations, 3),
 ]

@@ -46,4 +46,4 @@ COLUMNS = {
     "steps/s": "{steps_per_second:,.0f}",
     "length of a random episode": "{episode_length:,.0f}",
 }
-PARTS = [Part("stepping", "docs/tasks.md", "each task alone", TASKS, measure, COLUMNS)]
+PARTS = [Part("stepping", "benchmarks/README.md", "each task alone", TASKS, measure, COLUMNS)]

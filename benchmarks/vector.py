@@ -94,4 +94,4 @@ def render(rows: Sequence[Row]) -> str:
     return table(["setting", "", *head, "peak memory, MiB"], lines)
 
 
-PARTS = [Part("vector", "docs/vector-environments.md", "several environments", CASES, measure, render, 3, peers.notes)]
+PARTS = [Part("vector", "benchmarks/README.md", "several environments", CASES, measure, render, 3, peers.notes)]

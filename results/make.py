@@ -1,4 +1,4 @@
-"""Fill in the tables of the pages in results/ and of two in docs/, and draw their pictures: `make results`.
+"""Fill in the tables of the pages in results/ and of docs/results.md, and draw their pictures: `make results`.
 
 A page says in a comment what stands below it: `<!-- table`, lines of TOML, `-->`, and at the end `<!-- end -->`. Their
 `kind` is a function in KINDS, the others are its arguments. Each folder has `runs.csv`, a row for each run,
@@ -292,8 +292,8 @@ KINDS = {
 def main(root: Path = Path(__file__).parents[1], has_pictures: bool = True) -> None:
     """Make every page of a working copy."""
     runs = read_runs(root / "results")
-    in_docs = (root / "docs" / name for name in ("relative-entropy.md", "results.md"))
-    for path in (*sorted(root.glob("results/*/README.md")), *in_docs):
+    others = root / "results" / "reference" / "mechanism.md", root / "docs" / "results.md"
+    for path in (*sorted(root.glob("results/*/README.md")), *others):
         Page(path, runs, has_pictures).fill_in()
 
 

@@ -1,4 +1,4 @@
-"""What README shows runs; the examples about the theory print what it says, and documents hold what they print."""
+"""What README and the tutorials show runs, commands on all pages parse, and pages hold what the examples print."""
 
 from __future__ import annotations
 
@@ -7,38 +7,96 @@ import math
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import nbformat
 import numpy as np
 import optax
 import pytest
+from nbclient import NotebookClient
+
+import csac.studies.commands as study_commands
+from csac.cli.commands import COMMANDS
+from csac.cli.options import parse_training
+from csac.cli.parsing import parse
 
 ROOT = Path(__file__).parents[1]
 LAG = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "reference_lag.py")))
 READING = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "minibatch_reading.py")))
 NUMBER = re.compile(r"[-+]?\d+\.?\d*")
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-SHORT = {"10000": "350", "8000": "330", "8_000": "330", "1000": "300", "1_000": "300"}  # steps on the page and here
+# Numbers on a page and here.
+SHORT = {
+    "10000": "350",
+    "20000": "350",
+    "8000": "330",
+    "6000": "300",
+    "1000": "300",
+    "500": "250",
+    "100": "20",
+    "50": "4",
+}
+TUTORIALS = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/tutorials/*.md"))
+NOTEBOOK = ROOT / "examples" / "first_controller.ipynb"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["README.md"])
+@pytest.mark.parametrize("page", ["README.md", *TUTORIALS])
 def test_what_a_page_shows_runs(page, tmp_path):
+    """A block whose first line is `# name.py` is also saved under that name."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     blocks = BLOCK.findall((ROOT / page).read_text())
-    assert {language for language, _ in blocks} == {"sh", "python"}
+    assert "python" in {language for language, _ in blocks}
     for language, block in blocks:
-        text = re.sub(r"\b\d[\d_]*\b", lambda found: SHORT.get(found[0], found[0]), block)
+        text = re.sub(r"\b\d[\d_]*\b", lambda found: SHORT.get(found[0].replace("_", ""), found[0]), block)
         if importlib.util.find_spec("pygame") is None:  # draws Pendulum
             text = re.sub("^csac play .*$", "", text, flags=re.MULTILINE)
+        if named := re.match(r"# (\w+\.py)\n", text):
+            (tmp_path / named[1]).write_text(text)
         command = ["bash", "-ec", text] if language == "sh" else [sys.executable, "-c", text]
         done = subprocess.run(
             command, cwd=tmp_path, env=os.environ | {"PATH": path}, capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_and_draws(tmp_path):
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    for cell in notebook.cells:
+        cell.source = cell.source.replace("STEPS = 8_000", "STEPS = 330").replace("1_000", "300")
+    NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": tmp_path}}).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 5
+
+
+PAGES = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/**/*.md"))]
+VARIABLE = re.compile(r"^(TASK|DIR|OTHER|FILE|FIRST|NAME|RUN)\b|\$|\.\.\.")  # what a reader replaces
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_python_compiles_and_commands_parse(page):
+    for language, block in re.findall(r"^```(\w*)\n(.*?)^```$", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE):
+        if language == "python":
+            compile(block, page, "exec")
+        elif language in ("", "sh"):
+            for line in block.replace("\\\n", " ").splitlines():
+                words = shlex.split(line, comments=True) if line.lstrip().startswith("csac ") else []
+                if words and not any(map(VARIABLE.search, words)) and "--from" not in words:
+                    parsed(words[1], words[2:])
+
+
+def parsed(name: str, words: list[str]) -> object:
+    """Return the options of a command. Raises InputError for one that there is not."""
+    if name in ("study", "report"):
+        kind = study_commands.COMMANDS[words.pop(0)][0] if name == "study" else study_commands.Report
+        return parse(kind, words, f"csac {name}")
+    kind = COMMANDS[name][0]
+    return (parse_training if name in ("train", "tune") else parse)(kind, words, f"csac {name}")
 
 
 def test_the_front_page_is_read_in_minutes():
@@ -169,13 +227,11 @@ def test_only_noise_is_left_of_a_sampled_relative_entropy_towards_the_actor_itse
 
 
 @pytest.mark.parametrize(
-    ("example", "document"),
-    [pytest.param(LAG, "docs/relative-entropy.md", marks=pytest.mark.slow), (READING, "docs/algorithms/csac.md")],
-    ids=["reference_lag", "minibatch_reading"],
+    "example", [pytest.param(LAG, marks=pytest.mark.slow), READING], ids=["reference_lag", "minibatch_reading"]
 )
-def test_documents_hold_what_an_example_prints(example, document, capsys):
+def test_a_page_holds_what_an_example_prints(example, capsys):
     example.main()
-    told = (ROOT / document).read_text()
+    told = (ROOT / "results" / "reference" / "mechanism.md").read_text()
     for table in capsys.readouterr().out.strip().split("\n\n"):
         heading, *_ = table.splitlines()
         held = told[told.index(f"```\n{heading}\n") + 4 :].partition("\n```")[0]

@@ -17,7 +17,7 @@ from shown import make_set
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results.md"
-PAGES = [*ROOT.glob("results/*/README.md"), ROOT / "docs" / "relative-entropy.md", RESULTS]
+PAGES = [*ROOT.glob("results/*/README.md"), ROOT / "results" / "reference" / "mechanism.md", RESULTS]
 
 
 def rows(*curves: list[float]) -> np.ndarray:

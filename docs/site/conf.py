@@ -37,31 +37,33 @@ NAVIGATION = {
     "Tutorials": [
         f"docs/tutorials/{name}" for name in ("first-controller", "your-own-environment", "from-training-to-a-robot")
     ],
-    "Use": [
-        "docs/python",
+    "How to": [
+        "docs/choosing-an-algorithm",
+        "docs/callbacks-and-logging",
         "docs/saving-and-resuming",
-        "docs/from-stable-baselines3",
-        "docs/tasks",
+        "docs/vector-environments",
+        "docs/learning-options",
         "docs/perturbations",
         "docs/deploy",
+        "docs/tuning",
         "docs/studies",
         "docs/cluster",
-        "docs/tuning",
-        "docs/learning-options",
-        "docs/vector-environments",
-        "docs/glossary",
-    ],
-    "Algorithms": [f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")]
-    + ["docs/relative-entropy"],
-    "Measured": [
-        "docs/results",
-        "docs/performance",
-        "docs/statistics",
         "docs/gpu",
-        "benchmarks/README",
-        "results/*/*",
+        "docs/from-stable-baselines3",
+        "docs/troubleshooting",
+        "docs/adding-an-algorithm",
     ],
-    "Inside": ["docs/design", "docs/adding-an-algorithm", "CONTRIBUTING", "docs/reference/csac", "CHANGELOG"],
+    "Reference": [
+        "docs/python",
+        *[f"docs/algorithms/{name}" for name in ("csac", "sac", "td3", "sd3", "ppo", "critics")],
+        "docs/tasks",
+        "docs/statistics",
+        "docs/glossary",
+        "docs/reference/csac",
+        "CHANGELOG",
+    ],
+    "Explanation": ["docs/results", "docs/relative-entropy", "docs/performance", "docs/design", "CONTRIBUTING"],
+    "Measured": ["results/README", "benchmarks/README", "benchmarks/limit", "results/*/*"],
 }
 
 
