@@ -201,8 +201,8 @@ def test_what_a_notebook_defines_is_not_sent_to_a_process(monkeypatch):
     exec("class Cell: ...", notebook.__dict__)
     monkeypatch.setitem(sys.modules, "__main__", notebook)
     monkeypatch.setitem(gymnasium.registry, "Cell-v0", EnvSpec("Cell-v0", notebook.Cell))
-    for task in (notebook.Cell, partial(notebook.Cell), "Cell-v0", lambda: None):
-        assert not can_be_sent(task)
+    tasks: list[Any] = [notebook.Cell, partial(notebook.Cell), "Cell-v0", lambda: None]
+    assert not any(map(can_be_sent, tasks))
     assert can_be_sent("Pendulum-v1")
     notebook.__file__ = "script.py"
     assert can_be_sent(notebook.Cell)
