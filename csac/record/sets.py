@@ -17,6 +17,7 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from typing import Self
 
     from csac.record.config import RunConfig
     from csac.record.run import Table
@@ -35,7 +36,7 @@ class RunSet:
         return str(self.path)
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str]) -> RunSet:
+    def open(cls, path: str | os.PathLike[str]) -> Self:
         """Open the runs below a folder, or a run. Raises InputError where there is none, or a manifest is damaged."""
         check_path("a run directory", path)
         path = Path(os.path.abspath(path))
