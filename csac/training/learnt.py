@@ -83,7 +83,7 @@ class Learnt:
         def of_one(observation: jax.Array, action: jax.Array) -> list[jax.Array]:
             return [q_value(critic, normalise(statistics, observation), action) for critic in critics]
 
-        values = np.stack(jax.vmap(of_one)(flat, inner.astype(np.float32)), axis=-1)
+        values = np.stack(jax.vmap(of_one)(jax.numpy.asarray(flat), jax.numpy.asarray(inner, np.float32)), axis=-1)
         return values if self._contract.flatten(observations).ndim == 2 else values[0]
 
     def _critics(self) -> tuple[list[Any], Any]:
@@ -116,7 +116,7 @@ class Learnt:
         if len(rows):
             for lost in self._checkpoint.fill(rows):
                 warnings.warn(lost, stacklevel=3)
-        in_order = rows[np.arange(first, last) % max(len(rows), 1)]
+        in_order = jax.numpy.asarray(rows[np.arange(first, last) % max(len(rows), 1)])
         return Transition(*map(np.asarray, jax.vmap(unpack, (0, None))(in_order, self._contract.spec)))
 
 

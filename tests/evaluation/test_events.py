@@ -178,7 +178,7 @@ class Wandering(Endless):
 
 @pytest.mark.parametrize("line", ["evaluate run --processes 1 --csv place.csv", "export run --out place.csv"])
 def test_paths_are_those_of_where_the_command_was_typed(tmp_path, monkeypatch, line):
-    monkeypatch.setitem(gymnasium.registry, "Wandering-v0", EnvSpec("Wandering-v0", Wandering))
+    monkeypatch.setitem(gymnasium.registry, "Wandering-v0", EnvSpec("Wandering-v0", lambda **_: Wandering()))
     monkeypatch.chdir(tmp_path)
     run_of_task(Path("run"), "Wandering-v0")
     assert main([*line.split(), "--episodes", "1"]) == 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -98,6 +100,7 @@ def test_the_pairs_of_sd3_have_a_critic_each_and_ppo_has_none(tmp_path):
 
 def test_a_checkpoint_that_is_not_there_is_one_line(sac):
     assert csac.load_checkpoint(sac, step=120).step == 120
-    for given, name in (({"step": 60}, "60"), ({"seed": 5}, "5"), ({"step": "last"}, "step")):
+    cases: list[tuple[dict[str, Any], str]] = [({"step": 60}, "60"), ({"seed": 5}, "5"), ({"step": "last"}, "step")]
+    for given, name in cases:
         with pytest.raises(InputError, match=name):
             csac.load_checkpoint(sac, **given)
