@@ -34,7 +34,7 @@ class State(NamedTuple):
     actor_optimiser: Any
     critic_optimiser: Any
     learnt_weights: LearntWeights | None = None
-    observations: Statistics | None = None
+    observation_statistics: Statistics | None = None
     actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
 
@@ -74,7 +74,61 @@ class CSAC(TwinCritics):
         if is_learnt and self.reference_period < least:  # else the actor may not have moved away from its reference
             raise InputError(f"relative_entropy_weight auto needs a reference_period of at least {least}")
 
-    def bracket_terms(
+    def init(self, key: Key, spec: Spec, steps: int) -> State:
+        """Return random networks; targets and reference are copies (Algorithm 1, line 1)."""
+        networks, given = self.first_networks(key, spec, steps, 2 * spec.action_size), self.given_weights
+        return State(
+            **networks,
+            reference=copy_tree(networks["actor"]),
+            learnt_weights=adaptation.make_weights(given, make_optimiser(self.weight_learning_rate)),
+            actor_metrics=first_metrics(("actor_loss", "entropy", "relative_entropy"), self.policy_delay),
+        )
+
+    def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
+        """Return ã(s, ξ) to explore (Eq. actor), else tanh(mean)."""
+        policy = policy_at(state.actor, normalise(state.observation_statistics, observation))
+        return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
+
+    def policy(self, state: State) -> PolicyNetwork:
+        """Return the actor's layers, and what it sees observations by."""
+        return policy_network(state.actor, state.observation_statistics, "tanh_gaussian")
+
+    def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
+        """Run the update phase of Algorithm 1, lines 12 to 23, on the mini-batch of line 13."""
+        statistics, batch = normalise_batch(state.observation_statistics, batch)
+        target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
+        weights = adaptation.current_weights(self.given_weights, state.learnt_weights)
+        # Line 12: φ_p ← φ; an average moves later, in `improve`
+        reference = self.reference_before(state.reference, state.actor, step)
+        state = state._replace(reference=reference, observation_statistics=statistics)
+        # Lines 16 to 19: a' ~ π(·|s'), then y(s, a, s'), then a step down Σᵢ [Qᵢ(s, a) - y]²
+        critic_target = partial(self.critic_target, actor=state.actor, reference=reference, weights=weights)
+        adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
+        state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
+        # Line 21: a step down J(φ)
+        given = (folded_critics, batch.observation, actor_noise, step)
+        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
+        # Line 23: θ̂ᵢ ← ρ θᵢ + (1 - ρ) θ̂ᵢ
+        state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
+        return state, {**metrics, **actor_metrics, **adaptation.weight_metrics(weights, state.learnt_weights)}
+
+    def improve(
+        self, state: State, critics: Critics, observations: Observations, noise: Actions, step: Count
+    ) -> tuple[State, Metrics]:
+        """Return the state after one step on the actor, then of a running average and of weights that are learnt."""
+        weights = adaptation.current_weights(self.given_weights, state.learnt_weights)
+        loss = partial(self.actor_loss, reference=state.reference, critics=critics, weights=weights)
+        adam = self.optimiser(self.actor_learning_rate)
+        actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)
+        new_state = state._replace(
+            actor=actor,
+            actor_optimiser=optimiser,
+            reference=self.reference_after(state.reference, state.actor),
+            learnt_weights=self.update_weights(state, metrics, noise.shape[-1], step),
+        )
+        return new_state, metrics
+
+    def soft_value_terms(
         self, observation: Observation, noise: Action, *, actor: MLP, reference: MLP, critics: Critics
     ) -> tuple[Scalar, Scalar, Scalar]:
         """Return min Q, log π and log(π/π̃) or its mean, the KL, at ã(s, ξ): the terms of the bracket in Eq. Q_CSAC."""
@@ -89,7 +143,7 @@ class CSAC(TwinCritics):
     ) -> Scalar:
         """Return y = r + γ [min Q - σ log π - τ log(π/π̃)] at s' (Eq. Q_TD_2), and no future after a terminal step."""
         sigma, tau = weights
-        q_value, log_prob, relative_entropy = self.bracket_terms(
+        q_value, log_prob, relative_entropy = self.soft_value_terms(
             transition.next_observation, noise, actor=actor, reference=reference, critics=targets
         )
         value = q_value - sigma * bounded(log_prob, self.target_log_prob_bound)
@@ -102,7 +156,7 @@ class CSAC(TwinCritics):
     ) -> tuple[Scalar, Metrics]:
         """Return J(φ) = (τ + σ) log π - τ log π̃ - min Q at ã(s, ξ) (Eq. actor_update_2), and what to log."""
         sigma, tau = weights
-        q_value, log_prob, relative_entropy = self.bracket_terms(
+        q_value, log_prob, relative_entropy = self.soft_value_terms(
             observation, noise, actor=actor, reference=reference, critics=critics
         )
         loss = -(q_value - sigma * log_prob - tau * relative_entropy)
@@ -121,70 +175,16 @@ class CSAC(TwinCritics):
         """Return φ_p to keep, given that of the update and the actor before it."""
         return polyak(used, actor, self.reference_rate) if self.reference_policy == "average" else used
 
-    def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
-        """Run the update phase of Algorithm 1, lines 12 to 23, on the mini-batch of line 13."""
-        observations, batch = normalise_batch(state.observations, batch)
-        target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
-        weights = adaptation.current_weights(self.given_weights, state.learnt_weights)
-        # Line 12: φ_p ← φ
-        reference = self.reference_before(state.reference, state.actor, step)
-        state = state._replace(reference=reference, observations=observations)
-        # Lines 16 to 19: a' ~ π(·|s'), then y(s, a, s'), then a step down Σᵢ [Qᵢ(s, a) - y]²
-        critic_target = partial(self.critic_target, actor=state.actor, reference=reference, weights=weights)
-        adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
-        state, critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
-        # Line 21: a step down J(φ)
-        given = (critics, batch.observation, actor_noise, step)
-        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
-        # Line 23: θ̂ᵢ ← ρ θᵢ + (1 - ρ) θ̂ᵢ
-        state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
-        return state, {**metrics, **actor_metrics, **adaptation.weight_metrics(weights, state.learnt_weights)}
-
-    def improve(
-        self, state: State, critics: Critics, observations: Observations, noise: Actions, step: Count
-    ) -> tuple[State, Metrics]:
-        """Return the state after one step on the actor, then of a running average and of weights that are learnt."""
-        weights = adaptation.current_weights(self.given_weights, state.learnt_weights)
-        loss = partial(self.actor_loss, reference=state.reference, critics=critics, weights=weights)
-        adam = self.optimiser(self.actor_learning_rate)
-        actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)
-        new_state = state._replace(
-            actor=actor,
-            actor_optimiser=optimiser,
-            reference=self.reference_after(state.reference, state.actor),
-            learnt_weights=self.adapted(state, metrics, noise.shape[-1], step),
-        )
-        return new_state, metrics
-
     @property
     def given_weights(self) -> Weights:
         """σ and τ, or `auto`."""
         return Weights(self.entropy_weight, self.relative_entropy_weight)
 
-    def adapted(self, state: State, metrics: Metrics, dimensions: int, step: Count) -> LearntWeights | None:
+    def update_weights(self, state: State, metrics: Metrics, dimensions: int, step: Count) -> LearntWeights | None:
         """Return the learnt weights after one step: σ follows the entropy, τ the KL at the end of the last period."""
         target = adaptation.entropy_target(self.target_entropy, dimensions)
         targets = Weights(target, self.target_relative_entropy * dimensions)
-        until_renewal = self.reference_period - step % self.reference_period
-        is_last = self.reference_policy == "average" or until_renewal <= self.policy_delay
+        until_refresh = self.reference_period - step % self.reference_period
+        is_last = self.reference_policy == "average" or until_refresh <= self.policy_delay
         adam = make_optimiser(self.weight_learning_rate)
         return adaptation.adapt_weights(state.learnt_weights, metrics, targets, is_last, adam)
-
-    def init(self, key: Key, spec: Spec, steps: int) -> State:
-        """Return random networks; targets and reference are copies (Algorithm 1, line 1)."""
-        networks, given = self.first_networks(key, spec, steps, 2 * spec.action_size), self.given_weights
-        return State(
-            **networks,
-            reference=copy_tree(networks["actor"]),
-            learnt_weights=adaptation.make_weights(given, make_optimiser(self.weight_learning_rate)),
-            actor_metrics=first_metrics(("actor_loss", "entropy", "relative_entropy"), self.policy_delay),
-        )
-
-    def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
-        """Return ã(s, ξ) to explore (Eq. actor), else tanh(mean)."""
-        policy = policy_at(state.actor, normalise(state.observations, observation))
-        return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
-
-    def policy(self, state: State) -> PolicyNetwork:
-        """Return the actor's layers, and what it sees observations by."""
-        return policy_network(state.actor, state.observations, "tanh_gaussian")

@@ -150,7 +150,9 @@ class TwinCritics(OffPolicy):
             "target_critics": copy_tree(critics) if self.critic_normalisation == "none" else None,
             "actor_optimiser": init_optimiser(actor_adam, actor),
             "critic_optimiser": init_optimiser(self.optimiser(self.critic_learning_rate, planned), critics),
-            "observations": Statistics.create((spec.observation_size,)) if self.normalise_observations else None,
+            "observation_statistics": Statistics.create((spec.observation_size,))
+            if self.normalise_observations
+            else None,
         }
 
 

@@ -61,7 +61,7 @@ class State(NamedTuple):
 
     parameters: Parameters
     optimiser: Any
-    observations: Statistics  # [observation]
+    observation_statistics: Statistics  # [observation]
     returns: Statistics  # [] of the discounted return so far in each episode
     discounted_return: Float[Array, "..."]  # of the episode, or [environment] episodes, that the last rollout broke off
     total_updates: Scalar  # in this run
@@ -164,7 +164,7 @@ class PPO(Architecture):
         in_time = by_environment(batch, state)
         returns, discounted_return = discounted_returns(state.discounted_return, in_time, self.discount)
         absorbed = state._replace(
-            observations=state.observations.absorb(batch.observation),
+            observation_statistics=state.observation_statistics.absorb(batch.observation),
             returns=state.returns.absorb(returns.ravel()),
             discounted_return=discounted_return,
         )
@@ -192,9 +192,11 @@ class PPO(Architecture):
         """Return what there is to learn from: densities by the state that acted, all else by the newest statistics."""
 
         def log_prob(observation: Observation, action: Action) -> Scalar:
-            return policy_at(state.parameters, self.normalise(state.observations, observation)).log_prob(action)
+            return policy_at(state.parameters, self.normalise(state.observation_statistics, observation)).log_prob(
+                action
+            )
 
-        normalise = jax.vmap(partial(self.normalise, absorbed.observations))
+        normalise = jax.vmap(partial(self.normalise, absorbed.observation_statistics))
         observations, next_observations = normalise(batch.observation), normalise(batch.next_observation)
         value = jax.vmap(partial(value_at, state.parameters))
         values, next_values = value(observations), value(next_observations)
@@ -259,7 +261,7 @@ class PPO(Architecture):
         return State(
             parameters=parameters,
             optimiser=init_optimiser(self._optimiser(self.learning_rate), parameters),
-            observations=Statistics.create((spec.observation_size,)),
+            observation_statistics=Statistics.create((spec.observation_size,)),
             returns=Statistics.create(()),
             discounted_return=jnp.zeros(spec.environments if spec.environments > 1 else ()),
             total_updates=jnp.float32(self.cadence.updates(steps)),
@@ -267,14 +269,14 @@ class PPO(Architecture):
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return an unclipped sample to explore, else the mean clipped to [-1, 1]."""
-        policy = policy_at(state.parameters, self.normalise(state.observations, observation))
+        policy = policy_at(state.parameters, self.normalise(state.observation_statistics, observation))
         if explore:
             return policy.sample(jax.random.normal(key, policy.mean.shape))
         return jnp.clip(policy.mean, -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, its spread and the statistics that it sees observations by."""
-        actor, statistics = state.parameters.actor, state.observations
+        actor, statistics = state.parameters.actor, state.observation_statistics
         normaliser = Normaliser(statistics.mean, statistics.std, jnp.float32(self.normalisation_limit))
         parameters = PolicyParameters(
             actors=(actor.layers,),

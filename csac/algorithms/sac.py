@@ -29,7 +29,7 @@ class State(NamedTuple):
     temperature: LearntWeight  # a fixed one as well
     actor_optimiser: Any
     critic_optimiser: Any
-    observations: Statistics | None = None
+    observation_statistics: Statistics | None = None
     actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
 
@@ -69,16 +69,16 @@ class SAC(TwinCritics):
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Take one gradient step on the critics, then on the actor and the temperature; move the target critics."""
-        observations, batch = normalise_batch(state.observations, batch)
-        state = state._replace(observations=observations)
+        statistics, batch = normalise_batch(state.observation_statistics, batch)
+        state = state._replace(observation_statistics=statistics)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.temperature.log_weight)
 
         critic_target = partial(self.critic_target, actor=state.actor, temperature=temperature)
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
-        state, critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
+        state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
 
-        given = (critics, batch.observation, actor_noise)
+        given = (folded_critics, batch.observation, actor_noise)
         state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
         state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
         return state, {**metrics, **actor_metrics, "temperature": temperature}
@@ -108,9 +108,9 @@ class SAC(TwinCritics):
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return a sampled action to explore, else tanh(mean)."""
-        policy = policy_at(state.actor, normalise(state.observations, observation))
+        policy = policy_at(state.actor, normalise(state.observation_statistics, observation))
         return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, and what it sees observations by."""
-        return policy_network(state.actor, state.observations, "tanh_gaussian")
+        return policy_network(state.actor, state.observation_statistics, "tanh_gaussian")

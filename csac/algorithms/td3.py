@@ -27,7 +27,7 @@ class State(NamedTuple):
     target_critics: Critics | None
     actor_optimiser: Any
     critic_optimiser: Any
-    observations: Statistics | None = None
+    observation_statistics: Statistics | None = None
     actor_metrics: Metrics | None = None  # those of the actor's last step, where it waits
 
 
@@ -64,15 +64,15 @@ class TD3(TwinCritics):
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Take one gradient step on the critics; every `policy_delay`-th time move the actor, then the targets."""
-        observations, batch = normalise_batch(state.observations, batch)
-        state = state._replace(observations=observations)
+        statistics, batch = normalise_batch(state.observation_statistics, batch)
+        state = state._replace(observation_statistics=statistics)
         noise = jax.random.normal(key, batch.action.shape)
 
         critic_target = partial(self.critic_target, target_actor=state.target_actor)
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(self.smoothed_action, state.target_actor)
-        state, critics, metrics = update_critics(adam, state, batch, noise, critic_target, next_action)
+        state, folded_critics, metrics = update_critics(adam, state, batch, noise, critic_target, next_action)
 
-        given = (critics, batch.observation)
+        given = (folded_critics, batch.observation)
         state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
         return state, {**metrics, **actor_metrics}
 
@@ -96,11 +96,11 @@ class TD3(TwinCritics):
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return tanh(actor), with noise and clipped to [-1, 1] to explore."""
-        action = jnp.tanh(state.actor(normalise(state.observations, observation)))
+        action = jnp.tanh(state.actor(normalise(state.observation_statistics, observation)))
         if not explore:
             return action
         return jnp.clip(action + self.exploration_std * self.noise(key, action.size), -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, and what it sees observations by."""
-        return policy_network(state.actor, state.observations, "tanh")
+        return policy_network(state.actor, state.observation_statistics, "tanh")

@@ -164,7 +164,7 @@ class _QueueWatcher:
         # Nobody waits until it was heard: Ray would lend the core of who waits to another run.
         self.sent = [*self.sent[-100:], self.messages.actor.put.remote((self.index, name, arguments))]
 
-    def turn(self, step: int) -> None:
+    def wait_for_turn(self, step: int) -> None:
         pass
 
     def progress(self, steps: Mapping[int, int]) -> None:

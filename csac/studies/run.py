@@ -159,7 +159,7 @@ class RunProgress(NamedTuple):
     study: Progress
     path: Path
 
-    def turn(self, step: int) -> None:
+    def wait_for_turn(self, step: int) -> None:
         """Nothing to do: the supervisor gives turns."""
 
     def progress(self, steps: Mapping[int, int]) -> None:

@@ -68,11 +68,11 @@ class Evaluations:
         self._pending: tuple[int, list[int], list[Policy], Any] | None = None
         self.step = int(runs[0].evaluations["step"].max(initial=0))  # of the newest one
         self.wants_stop = False  # whether the watcher has said so of an evaluation
-        self._unheard = {info_name(event) for event in config.events} if not len(runs[0].evaluations) else set()
+        self._missing_events = {info_name(event) for event in config.events} if not len(runs[0].evaluations) else set()
 
     @property
     def is_over(self) -> bool:
-        """Whether an evaluation has been made that `settle` has not recorded yet."""
+        """Whether an evaluation has been made that `finish` has not recorded yet."""
         return bool(self._pending and self._pending[3].is_over)
 
     def policy(self, network: PolicyNetwork, step: int) -> Policy:
@@ -87,39 +87,39 @@ class Evaluations:
 
     def begin(self, step: int, networks: Sequence[PolicyNetwork], task_step: int) -> None:
         """Begin to evaluate each seed's network after `step`, on the task of `task_step`."""
-        self.settle()
+        self.finish()
         self.step = step
-        places = [i for i in np.flatnonzero(self.environments.alive).tolist() if is_finite(networks[i])]
-        policies = [self.policy(networks[i], step) for i in places]
+        indices = [i for i in np.flatnonzero(self.environments.alive).tolist() if is_finite(networks[i])]
+        policies = [self.policy(networks[i], step) for i in indices]
         self._evaluator.perturb(values_at(self._perturbations, task_step))
-        self._pending = (step, places, policies, self.evaluator.begin(policies))
+        self._pending = (step, indices, policies, self.evaluator.begin(policies))
         if self.is_over:
-            self.settle()
+            self.finish()
 
-    def settle(self) -> None:
+    def finish(self) -> None:
         """Wait for the evaluation in progress, if there is one, and record it."""
         if not self._pending:
             return
-        (step, places, policies, pending), self._pending = self._pending, None
+        (step, indices, policies, pending), self._pending = self._pending, None
         results: dict[int, tuple[Policy, list[EvaluationEpisode]]] = {}
-        for place, policy, result in zip(places, policies, pending.results(), strict=True):
-            run = self.runs[place]
+        for index, policy, result in zip(indices, policies, pending.results(), strict=True):
+            run = self.runs[index]
             if isinstance(result, EvaluationFailure):
                 self._note(run, f"warning: seed {run.seed}: the evaluation at step {step:,} failed: {result}")
                 continue
-            self._record(place, step, policy, result)
-            results[place] = policy, result
+            self._record(index, step, policy, result)
+            results[index] = policy, result
         for text in pending.notes:
             self._note(self.runs[0], text)
-        self._tell_unheard()
+        self._warn_of_missing_events()
         if results:
-            means = {self.runs[place].seed: mean_return(episodes) for place, (_, episodes) in results.items()}
+            means = {self.runs[index].seed: mean_return(episodes) for index, (_, episodes) in results.items()}
             self.watcher.evaluated(step, means)
         self.wants_stop = self._teller.evaluated(step, results) or self.wants_stop
 
-    def _record(self, place: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> None:
+    def _record(self, index: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> None:
         """Record a run's evaluation, and its policy where it is the best so far."""
-        run, recorder = self.runs[place], self.recorders[place]
+        run, recorder = self.runs[index], self.recorders[index]
         recorder.add("evaluations", [episode.row(run.seed, step) for episode in episodes])
         recorder.flush("evaluations")
         mean = mean_return(episodes)
@@ -133,13 +133,13 @@ class Evaluations:
         if any(episode.length >= LONGEST_EPISODE for episode in episodes):
             self._note(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
 
-    def _tell_unheard(self) -> None:
+    def _warn_of_missing_events(self) -> None:
         """Say which events no evaluation episode has held, after the first evaluation, and what there is instead."""
         there = self.evaluator.info_names
-        for name in sorted(self._unheard - there):
+        for name in sorted(self._missing_events - there):
             known = ", ".join(sorted(there)) or "nothing"
             self._note(self.runs[0], f"note: no episode's last info holds a number called {name!r}; it holds {known}")
-        self._unheard = set()
+        self._missing_events = set()
 
     def _note(self, run: RunDirectory, text: str) -> None:
         run.log(text)

@@ -58,8 +58,8 @@ class Learner:
         begin = jax.jit(self._axis.map(self._one.begin), compiler_options={"xla_backend_optimization_level": 1})
         keys = [np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds]
         self._carry: Carry = begin(self._axis.stack(keys))
-        turn = (spec.environments,) if spec.environments > 1 else ()
-        observations = np.zeros((len(seeds), *turn, spec.observation_size), np.float32)
+        axis = (spec.environments,) if spec.environments > 1 else ()
+        observations = np.zeros((len(seeds), *axis, spec.observation_size), np.float32)
         self._parcel = Parcel(self._axis.strip(self._waiting).shape, self._axis.strip(observations).shape)
         # JAX pairs what is donated with what comes out by order and shape. So the carry comes out first, and is kept
         # whole where an algorithm does not read all of it: a shift by one would copy whole networks to and fro.
@@ -88,7 +88,7 @@ class Learner:
                 observations, actions, outcome.reward, outcome.next_observation, outcome.terminated, outcome.truncated
             )
         )
-        self._waiting[:, self._turn(step)] = rows.reshape(len(rows), self.spec.environments, -1)
+        self._waiting[:, self._rows_of(step)] = rows.reshape(len(rows), self.spec.environments, -1)
         if step % self._cadence.update_interval:
             return self.next_actions(outcome.observation, step)
         program = self._explore
@@ -160,14 +160,14 @@ class Learner:
         interval = self._cadence.update_interval
         return Ring(self._axis.of(np.asarray(self._carry.memory.rows), index), step // interval * interval)
 
-    def take_back(self, saved: Sequence[Snapshot], memories: Sequence[Callable[[np.ndarray], None]]) -> None:
+    def restore(self, saved: Sequence[Snapshot], memories: Sequence[Callable[[np.ndarray], None]]) -> None:
         """Go on from what `save` returned for each seed; `memories` fill each seed's rows [capacity, width].
 
         Raises:
             InputError: it is of another algorithm, or of networks of another size.
         """
         for seed in saved:
-            if problem := misfit(self.algorithm, self.spec, self._steps, seed):
+            if problem := incompatibility(self.algorithm, self.spec, self._steps, seed):
                 raise InputError(f"the checkpoint does not fit: {problem}: go on with the csac that wrote it")
         memory = self._carry.memory
         rows, kind = np.zeros(memory.rows.shape, memory.rows.dtype), jax.tree.structure(memory)
@@ -187,15 +187,15 @@ class Learner:
         self._carry = taken._replace(state=jax.jit(self._axis.map(self._one.packing.pack))(taken.state))
         self._waiting = np.stack([seed.arrays["waiting"] for seed in saved])
 
-    def break_off(self, indices: Sequence[int], step: int) -> None:
+    def truncate_last(self, indices: Sequence[int], step: int) -> None:
         """Mark the last transition of these seeds, after `step` steps, as truncated: what follows is another episode.
 
         One that an update has learnt from already stays as it was: a replay sees by itself what follows what.
         """
         if step % self._cadence.update_interval:
-            self._waiting[indices, self._turn(step), -1] = 1.0  # `pack` ends with it
+            self._waiting[indices, self._rows_of(step), -1] = 1.0  # `pack` ends with it
 
-    def _turn(self, step: int) -> slice:
+    def _rows_of(self, step: int) -> slice:
         """Return where the transitions of the turn that ends with this step wait."""
         begin = (step - self.spec.environments) % self._cadence.update_interval
         return slice(begin, begin + self.spec.environments)
@@ -313,7 +313,7 @@ class OneSeed:
         return function(observation, keys) if observation.ndim == 1 else jax.vmap(function)(observation, keys)
 
 
-def misfit(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str | None:
+def incompatibility(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str | None:
     """Say what keeps an algorithm from going on from what `Learner.save` returned, or return None."""
     state = jax.eval_shape(lambda key: algorithm.init(key, spec, steps), KEY_DATA)
     for name, leaf in by_name({"state": state}).items():

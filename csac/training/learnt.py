@@ -21,7 +21,7 @@ from csac.record.run import RunDirectory
 from csac.record.sets import RunSet
 from csac.training.checkpoint import Checkpoint, newest_sound
 from csac.training.config import algorithm_of
-from csac.training.learner import KEY_DATA, misfit
+from csac.training.learner import KEY_DATA, incompatibility
 from csac.training.packing import by_name
 from csac.types import InputError, Transition
 
@@ -44,7 +44,7 @@ class Learnt:
         self._contract = load_run(run).contract
         spec, saved = self._contract.spec._replace(environments=run.config.environments), checkpoint.state()
         learner, steps = saved.part("learner"), run.config.steps
-        if problem := misfit(self.algorithm, spec, steps, learner):
+        if problem := incompatibility(self.algorithm, spec, steps, learner):
             raise InputError(f"the checkpoint does not fit: {problem}: use the csac that wrote it")
         shapes = jax.eval_shape(lambda key: self.algorithm.init(key, spec, steps), KEY_DATA)
         leaves = [learner.arrays[f"state.{name}"] for name in by_name(shapes)]
@@ -92,7 +92,7 @@ class Learnt:
         critics = [c for pair in pairs for c in getattr(pair, "critics", [getattr(pair, "critic", None)])]
         if any(critic is None for critic in critics):
             raise InputError(f"{self.algorithm.name} has no critics Q(s, a); CSAC, SAC, TD3 and SD3 have")
-        statistics = getattr(self.state, "observations", None)
+        statistics = getattr(self.state, "observation_statistics", None)
         if getattr(self.algorithm, "critic_normalisation", "none") == "batch":
             critics = self._folded(critics, statistics)
         return critics, statistics

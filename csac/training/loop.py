@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from csac.training.program import Program, Watcher
 
 METRICS_INTERVAL = 1_000
-LOOK_INTERVAL = 500  # steps between two looks at what is due: rows to write, a signal, a diverged seed
+CHECK_INTERVAL = 500  # steps between two looks at what is due: rows to write, a signal, a diverged seed
 SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
@@ -54,15 +54,15 @@ class Loop:
     ) -> None:
         self.runs, self.watcher, self.config = list(runs), watcher, runs[0].config
         self.step, self.steps = points[0].step, self.config.steps
-        self._turn = self.config.environments  # steps made at a time: one of each environment
+        self._stride = self.config.environments  # steps made at a time: one of each environment
         seeds = [run.seed for run in runs]
         arguments = self.config.environment_arguments
         with ExitStack() as stack:
             processes = program.environment_processes
             if processes is None:
-                processes = choose_processes(program.task, arguments, self._turn, program.threads)
+                processes = choose_processes(program.task, arguments, self._stride, program.threads)
             self.environments = SeedEnvironments(
-                program.task, arguments, seeds, self._turn, processes, self.config.events
+                program.task, arguments, seeds, self._stride, processes, self.config.events
             )
             stack.callback(self.environments.close)
             self.learner = Learner(program.algorithm, self.environments.spec, seeds, self.steps)
@@ -75,7 +75,7 @@ class Loop:
             self.evaluations = Evaluations(program, *told, self.environments, watcher, self.teller, stack)
             self._saved_at, self._saved_time = self.step, time.monotonic()
             self.is_over = False
-            self._opened = stack.pop_all()
+            self._resources = stack.pop_all()
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Train to the last step, until no seed is left, or until a stop is asked for.
@@ -84,19 +84,19 @@ class Loop:
             OSError: a run directory can no longer be written.
         """
         is_stopping = False
-        self.watcher.turn(self.step)
+        self.watcher.wait_for_turn(self.step)
         while self.step < self.steps and self.environments.is_any_alive and not is_stopping:
             is_stopping = self._advance()
             is_last = self.step == self.steps
             if self._is_due(METRICS_INTERVAL) or is_last:
                 self._record_metrics()
-            is_look_due = self._is_due(LOOK_INTERVAL) or is_last
-            if is_look_due:
+            is_check_due = self._is_due(CHECK_INTERVAL) or is_last
+            if is_check_due:
                 self._stop_diverged()
             if (due := self._due_evaluation()) is not None:
                 self._evaluate(due)
-            if is_look_due:
-                self._look()
+            if is_check_due:
+                self._write_and_report()
                 is_stopping = should_stop() or is_stopping
             if self._is_due(self.config.checkpoint_interval):
                 self.save()
@@ -106,7 +106,7 @@ class Loop:
 
     def save(self) -> None:
         """Write a checkpoint of every run, seeds that have failed included. Raises OSError."""
-        self.evaluations.settle()
+        self.evaluations.finish()
         self._stop_diverged()
         if self.step == self._saved_at or not self.environments.alive.any():
             return
@@ -118,20 +118,20 @@ class Loop:
                 problem = saved.values["environment"]["problem"] or "its environment cannot be saved"
                 self._note(run, f"seed {run.seed}: {problem}: a resume restarts the episode in progress")
             run.update_manifest(steps_done=self.step, restarts_episode=restarts, last_checkpoint=self.step)
-            self._writers[index].write(self.step, saved, self.learner.memory(index, self.step), _others(run))
+            self._writers[index].write(self.step, saved, self.learner.memory(index, self.step), _tables_and_policy(run))
         self._saved_at, self._saved_time = self.step, time.monotonic()
 
     def close(self) -> None:
         """Close every environment, and end the processes that evaluate."""
         for recorder in self.recorders:
             recorder.close()
-        self._opened.close()
+        self._resources.close()
 
     def _begin(self, points: Sequence[ResumePoint]) -> None:
         """Reset the environments, or restore what `save` wrote."""
         keep = self.config.keep_checkpoints
         self._writers = [Writer(run.checkpoints, keep) for run in self.runs]
-        self._perturb(max(self.step - self._turn, 0))  # as in the turn that the checkpoint came after
+        self._perturb(max(self.step - self._stride, 0))  # as in the turn that the checkpoint came after
         if not self.step:
             self._observations = self.environments.reset()
             self._actions = self.learner.next_actions(self._observations, 0)
@@ -149,16 +149,16 @@ class Loop:
                 environment.values["exact"] = False
             if not self.environments.restore(index, environment):
                 restarted.append(index)
-            fills.append(self._filler(index, point))
-        self.learner.take_back(learnt, fills)
+            fills.append(self._replay_loader(index, point))
+        self.learner.restore(learnt, fills)
         self._observations = self.environments.observations
         for index, reason in self.environments.refused.items():
             self._note(self.runs[index], f"seed {self.runs[index].seed}: {reason}: its episode restarts")
         if restarted:
-            self.learner.break_off(restarted, self.step)
+            self.learner.truncate_last(restarted, self.step)
             self._actions[restarted] = self.learner.next_actions(self._observations, self.step)[restarted]
 
-    def _filler(self, index: int, point: ResumePoint) -> Callable[[np.ndarray], None]:
+    def _replay_loader(self, index: int, point: ResumePoint) -> Callable[[np.ndarray], None]:
         """Return what puts a run's transitions into its rows [capacity, width]."""
         checkpoint, run = point.checkpoint, self.runs[index]
         assert checkpoint
@@ -175,13 +175,13 @@ class Loop:
 
     def _advance(self) -> bool:
         """Make one step of each environment, and learn from them; return whether a callback ends the runs."""
-        for change in [self._changes[step] for step in self._changes if 0 <= self.step - step < self._turn]:
+        for change in [self._changes[step] for step in self._changes if 0 <= self.step - step < self._stride]:
             self._perturb(self.step)
             for run in self.runs:
                 run.log(f"perturbed from step {self.step + 1:,} on: {change}")
             self.watcher.note(f"perturbed from step {self.step + 1:,} on: {change}")
         outcome = self.environments.step(self._actions)
-        self.step += self._turn
+        self.step += self._stride
         for failure in outcome.failures:
             self._save_policy(failure.place)
             self._fail(failure.place, failure.reason, failure.details)
@@ -195,7 +195,7 @@ class Loop:
         # One product finds a nan or an inf in a third of the time of np.isfinite().all().
         if not flat.dot(flat) < np.inf and not np.isfinite(self._actions[self.environments.alive]).all():
             self._stop_diverged()
-        return self.teller.after_step(self.step, self._turn, self.environments.alive, outcome.episodes)
+        return self.teller.after_step(self.step, self._stride, self.environments.alive, outcome.episodes)
 
     def _due_evaluation(self) -> int | None:
         """Return the step of an evaluation that is to be made now, or None."""
@@ -209,16 +209,16 @@ class Loop:
 
     def _evaluate(self, step: int) -> None:
         """Begin to evaluate the current policies, on the task as it was in the last step."""
-        self.evaluations.begin(step, self.learner.networks(), self.step - self._turn)
+        self.evaluations.begin(step, self.learner.networks(), self.step - self._stride)
         if not self.config.evaluation_environments:  # the training environment has played them
-            self.learner.break_off([0], self.step)
+            self.learner.truncate_last([0], self.step)
             self._observations = self.environments.begin_again()
             self._actions = self.learner.next_actions(self._observations, self.step)
 
-    def _look(self) -> None:
+    def _write_and_report(self) -> None:
         """Write waiting rows, report progress, save by the clock, wait for the next turn on the cores."""
         if self.evaluations.is_over:
-            self.evaluations.settle()
+            self.evaluations.finish()
         for recorder in self.recorders:
             recorder.flush()
         alive = zip(self.runs, self.environments.alive.tolist(), strict=True)
@@ -226,11 +226,11 @@ class Loop:
         if self.config.checkpoint_interval and time.monotonic() - self._saved_time >= SECONDS_BETWEEN_CHECKPOINTS:
             self.save()
         if self.step < self.steps:
-            self.watcher.turn(self.step)
+            self.watcher.wait_for_turn(self.step)
 
     def _finish(self) -> None:
         """Save at the end, or where a stop was asked for; leave the newest policies."""
-        self.evaluations.settle()
+        self.evaluations.finish()
         self._stop_diverged()
         for index, alive in enumerate(self.environments.alive.tolist()):
             self.recorders[index].flush()
@@ -287,10 +287,10 @@ class Loop:
 
     def _is_due(self, interval: int) -> bool:
         """Return whether the last turn has made a step whose number is a multiple of `interval`."""
-        return bool(interval) and self.step % interval < self._turn
+        return bool(interval) and self.step % interval < self._stride
 
 
-def _others(run: RunDirectory) -> dict[str, bytes]:
+def _tables_and_policy(run: RunDirectory) -> dict[str, bytes]:
     """Return what a checkpoint has beside the state: the tables, the best policy and the manifest."""
     paths = [*map(run.table, TABLES), run.policy_file("best")]
     contents = {path.name: path.read_bytes() for path in paths if path.exists()}

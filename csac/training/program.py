@@ -49,7 +49,7 @@ class Program(NamedTuple):
 class Watcher(Protocol):
     """Who is told what happens, beside the run directories."""
 
-    def turn(self, step: int) -> None:
+    def wait_for_turn(self, step: int) -> None:
         """Wait until it is this program's turn to train on, after so many steps."""
         ...
 

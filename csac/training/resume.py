@@ -229,7 +229,7 @@ class Source(NamedTuple):
         planned = perturbations_of(self.runs[seed].config.perturbations)
         return tuple(map(str, planned if given is None else continued(planned, perturbations_of(given), self.step)))
 
-    def refuse_misfit(self, wanted: RunConfig, has_schedule: bool) -> None:
+    def refuse_incompatible(self, wanted: RunConfig, has_schedule: bool) -> None:
         """Raise InputError where a new run of this configuration cannot begin with its checkpoint."""
         before = self.runs[wanted.seed].config
         if before.algorithm != wanted.algorithm:

@@ -184,7 +184,7 @@ class _RemoteWatcher:
         self._turns: queue.SimpleQueue[None] = queue.SimpleQueue()
         threading.Thread(target=self._listen, daemon=True).start()
 
-    def turn(self, step: int) -> None:
+    def wait_for_turn(self, step: int) -> None:
         if not self.stopped.is_set():
             self._connection.send(("turn", step))
             self._turns.get()

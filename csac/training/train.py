@@ -134,7 +134,7 @@ def train(
     programs = how.programs([[place / f"seed-{seed}" for seed in group] for group in groups], existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
     for config in configs:
-        source.refuse_misfit(config, algorithm.cadence.has_schedule) if source else None
+        source.refuse_incompatible(config, algorithm.cadence.has_schedule) if source else None
     for config in configs:
         _create_or_extend(place, config, groups, existing.get(config.seed), source)
     runs = TrainedRuns(place, [RunDirectory.open(place / f"seed-{seed}") for seed in wanted])

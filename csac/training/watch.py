@@ -26,7 +26,7 @@ class Watch:
             reporter = Reporter()
         self.reporter, self.callbacks = reporter, callbacks
 
-    def turn(self, step: int) -> None:
+    def wait_for_turn(self, step: int) -> None:
         """Go on: nobody else trains in this process."""
 
     def progress(self, steps: Mapping[int, int]) -> None:

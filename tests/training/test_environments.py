@@ -109,7 +109,7 @@ def test_ppo_learns_known_values_over_truncation_in_four_environments():
     )
     state = run(algorithm, Onward, 6144, environments=4).states[0]
     for observation, value in {0.0: 9.0, 1.0: 10.0}.items():
-        seen = algorithm.normalise(state.observations, jnp.array([observation]))
+        seen = algorithm.normalise(state.observation_statistics, jnp.array([observation]))
         assert float(value_at(state.parameters, seen)) == pytest.approx(value, rel=0.02)
 
 

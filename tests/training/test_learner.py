@@ -16,7 +16,7 @@ from csac.algorithms import ALGORITHMS, CSAC, SAC, TD3
 from csac.algorithms.memory import row_width
 from csac.tasks.seeds import Steps
 from csac.training.checkpoint import SCHEMA_VERSION, Checkpoint, Damaged, Writer
-from csac.training.learner import Learner, misfit
+from csac.training.learner import Learner, incompatibility
 from csac.training.packing import by_name
 from csac.types import Snapshot, Spec
 
@@ -68,7 +68,7 @@ def test_what_was_saved_of_each_seed_is_taken_back(seeds):
     advance(learner, len(seeds), 1, 10)
     saved = [learner.save(index) for index in range(len(seeds))]
     rows = [learner.memory(index, 10).rows.copy() for index in range(len(seeds))]
-    again.take_back(saved, [lambda given, own=own: np.copyto(given, own) for own in rows])
+    again.restore(saved, [lambda given, own=own: np.copyto(given, own) for own in rows])
 
     for index in range(len(seeds)):
         for ours, theirs in zip(
@@ -84,7 +84,7 @@ def test_the_memory_that_a_learner_begins_with_is_gone_before_the_saved_one_is_r
     learner = Learner(SAC(**TINY), SPEC, [0], 100)
     saved, begun = learner.save(0), weakref.ref(learner._carry.memory.rows)
     there = []
-    learner.take_back([saved], [lambda rows: there.append(begun())])
+    learner.restore([saved], [lambda rows: there.append(begun())])
     assert there == [None]
 
 
@@ -106,7 +106,7 @@ def state_of(algorithm: CSAC) -> Snapshot:
     ],
 )
 def test_what_a_checkpoint_has_fits_or_is_refused(before, after, problem):
-    found = misfit(CSAC(**TINY, **after), SPEC, 100, state_of(CSAC(**TINY, **before)))
+    found = incompatibility(CSAC(**TINY, **after), SPEC, 100, state_of(CSAC(**TINY, **before)))
     assert found is None if problem is None else problem in found
 
 
@@ -116,7 +116,7 @@ def test_means_begin_anew_where_other_things_are_told():
     learner, again = (Learner(CSAC(**TINY, **changes), SPEC, [0], 100) for changes in (before, after))
     advance(learner, 1, 1, 6)
     rows = learner.memory(0, 6).rows.copy()
-    again.take_back([learner.save(0)], [lambda given: np.copyto(given, rows)])
+    again.restore([learner.save(0)], [lambda given: np.copyto(given, rows)])
     assert again.metrics() == []
     advance(again, 1, 7, 7)
     alone = Learner(CSAC(**TINY, **after), SPEC, [0], 100)

@@ -79,7 +79,7 @@ def test_critics_that_are_normalised_over_batches_are_asked_by_the_replay(tmp_pa
     following = csac.load(tmp_path / "set").act(replay["next_observations"])
 
     def asked(observation, action, next_observation, next_action):
-        seen = [normalise(state.observations, one) for one in (observation, next_observation)]
+        seen = [normalise(state.observation_statistics, one) for one in (observation, next_observation)]
         pairs = [jnp.concatenate(pair) for pair in zip(seen, (action, next_action), strict=True)]
         return normalised_pass(state.critics[0], pairs).outputs[0][0]
 
