@@ -201,7 +201,8 @@ def _study(words: list[str]) -> int:
 
 def _tune(options: Any, command: str) -> int:
     from csac.console.tables import make_console
-    from csac.record.config import TUNING_EVALUATION_SEED, RunConfig
+    from csac.record.config import RunConfig
+    from csac.seeds import TUNING_EVALUATION_SEED
     from csac.studies.search import Search, space_of
     from csac.studies.tune import tune
     from csac.training.config import labels

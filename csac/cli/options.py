@@ -16,7 +16,8 @@ from tyro.constructors import PrimitiveConstructorSpec
 from csac.checks import did_you_mean
 from csac.cli.parsing import JSON, options_of, parse, value_of
 from csac.presets import PRESETS, hyperparameters
-from csac.record.config import EVALUATION_SEED, RunConfig
+from csac.record.config import RunConfig
+from csac.seeds import EVALUATION_SEED
 from csac.types import InputError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from rich import box
 from rich.console import Console
 from rich.text import Text
 
-from csac.record import summary_tables
+from csac.record import report_tables
 from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric, short
 from csac.record.statistics import last_evaluations
 from csac.record.summaries import last_rows, over_seeds, perturbation_recoveries
@@ -100,10 +100,10 @@ def result_tables(runs: RunSet) -> list[Fitted]:
     rows, failed = runs.evaluations, runs.failures.keys()
     trained, episodes = np.unique(runs.rows("episodes")["seed"], return_counts=True)
     counts = dict(zip(trained.tolist(), episodes.tolist(), strict=True))
-    cases = summary_tables.case_table(last_rows(rows[~np.isin(rows["seed"], list(failed))]))
-    tables = [summary_tables.results_table(rows, failed, counts), *([cases] if cases else [])]
+    cases = report_tables.case_table(last_rows(rows[~np.isin(rows["seed"], list(failed))]))
+    tables = [report_tables.results_table(rows, failed, counts), *([cases] if cases else [])]
     perturbed = by_step(perturbations_of(runs.config.perturbations))
-    tables += [summary_tables.recovery_table([cost]) for cost in perturbation_recoveries(rows, perturbed, failed)]
+    tables += [report_tables.recovery_table([cost]) for cost in perturbation_recoveries(rows, perturbed, failed)]
     return [Fitted(table) for table in tables]
 
 
@@ -112,7 +112,7 @@ def evaluation_tables(
 ) -> list[Fitted]:
     """Return the returns of fresh episodes by seed, and the cases of the seeds that did not fail in training."""
     rows = _rows(results)
-    cases = summary_tables.case_table(rows[~np.isin(rows["seed"], list(failed))])
+    cases = report_tables.case_table(rows[~np.isin(rows["seed"], list(failed))])
     return [Fitted(table) for table in (_evaluation_table(rows, failed), cases) if table]
 
 
@@ -133,9 +133,9 @@ def _evaluation_table(rows: np.ndarray, failed: Collection[int]) -> Table:
     if len(sound) > 1:
         over, blank = over_seeds(sound), [EMPTY] * (4 + has_success)
         body.append(Row((Cell("mean", np.nan), numeric(over.mean, number(over.mean, largest)), *blank), "summary"))
-        body += summary_tables.interval_rows([over], largest, len(blank))
+        body += report_tables.interval_rows([over], largest, len(blank))
     headings = ("seed", "mean return", "± std", "min", "max", "length", *["success"] * has_success)
-    return Table(headings, tuple(body), note=summary_tables.few_seeds(len(sound)))
+    return Table(headings, tuple(body), note=report_tables.few_seeds(len(sound)))
 
 
 def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[str]:

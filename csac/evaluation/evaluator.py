@@ -13,7 +13,7 @@ from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy
 from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, Playing, start
 from csac.evaluation.pending import EvaluationStopped, Pending
-from csac.record.config import EVALUATION_SEED, FRESH_EVALUATION_SEED
+from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import constant_perturbations, values_at
 from csac.tasks.preflight import globals_seeded

@@ -14,8 +14,8 @@ from csac.checks import check_flag, check_whole
 from csac.deploy.choosing import has_policy, load, load_run
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, EvaluationFailure, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
-from csac.record.config import FRESH_EVALUATION_SEED
 from csac.record.sets import RunSet
+from csac.seeds import FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import constant_perturbations, unlike_training, values_at
 from csac.tasks.registry import adapter_of

@@ -10,14 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from csac.checks import check_whole
+from csac.seeds import EVALUATION_SEED
 from csac.types import InputError
 
 STEPS_LIMIT = 2**31 - 1  # learners count their steps in 32 bits
 SEED_LIMIT = 2**32  # a key is made of a seed's lowest 32 bits
-# What episode 0 of an evaluation is reset with; the next ones with the numbers after it.
-EVALUATION_SEED = 1_000_000  # in training: the curves
-FRESH_EVALUATION_SEED = 2_000_000  # of finished policies: what nothing was chosen by
-TUNING_EVALUATION_SEED = 3_000_000  # in training for `csac tune`: what hyperparameters are chosen by
 NEVER = 10**15  # an interval longer than any run
 MOST_EPISODES = 1_000_000
 

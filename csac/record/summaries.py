@@ -1,4 +1,4 @@
-"""Numbers over seeds, recoveries and cases of runs, as plain values: `summary_tables` turns them into text.
+"""Numbers over seeds, recoveries and cases of runs, as plain values: `report_tables` turns them into text.
 
 Rows are those of evaluations.csv; a seed in `failed` is shown and left out of what is over seeds.
 """

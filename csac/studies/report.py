@@ -16,6 +16,7 @@ from csac.record import rendering
 from csac.record.files import write_atomically
 from csac.record.plots import encoded, figure_of, looks_of
 from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric
+from csac.record.report_tables import case_comparison_table, comparison_table, plus_minus, recovery_table
 from csac.record.statistics import (
     drawdown,
     evaluation_matrix,
@@ -27,7 +28,6 @@ from csac.record.statistics import (
     stratified_bootstrap_interval,
 )
 from csac.record.summaries import last_rows, over_seeds, recoveries
-from csac.record.summary_tables import case_comparison_table, comparison_table, plus_minus, recovery_table
 from csac.studies import paper
 from csac.studies.arms import by_place, differing, plain, seconds_per_step, settings, train_command
 from csac.types import InputError

@@ -15,7 +15,7 @@ from csac.checks import check_arguments
 from csac.deploy.contract import ActionBounds
 from csac.tasks import snapshots
 from csac.tasks.failures import EnvironmentFailure, failure_of, one_line, raise_interrupt
-from csac.tasks.physics import NOISES, PHYSICS, Noise, Physics
+from csac.tasks.perturbations import NOISES, PHYSICS, Noise, Physics
 from csac.tasks.pybullet import quietly
 from csac.tasks.registry import Task, has_memory, is_pybullet, make, task_name
 from csac.tasks.spaces import check_finite, contract_parts, dict_part, part, scalar, size

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from csac.deploy.policy import Policy
-    from csac.tasks.seeds import FinishedEpisode
+    from csac.tasks.vector import FinishedEpisode
 
 
 class CallbackFailure(Failure):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from csac.evaluation.evaluator import EvaluationEpisode
     from csac.record.recorder import Recorder
     from csac.record.run import RunDirectory
-    from csac.tasks.seeds import SeedEnvironments
+    from csac.tasks.vector import SeedEnvironments
     from csac.training.program import Program, Watcher
     from csac.training.teller import Teller
     from csac.types import PolicyNetwork

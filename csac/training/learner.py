@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from csac.algorithms.exploration import Noise
-    from csac.tasks.seeds import Steps
+    from csac.tasks.vector import Steps
     from csac.types import Algorithm, PolicyParameters, Spec
 
 # Arrays with fewer elements travel packed. Hidden layers of 256 x 256 have more: XLA would copy them out of the row at

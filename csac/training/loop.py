@@ -12,7 +12,7 @@ from csac.record.manifest import written
 from csac.record.recorder import Recorder
 from csac.record.run import MANIFEST, TABLES
 from csac.tasks.perturbations import by_step, perturbations_of, values_at
-from csac.tasks.seeds import SeedEnvironments
+from csac.tasks.vector import SeedEnvironments
 from csac.tasks.workers import choose_processes
 from csac.training.checkpoint import Writer
 from csac.training.evaluations import Evaluations, is_finite
@@ -183,12 +183,12 @@ class Loop:
         outcome = self.environments.step(self._actions)
         self.step += self._stride
         for failure in outcome.failures:
-            self._save_policy(failure.place)
-            self._fail(failure.place, failure.reason, failure.details)
+            self._save_policy(failure.seed_index)
+            self._fail(failure.seed_index, failure.reason, failure.details)
         for episode in outcome.episodes:
-            row = {"seed": self.runs[episode.place].seed, "step": self.step}
+            row = {"seed": self.runs[episode.seed_index].seed, "step": self.step}
             row |= {"return": episode.episode_return, "length": episode.length, **episode.events}
-            self.recorders[episode.place].add("episodes", [row])
+            self.recorders[episode.seed_index].add("episodes", [row])
         self._actions = self.learner.step(self._observations, self._actions, outcome, self.step)
         self._observations = outcome.observation
         flat = self._actions.ravel()

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from csac.deploy.policy import Policy
     from csac.record.recorder import Recorder
     from csac.record.run import RunDirectory
-    from csac.tasks.seeds import FinishedEpisode
+    from csac.tasks.vector import FinishedEpisode
     from csac.training.callbacks import Hears
 
 
@@ -45,7 +45,7 @@ class Teller:
     def after_step(self, step: int, turn: int, alive: np.ndarray, episodes: Sequence[FinishedEpisode]) -> bool:
         """Tell of a turn of `turn` steps and of the episodes that ended; return whether to stop."""
         if episodes and self._hears.episodes:
-            told = [episode.place for episode in episodes]
+            told = [episode.seed_index for episode in episodes]
             self._tell("on_episode", step, told, [(episode,) for episode in episodes])
         due = tuple(interval for interval in self._hears.intervals if step % interval < turn)
         if due:

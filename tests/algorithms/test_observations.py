@@ -64,8 +64,10 @@ def test_learning_from_far_observations_is_learning_from_near_ones(algorithm):
     )
     for name, value in expected_metrics.items():
         np.testing.assert_allclose(metrics[name], value, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose([state.observation_statistics.mean[0], state.observation_statistics.std[0]], [4.0, 2.0], rtol=1e-6)
-    assert expected.observations is None
+    np.testing.assert_allclose(
+        [state.observation_statistics.mean[0], state.observation_statistics.std[0]], [4.0, 2.0], rtol=1e-6
+    )
+    assert expected.observation_statistics is None
 
 
 @pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda algorithm: algorithm.name)

@@ -23,9 +23,9 @@ from csac.evaluation.evaluator import (
     evaluate,
     evaluate_episodes,
 )
-from csac.record.config import EVALUATION_SEED, FRESH_EVALUATION_SEED
+from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
-from csac.tasks.physics import Noise
+from csac.tasks.perturbations import Noise
 from csac.tasks.registry import Task
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters
 

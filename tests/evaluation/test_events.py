@@ -21,9 +21,9 @@ from csac.cli import main
 from csac.console.progress import Reporter
 from csac.evaluation.evaluator import Evaluator
 from csac.evaluation.play import evaluate_run
-from csac.record.config import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.record.run import RunDirectory
 from csac.record.tables import read_rows
+from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks import events
 from csac.training.train import resume, train
 from csac.types import InputError

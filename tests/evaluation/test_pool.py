@@ -21,7 +21,7 @@ from csac.evaluation.evaluator import EPISODES_AT_ONCE, EvaluationFailure, Evalu
 from csac.evaluation.pending import EvaluationStopped
 from csac.evaluation.play import evaluate_run
 from csac.evaluation.pool import EvaluationPool, choose_processes
-from csac.record.config import EVALUATION_SEED
+from csac.seeds import EVALUATION_SEED
 from csac.types import InputError
 
 SUPPORT = Path(__file__).parents[1] / "support"

@@ -5,6 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from csac.record.report_tables import (
+    case_comparison_table,
+    case_table,
+    comparison_table,
+    events_table,
+    recovery_table,
+    results_table,
+)
 from csac.record.summaries import (
     case_names,
     cases,
@@ -12,14 +20,6 @@ from csac.record.summaries import (
     over_seeds,
     perturbation_recoveries,
     recoveries,
-)
-from csac.record.summary_tables import (
-    case_comparison_table,
-    case_table,
-    comparison_table,
-    events_table,
-    recovery_table,
-    results_table,
 )
 
 NAN = np.nan

@@ -14,9 +14,10 @@ from studying import write_run
 from csac.algorithms import ALGORITHMS, CSAC, SAC, TD3
 from csac.cli import main
 from csac.console.tables import make_console
-from csac.record.config import TUNING_EVALUATION_SEED, RunConfig
+from csac.record.config import RunConfig
 from csac.record.run import is_run
 from csac.record.sets import RunSet
+from csac.seeds import TUNING_EVALUATION_SEED
 from csac.studies import tune as module
 from csac.studies.search import SPACES, Search, draw, space_of
 from csac.studies.tune import tune

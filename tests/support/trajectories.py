@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from csac.tasks.seeds import SeedEnvironments
+from csac.tasks.vector import SeedEnvironments
 
 
 def steps_of(environments: SeedEnvironments, count: int) -> list[tuple]:

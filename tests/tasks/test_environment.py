@@ -16,10 +16,10 @@ import probes
 import pytest
 from gymnasium import spaces
 
-from csac.record.config import EVALUATION_SEED, FRESH_EVALUATION_SEED
+from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED, training_seed
 from csac.tasks.environment import Environment
 from csac.tasks.failures import EnvironmentFailure, one_line
-from csac.tasks.seeds import SeedEnvironments, training_seed
+from csac.tasks.vector import SeedEnvironments
 from csac.types import InputError, Spec
 
 UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -397,7 +397,7 @@ def test_a_seed_that_breaks_fails_alone_and_is_not_stepped_again():
     assert environments.alive.tolist() == [True, False, True]
     raws = [environment.raw.unwrapped for environment in environments.environments]
     assert [raw.count["step"] for raw in raws] == [4, 3, 4]  # pyright: ignore
-    assert [episode.place for episode in broken.episodes] == [0, 2]
+    assert [episode.seed_index for episode in broken.episodes] == [0, 2]
 
 
 class Panic(BaseException):
@@ -422,7 +422,7 @@ def test_a_panic_and_an_exit_fail_their_seed_alone(monkeypatch, where, error):
     environments = SeedEnvironments(Panicking, arguments, [0, 1])
     environments.reset()
     failures = [failure for step in steps_of(environments, 2) for failure in step.failures]
-    assert [(failure.place, failure.reason.partition(":")[0]) for failure in failures] == [
+    assert [(failure.seed_index, failure.reason.partition(":")[0]) for failure in failures] == [
         (0, f"{where} raised {type(error).__name__}")
     ]
     assert environments.alive.tolist() == [False, True]
@@ -457,7 +457,7 @@ def test_a_seed_that_fails_in_its_first_reset_is_reported_by_the_first_step():
     environments.reset()
     assert environments.alive.all()
     first, second = steps_of(environments, 2)
-    assert [failure.place for failure in first.failures] == [0, 1]
+    assert [failure.seed_index for failure in first.failures] == [0, 1]
     assert second.failures == []
     assert not environments.is_any_alive
 
@@ -467,7 +467,7 @@ def test_a_seed_that_fails_in_a_later_reset_has_finished_its_episode():
     environments.reset()
     *_, last = steps_of(environments, 3)
     assert last.episodes == [(0, 3.0, 3)]
-    assert [failure.place for failure in last.failures] == [0]
+    assert [failure.seed_index for failure in last.failures] == [0]
     assert environments.alive.tolist() == [False]
 
 
@@ -477,7 +477,7 @@ def test_a_stopped_seed_steps_no_more():
     environments.stop(0)
     assert environments.alive.tolist() == [False, True]
     _, second = steps_of(environments, 2)
-    assert [failure.place for failure in second.failures] == [1]
+    assert [failure.seed_index for failure in second.failures] == [1]
 
 
 # What an environment does to the process that it is in
@@ -504,7 +504,7 @@ def test_the_working_directory_stays_where_it_was(tmp_path, monkeypatch):
 RUN = """
 import numpy as np
 from csac.tasks.environment import Environment
-from csac.tasks.seeds import SeedEnvironments
+from csac.tasks.vector import SeedEnvironments
 environments = SeedEnvironments("HalfCheetah-v4", None, [0, 1])
 environments.reset()
 environments.step(np.zeros((2, 6), np.float32))

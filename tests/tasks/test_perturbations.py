@@ -18,7 +18,7 @@ from trajectories import steps_of
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import EvaluationFailure, Evaluator, evaluate
-from csac.record.config import EVALUATION_SEED
+from csac.seeds import EVALUATION_SEED
 from csac.tasks.environment import Environment
 from csac.tasks.failures import EnvironmentFailure
 from csac.tasks.perturbations import (
@@ -30,8 +30,8 @@ from csac.tasks.perturbations import (
     refuse_late,
     values_at,
 )
-from csac.tasks.seeds import SeedEnvironments
 from csac.tasks.snapshots import _mujoco_arrays
+from csac.tasks.vector import SeedEnvironments
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters, Snapshot
 
 PAPER_TASKS = ["HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"]

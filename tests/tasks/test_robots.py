@@ -17,7 +17,7 @@ from played import policy_for, run_of_task
 from csac.algorithms import SAC
 from csac.evaluation.evaluator import EPISODES_AT_ONCE, Evaluator
 from csac.evaluation.play import play
-from csac.record.config import EVALUATION_SEED
+from csac.seeds import EVALUATION_SEED
 from csac.tasks import registry
 from csac.tasks.environment import Environment
 from csac.tasks.pybullet import Adapter, quietly

@@ -12,7 +12,7 @@ from trajectories import steps_of
 
 from csac.tasks.environment import Environment
 from csac.tasks.failures import EnvironmentFailure
-from csac.tasks.seeds import SeedEnvironments
+from csac.tasks.vector import SeedEnvironments
 from csac.types import Snapshot
 
 PAPER_TASKS = ["HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"]

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from csac.algorithms import CSAC
-from csac.tasks.seeds import Steps
+from csac.tasks.vector import Steps
 from csac.training import compilation
 from csac.training.learner import Learner
 from csac.training.train import train

@@ -20,8 +20,9 @@ from csac.algorithms import PPO, SAC
 from csac.algorithms.memory import unpack
 from csac.algorithms.ppo import value_at
 from csac.record.run import RunDirectory
+from csac.seeds import training_seed
 from csac.tasks import workers
-from csac.tasks.seeds import SeedEnvironments, training_seed
+from csac.tasks.vector import SeedEnvironments
 from csac.types import Cadence, Spec
 
 SEEDS = (4, 9)
@@ -147,7 +148,7 @@ def test_a_seed_fails_once_where_one_of_its_environments_does(processes):
         assert (place, environments.alive.tolist()) == (0, [False, True])
         assert reason.startswith("step raised RuntimeError: the simulator broke (probes.py:")
         assert "maybe_fail" in details
-        assert [episode.place for episode in environments.step(actions).episodes] == [1, 1]
+        assert [episode.seed_index for episode in environments.step(actions).episodes] == [1, 1]
         assert environments.step(actions).failures == []
     finally:
         environments.close()

@@ -14,7 +14,7 @@ import trainer  # noqa: F401  (its cache of compiled programs)
 
 from csac.algorithms import ALGORITHMS, CSAC, SAC, TD3
 from csac.algorithms.memory import row_width
-from csac.tasks.seeds import Steps
+from csac.tasks.vector import Steps
 from csac.training.checkpoint import SCHEMA_VERSION, Checkpoint, Damaged, Writer
 from csac.training.learner import Learner, incompatibility
 from csac.training.packing import by_name

@@ -17,7 +17,7 @@ from csac.algorithms import SAC, SD3
 from csac.algorithms.networks import BATCH
 from csac.algorithms.normalisation import normalised_pass
 from csac.algorithms.statistics import normalise
-from csac.tasks.seeds import training_seed
+from csac.seeds import training_seed
 
 STEPS = 200
 

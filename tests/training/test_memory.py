@@ -16,7 +16,7 @@ from trainer import run
 
 from csac.algorithms import CSAC, SAC
 from csac.algorithms.memory import Replay, Rollout, pack, row_width, unpack
-from csac.tasks.seeds import training_seed
+from csac.seeds import training_seed
 from csac.types import Cadence, Layer, PolicyNetwork, PolicyParameters, Spec, Transition
 
 SPEC = Spec(2, 1)

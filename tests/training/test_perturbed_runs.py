@@ -14,9 +14,10 @@ from trainer import Silent
 
 from csac.deploy.choosing import load
 from csac.evaluation.evaluator import Evaluator
-from csac.record.config import EVALUATION_SEED, RunConfig
+from csac.record.config import RunConfig
 from csac.record.manifest import Manifest, Origin
 from csac.record.run import RunDirectory
+from csac.seeds import EVALUATION_SEED
 from csac.tasks.perturbations import perturbations_of, values_at
 from csac.training.loop import Loop
 from csac.training.program import Program

@@ -199,4 +199,6 @@ def test_ppo_finds_the_best_action_and_values_its_own_noise(probe, steps, best_a
 
 
 def state_value(algorithm: PPO, state, observation: float) -> float:
-    return float(value_at(state.parameters, algorithm.normalise(state.observation_statistics, jnp.array([observation]))))
+    return float(
+        value_at(state.parameters, algorithm.normalise(state.observation_statistics, jnp.array([observation])))
+    )

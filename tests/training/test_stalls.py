@@ -10,7 +10,7 @@ import pytest
 from probes import Probe
 
 from csac.tasks.environment import Environment
-from csac.tasks.seeds import SeedEnvironments
+from csac.tasks.vector import SeedEnvironments
 from csac.training import stalls
 
 

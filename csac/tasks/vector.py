@@ -1,4 +1,4 @@
-"""The environments of several seeds, stepped together, and which reset seed each of their episodes has."""
+"""The environments of all seeds of a program, stepped together; each episode is reset with a seed of its own."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac.deploy.contract import ActionBounds
+from csac.seeds import training_seed
 from csac.tasks.environment import Environment
 from csac.tasks.events import EpisodeEvents
 from csac.tasks.failures import EnvironmentFailure
@@ -17,22 +18,13 @@ from csac.tasks.registry import Task
 from csac.tasks.workers import Workers
 from csac.types import Snapshot
 
-FIRST_TRAINING_SEED = 2**30  # above every evaluation seed, and with as many again still a C int
-
-
 Place = tuple[int, ...]  # of an environment: its seed's, and its own where a seed has several
 
 
-def training_seed(seed: int, episode: int, environment: int = 0) -> int:
-    """Return the reset seed of an environment's training episode: its own, and never an evaluation episode's."""
-    word = int(np.random.SeedSequence([seed, episode, environment]).generate_state(1)[0])
-    return FIRST_TRAINING_SEED + word % FIRST_TRAINING_SEED
-
-
 class FinishedEpisode(NamedTuple):
-    """A training episode that ended; `place` is the seed's place in the group."""
+    """A training episode that ended; `seed_index` is the seed's position in the group."""
 
-    place: int
+    seed_index: int
     episode_return: float
     length: int
     events: Mapping[str, bool | float | None] = MappingProxyType({})
@@ -41,7 +33,7 @@ class FinishedEpisode(NamedTuple):
 class Failure(NamedTuple):
     """A seed whose environment failed: why in one line, and the traceback where something raised."""
 
-    place: int
+    seed_index: int
     reason: str
     details: str
 
@@ -160,7 +152,7 @@ class SeedEnvironments:
         self._reset([place for place in ended if place in self._running])
         failures, self._failures = self._failures, []
         for failure in failures:
-            self.alive[failure.place] = False
+            self.alive[failure.seed_index] = False
         return Steps(next_observation, reward, terminated, truncated, self._observation, episodes, failures)
 
     def stop(self, index: int) -> None:
@@ -296,7 +288,7 @@ class SeedEnvironments:
     def _fail(self, place: Place, error: EnvironmentFailure) -> None:
         self._rest(place[0])
         details = "".join(traceback.format_exception(error)) if error.__cause__ else ""
-        if all(failure.place != place[0] for failure in self._failures):
+        if all(failure.seed_index != place[0] for failure in self._failures):
             self._failures.append(Failure(place[0], str(error), details))
 
 
