@@ -109,6 +109,11 @@ class RunSet:
         return rows[~np.isin(rows["seed"], list(self.failures))]
 
 
+def run_path(directory: Path, seed: int) -> Path:
+    """Return the folder of a seed's run in a set."""
+    return directory / f"seed-{seed}"
+
+
 def new_set_directory(task: str, algorithm: str) -> Path:
     """Return `runs/<task>/<algorithm>/<date-time>`, with a number behind it where that is taken."""
     moment = datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -135,7 +140,7 @@ def find_sets(directory: str | Path, on_damaged: Callable[[InputError], None] | 
             below.clear()
             try:
                 run = RunDirectory.open(folder)
-                in_set = run.path.name == f"seed-{run.seed}" and Path(folder) != directory
+                in_set = run.path == run_path(run.path.parent, run.seed) and Path(folder) != directory
                 found.setdefault(run.path.parent if in_set else run.path, []).append(run)
             except InputError as error:
                 if on_damaged and "evaluations.csv" in files:  # else it is the manifest of something else

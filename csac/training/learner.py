@@ -77,11 +77,10 @@ class Learner:
         return self._axis.restore(np.array(program(self._carry, self._axis.strip(observations), np.int32(step))))
 
     def step(self, observations: np.ndarray, actions: np.ndarray, outcome: Steps, step: int) -> np.ndarray:
-        """Remember a turn, learn where it is time to, and return the next actions.
+        """Remember a step of each environment, learn where it is time to, and return the next actions.
 
-        A turn is a step of each of a seed's environments, and `step` the number of its last. One dispatch, whatever the
-        algorithm does. Between updates transitions wait on the host, so that an algorithm that learns from rollouts is
-        only asked to act.
+        `step` is the number of the last of these steps. One dispatch, whatever the algorithm does. Between updates
+        transitions wait on the host, so that an algorithm that learns from rollouts is only asked to act.
         """
         rows = pack(
             Transition(
@@ -196,7 +195,7 @@ class Learner:
             self._waiting[indices, self._rows_of(step), -1] = 1.0  # `pack` ends with it
 
     def _rows_of(self, step: int) -> slice:
-        """Return where the transitions of the turn that ends with this step wait."""
+        """Return where the transitions of the step of each environment that ends with `step` wait."""
         begin = (step - self.spec.environments) % self._cadence.update_interval
         return slice(begin, begin + self.spec.environments)
 

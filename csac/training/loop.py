@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from csac.training.program import Program, Watcher
 
 METRICS_INTERVAL = 1_000
-CHECK_INTERVAL = 500  # steps between two looks at what is due: rows to write, a signal, a diverged seed
+CHECK_INTERVAL = 500  # steps between checks of what is due: rows to write, a signal, a diverged seed
 SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
@@ -54,7 +54,7 @@ class Loop:
     ) -> None:
         self.runs, self.watcher, self.config = list(runs), watcher, runs[0].config
         self.step, self.steps = points[0].step, self.config.steps
-        self._stride = self.config.environments  # steps made at a time: one of each environment
+        self._stride = self.config.environments  # environment steps per iteration: one of each environment
         seeds = [run.seed for run in runs]
         arguments = self.config.environment_arguments
         with ExitStack() as stack:
@@ -131,7 +131,7 @@ class Loop:
         """Reset the environments, or restore what `save` wrote."""
         keep = self.config.keep_checkpoints
         self._writers = [Writer(run.checkpoints, keep) for run in self.runs]
-        self._perturb(max(self.step - self._stride, 0))  # as in the turn that the checkpoint came after
+        self._perturb(max(self.step - self._stride, 0))  # as before the last step of the checkpoint
         if not self.step:
             self._observations = self.environments.reset()
             self._actions = self.learner.next_actions(self._observations, 0)
@@ -177,9 +177,10 @@ class Loop:
         """Make one step of each environment, and learn from them; return whether a callback ends the runs."""
         for change in [self._changes[step] for step in self._changes if 0 <= self.step - step < self._stride]:
             self._perturb(self.step)
+            text = f"perturbed from step {self.step + 1:,} on: {change}"
             for run in self.runs:
-                run.log(f"perturbed from step {self.step + 1:,} on: {change}")
-            self.watcher.note(f"perturbed from step {self.step + 1:,} on: {change}")
+                run.log(text)
+            self.watcher.note(text)
         outcome = self.environments.step(self._actions)
         self.step += self._stride
         for failure in outcome.failures:
@@ -286,7 +287,7 @@ class Loop:
             self.environments.perturb(values_at(self._perturbations, step))
 
     def _is_due(self, interval: int) -> bool:
-        """Return whether the last turn has made a step whose number is a multiple of `interval`."""
+        """Return whether the last step of each environment passed a multiple of `interval`."""
         return bool(interval) and self.step % interval < self._stride
 
 

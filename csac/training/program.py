@@ -135,16 +135,16 @@ class Plan(NamedTuple):
             )
         return [
             Program(
-                tuple(group),
-                self.algorithm,
-                self.task,
-                threads,
-                processes,
-                stepping,
-                self.tensorboard,
-                self.wandb,
-                self.hears,
-                self.command,
+                directories=tuple(group),
+                algorithm=self.algorithm,
+                task=self.task,
+                threads=threads,
+                evaluation_processes=processes,
+                environment_processes=stepping,
+                tensorboard=self.tensorboard,
+                wandb=self.wandb,
+                hears=self.hears,
+                command=self.command,
             )
             for group in directories
         ]

@@ -13,7 +13,7 @@ from csac.checks import check_flag, check_path
 from csac.deploy.choosing import TrainedRuns
 from csac.processes import core_quota, end_if_unguarded, usable_cores
 from csac.record.run import RunDirectory, is_run
-from csac.record.sets import RunSet, new_set_directory
+from csac.record.sets import RunSet, new_set_directory, run_path
 from csac.record.wandb import import_wandb
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.tasks.trust import refuse_untrusted
@@ -119,25 +119,38 @@ def train(
     choose_device(options.get("device", "cpu"))
     place = None if directory is None else Path(os.path.abspath(directory))  # the task may chdir
     wanted = labels(seeds, first_seed)
+
     source = None
-    if start_from is not None and resume and place and all(is_run(place / f"seed-{seed}") for seed in wanted):
-        options = as_begun(RunDirectory.open(place / f"seed-{wanted[0]}"), options)
+    if start_from is not None and resume and place and all(is_run(run_path(place, seed)) for seed in wanted):
+        options = as_begun(RunDirectory.open(run_path(place, wanted[0])), options)
     elif start_from is not None:
         source = Source.find(start_from, wanted)
     configs, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
     choose_device(configs[0].device)  # the task's module may have changed JAX's settings
     place = place or new_set_directory(configs[0].task, algorithm.name)
-    existing = _existing(place, configs, resume, algorithm.cadence.has_schedule)
+    has_schedule = algorithm.cadence.has_schedule
+    existing = _existing(place, configs, resume, has_schedule)
+    if source:
+        for config in configs:
+            source.refuse_incompatible(config, has_schedule)
+
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task)
-    processes = evaluation_processes, environment_processes
-    how = Plan(algorithm, task, *processes, tensorboard, wandb, command, watch.callbacks.hears)
-    programs = how.programs([[place / f"seed-{seed}" for seed in group] for group in groups], existing, configs[0])
+    plan = Plan(
+        algorithm=algorithm,
+        task=task,
+        evaluation_processes=evaluation_processes,
+        environment_processes=environment_processes,
+        tensorboard=tensorboard,
+        wandb=wandb,
+        command=command,
+        hears=watch.callbacks.hears,
+    )
+    programs = plan.programs([[run_path(place, seed) for seed in group] for group in groups], existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
-    for config in configs:
-        source.refuse_incompatible(config, algorithm.cadence.has_schedule) if source else None
+
     for config in configs:
         _create_or_extend(place, config, groups, existing.get(config.seed), source)
-    runs = TrainedRuns(place, [RunDirectory.open(place / f"seed-{seed}") for seed in wanted])
+    runs = TrainedRuns(place, [RunDirectory.open(run_path(place, seed)) for seed in wanted])
     try:
         return _run(runs, programs, watch, notes)
     except InputError:  # so that the corrected call can use the directory
@@ -181,11 +194,17 @@ def resume(
         _extend(runs, steps, algorithm.cadence.has_schedule)
     existing = {run.seed: run for run in runs.runs}
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
-    has_wandb = any((run.path / "wandb").exists() for run in runs.runs)
-    has_tensorboard = any(run.tensorboard.exists() for run in runs.runs)
-    processes = evaluation_processes, environment_processes
-    how = Plan(algorithm, config.task, *processes, has_tensorboard, has_wandb, command, watch.callbacks.hears)
-    programs = how.programs([[existing[seed].path for seed in group] for group in groups], existing, config)
+    plan = Plan(
+        algorithm=algorithm,
+        task=config.task,
+        evaluation_processes=evaluation_processes,
+        environment_processes=environment_processes,
+        tensorboard=any(run.tensorboard.exists() for run in runs.runs),
+        wandb=any((run.path / "wandb").exists() for run in runs.runs),
+        command=command,
+        hears=watch.callbacks.hears,
+    )
+    programs = plan.programs([[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
 
 
@@ -212,7 +231,7 @@ def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_sched
     """Return the runs that are there and to be resumed. Raises InputError where something is in the way."""
     existing = {}
     for config in configs:
-        path = place / f"seed-{config.seed}"
+        path = run_path(place, config.seed)
         if is_run(path):
             if not resume:
                 raise InputError(f"{path} already holds a run: resume it, or leave the directory out for a new one")
@@ -235,7 +254,7 @@ def _create_or_extend(
                 existing.update_manifest(config=config)
         return
     manifest = make_manifest(config, next(group for group in groups if config.seed in group))
-    run = RunDirectory.create(place / f"seed-{config.seed}", source.begun(manifest) if source else manifest)
+    run = RunDirectory.create(run_path(place, config.seed), source.begun(manifest) if source else manifest)
     if source:
         source.copy_to(run)
 
@@ -291,8 +310,6 @@ def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:
 
 def _warmup_note(algorithm: Algorithm, config: RunConfig) -> list[str]:
     first = algorithm.cadence.side_by_side(config.environments).first_update
-    return (
-        [f"note: no updates: steps ({config.steps:,}) < {first:,}, where the first one comes"]
-        if config.steps < first
-        else []
-    )
+    if config.steps >= first:
+        return []
+    return [f"note: no updates: steps ({config.steps:,}) < {first:,}, where the first one comes"]
