@@ -109,12 +109,7 @@ def train(
     """
     end_if_unguarded()
     check_algorithm(algorithm)
-    check_flag("resume", resume)
-    check_path("directory", directory) if directory is not None else None
-    if resume and directory is None:
-        raise InputError("resume needs the `directory` of the runs (csac.resume(directory) does without a task)")
-    if wandb:
-        import_wandb()
+    _check_arguments(resume, directory, wandb)
     watch = Watch(reporter, progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(options.get("device", "cpu"))
     place = None if directory is None else Path(os.path.abspath(directory))  # the task may chdir
@@ -128,11 +123,7 @@ def train(
     configs, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
     choose_device(configs[0].device)  # the task's module may have changed JAX's settings
     place = place or new_set_directory(configs[0].task, algorithm.name)
-    has_schedule = algorithm.cadence.has_schedule
-    existing = _existing(place, configs, resume, has_schedule)
-    if source:
-        for config in configs:
-            source.refuse_incompatible(config, has_schedule)
+    existing = _existing(place, configs, resume, source, algorithm.cadence.has_schedule)
 
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task)
     plan = Plan(
@@ -148,9 +139,7 @@ def train(
     programs = plan.programs([[run_path(place, seed) for seed in group] for group in groups], existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
 
-    for config in configs:
-        _create_or_extend(place, config, groups, existing.get(config.seed), source)
-    runs = TrainedRuns(place, [RunDirectory.open(run_path(place, seed)) for seed in wanted])
+    runs = _create(place, configs, groups, existing, source)
     try:
         return _run(runs, programs, watch, notes)
     except InputError:  # so that the corrected call can use the directory
@@ -208,6 +197,16 @@ def resume(
     return _run(runs, programs, watch, [])
 
 
+def _check_arguments(resume: bool, directory: str | Path | None, wandb: bool | str) -> None:
+    check_flag("resume", resume)
+    if wandb:
+        import_wandb()
+    if directory is not None:
+        check_path("directory", directory)
+    elif resume:
+        raise InputError("resume needs the `directory` of the runs (csac.resume(directory) does without a task)")
+
+
 def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
     """Remove those of these new runs that no process has begun, and their folder if nothing else is in it."""
     for run in runs:
@@ -227,7 +226,9 @@ def _extend(runs: RunSet, steps: int, has_schedule: bool) -> None:
             run.update_manifest(config=config)
 
 
-def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_schedule: bool) -> dict[int, RunDirectory]:
+def _existing(
+    place: Path, configs: Sequence[RunConfig], resume: bool, source: Source | None, has_schedule: bool
+) -> dict[int, RunDirectory]:
     """Return the runs that are there and to be resumed. Raises InputError where something is in the way."""
     existing = {}
     for config in configs:
@@ -241,22 +242,30 @@ def _existing(place: Path, configs: Sequence[RunConfig], resume: bool, has_sched
     strangers = [] if existing or not place.is_dir() else [p for p in place.iterdir() if not p.name.startswith(known)]
     if strangers or (place.exists() and not place.is_dir()):
         raise InputError(f"{place} is not empty and holds no set of runs: choose a new or an empty directory")
+    if source:
+        for config in configs:
+            source.refuse_incompatible(config, has_schedule)
     return existing
 
 
-def _create_or_extend(
-    place: Path, config: RunConfig, groups: list[list[int]], existing: RunDirectory | None, source: Source | None
-) -> None:
-    """Create the run of a configuration, or give the existing one its larger number of steps."""
-    if existing:
-        if config != existing.config:
-            with existing.locked():
-                existing.update_manifest(config=config)
-        return
-    manifest = make_manifest(config, next(group for group in groups if config.seed in group))
-    run = RunDirectory.create(run_path(place, config.seed), source.begun(manifest) if source else manifest)
-    if source:
-        source.copy_to(run)
+def _create(
+    place: Path,
+    configs: Sequence[RunConfig],
+    groups: list[list[int]],
+    existing: dict[int, RunDirectory],
+    source: Source | None,
+) -> TrainedRuns:
+    """Create the run of each configuration, or give the existing one its larger number of steps. Raises InputError."""
+    for config in configs:
+        if config.seed not in existing:
+            manifest = make_manifest(config, next(group for group in groups if config.seed in group))
+            run = RunDirectory.create(run_path(place, config.seed), source.begun(manifest) if source else manifest)
+            if source:
+                source.copy_to(run)
+        elif config != existing[config.seed].config:
+            with existing[config.seed].locked():
+                existing[config.seed].update_manifest(config=config)
+    return TrainedRuns(place, [RunDirectory.open(run_path(place, config.seed)) for config in configs])
 
 
 def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[str]) -> TrainedRuns:
