@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from csac.record.recorder import Recorder
     from csac.record.run import RunDirectory
     from csac.tasks.vector import SeedEnvironments
+    from csac.training.notifier import Notifier
     from csac.training.program import Program, Watcher
-    from csac.training.teller import Teller
     from csac.types import PolicyNetwork
 
 
@@ -35,7 +35,7 @@ class Evaluations:
         program: what is trained and how.
         runs: the run directories; `recorders` write to them.
         environments: those that are trained in.
-        watcher, teller: who is told; the latter may end training.
+        watcher, notifier: who is told; the latter may end training.
         opened: closes what is opened here.
     """
 
@@ -46,11 +46,11 @@ class Evaluations:
         recorders: Sequence[Recorder],
         environments: SeedEnvironments,
         watcher: Watcher,
-        teller: Teller,
+        notifier: Notifier,
         opened: ExitStack,
     ) -> None:
         self.runs, self.recorders, self.environments = runs, recorders, environments
-        self.watcher, self._teller = watcher, teller
+        self.watcher, self._notifier = watcher, notifier
         config = runs[0].config
         self.evaluator = self._evaluator = Evaluator(
             *(program.task, config.environment_arguments, config.evaluation_episodes, config.evaluation_seed),
@@ -115,7 +115,7 @@ class Evaluations:
         if results:
             means = {self.runs[index].seed: mean_return(episodes) for index, (_, episodes) in results.items()}
             self.watcher.evaluated(step, means)
-        self.wants_stop = self._teller.evaluated(step, results) or self.wants_stop
+        self.wants_stop = self._notifier.evaluated(step, results) or self.wants_stop
 
     def _record(self, index: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> None:
         """Record a run's evaluation, and its policy where it is the best so far."""

@@ -17,8 +17,8 @@ from csac.tasks.workers import choose_processes
 from csac.training.checkpoint import Writer
 from csac.training.evaluations import Evaluations, is_finite
 from csac.training.learner import Learner
+from csac.training.notifier import Notifier
 from csac.training.resume import ResumePoint
-from csac.training.teller import Teller
 from csac.types import Snapshot
 
 if TYPE_CHECKING:
@@ -71,8 +71,8 @@ class Loop:
             self._begin(points)
             self.recorders = [Recorder(run, self.step, program.tensorboard, program.wandb) for run in runs]
             told = self.runs, self.recorders
-            self.teller = Teller(program.hears, watcher.call, *told, self.learner.metric_names, self._policy)
-            self.evaluations = Evaluations(program, *told, self.environments, watcher, self.teller, stack)
+            self.notifier = Notifier(program.hears, watcher.call, *told, self.learner.metric_names, self._policy)
+            self.evaluations = Evaluations(program, *told, self.environments, watcher, self.notifier, stack)
             self._saved_at, self._saved_time = self.step, time.monotonic()
             self.is_over = False
             self._resources = stack.pop_all()
@@ -196,7 +196,7 @@ class Loop:
         # One product finds a nan or an inf in a third of the time of np.isfinite().all().
         if not flat.dot(flat) < np.inf and not np.isfinite(self._actions[self.environments.alive]).all():
             self._stop_diverged()
-        return self.teller.after_step(self.step, self._stride, self.environments.alive, outcome.episodes)
+        return self.notifier.after_step(self.step, self._stride, self.environments.alive, outcome.episodes)
 
     def _due_evaluation(self) -> int | None:
         """Return the step of an evaluation that is to be made now, or None."""

@@ -47,30 +47,30 @@ class Program(NamedTuple):
 
 
 class Watcher(Protocol):
-    """Who is told what happens, beside the run directories."""
+    """Receives progress, results and notes while a program trains."""
 
     def wait_for_turn(self, step: int) -> None:
         """Wait until it is this program's turn to train on, after so many steps."""
         ...
 
     def progress(self, steps: Mapping[int, int]) -> None:
-        """Take how many steps each seed has made."""
+        """Receive how many steps each seed has made."""
         ...
 
     def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
-        """Take the mean return of each seed's evaluation."""
+        """Receive the mean return of each seed's evaluation."""
         ...
 
     def call(self, event: Event) -> Answer:
-        """Tell callbacks, and return what they have to say."""
+        """Tell the callbacks of an event, and return their answer."""
         ...
 
     def failed(self, seed: int, step: int, reason: str) -> None:
-        """Take that a seed is trained no more."""
+        """Receive that a seed has failed, and why."""
         ...
 
     def note(self, text: str) -> None:
-        """Take a line for the user."""
+        """Receive a line for the user."""
         ...
 
 

@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from csac.training.callbacks import Hears
 
 
-class Teller:
-    """The loop's end of callbacks.
+class Notifier:
+    """Tells the callbacks what happens in the loop.
 
     Args:
         hears: what they want to be told of.
         call: tells them, and returns their answer.
-        runs, recorders: of each place.
+        runs, recorders: of each seed.
         metrics: the names of the algorithm's metrics.
-        policy: returns the policy of a place as it is now.
+        policy: returns the policy of a seed as it is now.
     """
 
     def __init__(
@@ -42,21 +42,21 @@ class Teller:
         self._metrics, self._policy = metrics, policy
         self.stopped_by = ""  # what ended the runs
 
-    def after_step(self, step: int, turn: int, alive: np.ndarray, episodes: Sequence[FinishedEpisode]) -> bool:
-        """Tell of a turn of `turn` steps and of the episodes that ended; return whether to stop."""
+    def after_step(self, step: int, stride: int, alive: np.ndarray, episodes: Sequence[FinishedEpisode]) -> bool:
+        """Tell of the last `stride` steps and of the episodes that ended; return whether to stop."""
         if episodes and self._hears.episodes:
             told = [episode.seed_index for episode in episodes]
             self._tell("on_episode", step, told, [(episode,) for episode in episodes])
-        due = tuple(interval for interval in self._hears.intervals if step % interval < turn)
+        due = tuple(interval for interval in self._hears.intervals if step % interval < stride)
         if due:
-            places = np.flatnonzero(alive).tolist()
-            self._tell("on_step", step, places, [()] * len(places), due)
+            indices = np.flatnonzero(alive).tolist()
+            self._tell("on_step", step, indices, [()] * len(indices), due)
         return bool(self.stopped_by)
 
     def evaluated(self, step: int, results: Mapping[int, tuple[Policy, Any]]) -> bool:
-        """Tell of an evaluation, by place the policy and its episodes; return whether to stop."""
+        """Tell of an evaluation, by seed index the policy and its episodes; return whether to stop."""
         if results and self._hears.evaluations:
-            policies = {place: policy for place, (policy, _) in results.items()}
+            policies = {index: policy for index, (policy, _) in results.items()}
             self._tell("on_evaluation", step, [*results], [(e,) for _, e in results.values()], policies=policies)
         return bool(self.stopped_by)
 
@@ -64,7 +64,7 @@ class Teller:
         self,
         method: str,
         step: int,
-        places: Sequence[int],
+        indices: Sequence[int],
         arguments: list[tuple[Any, ...]],
         intervals: tuple[int, ...] = (),
         policies: Mapping[int, Policy] | None = None,
@@ -72,18 +72,18 @@ class Teller:
         policy_of = policies.__getitem__ if policies else self._policy
         moments = [
             Moment(
-                self._runs[place].seed,
+                self._runs[index].seed,
                 step,
-                self._runs[place].path,
-                policy_of(place) if self._hears.policies else None,
+                self._runs[index].path,
+                policy_of(index) if self._hears.policies else None,
                 metrics=self._metrics,
             )
-            for place in places
+            for index in indices
         ]
         answer = self._call(Event(method, moments, arguments, intervals))
-        for place, scalars in zip(places, answer.scalars, strict=False):
+        for index, scalars in zip(indices, answer.scalars, strict=False):
             if scalars:
-                self._recorders[place].add("metrics", [{"seed": self._runs[place].seed, "step": step, **scalars}])
+                self._recorders[index].add("metrics", [{"seed": self._runs[index].seed, "step": step, **scalars}])
         if answer.stopped_by and not self.stopped_by:
             self.stopped_by = answer.stopped_by
             for run in self._runs:
