@@ -117,7 +117,7 @@ class Learnt:
             for lost in self._checkpoint.fill(rows):
                 warnings.warn(lost, stacklevel=3)
         in_order = jax.numpy.asarray(rows[np.arange(first, last) % max(len(rows), 1)])
-        return Transition(*map(np.asarray, jax.vmap(unpack, (0, None))(in_order, self._contract.spec)))
+        return jax.tree.map(np.asarray, jax.vmap(unpack, (0, None))(in_order, self._contract.spec))
 
 
 def load_checkpoint(directory: str | os.PathLike[str], seed: int | None = None, step: int | None = None) -> Learnt:

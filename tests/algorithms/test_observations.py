@@ -59,7 +59,7 @@ def test_learning_from_far_observations_is_learning_from_near_ones(algorithm):
     expected, expected_metrics = update(plain, plain.init(jax.random.key(0), SPEC, 100), NEAR)
     jax.tree.map(
         partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5),
-        state._replace(observations=None),
+        state._replace(observation_statistics=None),
         expected,
     )
     for name, value in expected_metrics.items():
@@ -82,7 +82,7 @@ def test_the_policy_that_leaves_sees_what_the_algorithm_sees(algorithm):
     act = jax.vmap(partial(algorithm.act, explore=False), in_axes=(None, 0, None))
     actions = act(state, observations, jax.random.key(0))
     np.testing.assert_allclose(Policy(network, contract).act(np.asarray(observations)), actions, atol=1e-6)
-    seen = state._replace(observations=None)
+    seen = state._replace(observation_statistics=None)
     near = jnp.array([[-10.0], [-1.0], [0.0], [1.5], [10.0]])
     np.testing.assert_allclose(act(seen, near, jax.random.key(0)), actions, atol=1e-6)
 

@@ -252,12 +252,12 @@ def test_densities_are_those_by_which_the_actions_were_drawn():
     state, _ = update(SMALL, begin(SMALL), rollout(range(8)))
     state = state._replace(parameters=state.parameters._replace(log_std=jnp.array([-0.7])))
     batch = rollout(np.arange(8.0), truncated=[5])._replace(observation=rollout(range(8)).observation * 5 + 1)
-    absorbed = state._replace(observations=state.observation_statistics.absorb(batch.observation))
+    absorbed = state._replace(observation_statistics=state.observation_statistics.absorb(batch.observation))
     samples = compiled(SMALL.samples)(state, absorbed, batch)
     mean = jax.vmap(SMALL.act, in_axes=(None, 0, None, None))(state, batch.observation, jax.random.key(0), False)
     expected = scipy.stats.norm.logpdf(batch.action, np.asarray(mean), np.exp(-0.7))[:, 0]
     np.testing.assert_allclose(samples.log_prob, expected, rtol=1e-5)
-    normalised = jax.vmap(SMALL.normalise, in_axes=(None, 0))(absorbed.observations, batch.observation)
+    normalised = jax.vmap(SMALL.normalise, in_axes=(None, 0))(absorbed.observation_statistics, batch.observation)
     np.testing.assert_allclose(samples.observation, normalised, rtol=1e-5)
 
 

@@ -209,4 +209,4 @@ def test_the_example_of_the_documentation_runs(tmp_path, capsys):
     run = RunDirectory.open(tmp_path / "run" / "seed-0")
     assert (run.evaluations.dtype.names or ())[-3:] == ("success", "off_the_rail", "reversals")
     assert not run.manifest.restarts_episode
-    assert capsys.readouterr().out.startswith("success ")
+    assert "\nsuccess " in capsys.readouterr().out

@@ -161,7 +161,7 @@ def test_an_episode_that_has_one_time_limit_more_starts_anew():
     steps_of(first, 5)
     assert second.restore(0, through_json(first.save(0))) is False
     episodes = [episode for _, _, episodes in steps_of(second, 7) for episode in episodes]
-    assert [(length, reward) for _, reward, length in episodes] == [(7, 1 + 2 + 3 + 4 + 5 + 6 + 7)]
+    assert [episode[1:3] for episode in episodes] == [(1 + 2 + 3 + 4 + 5 + 6 + 7, 7)]
 
 
 def test_a_seed_that_neither_takes_its_episode_back_nor_can_be_reset_has_failed():
