@@ -137,11 +137,17 @@ def _let_through() -> None:
     signal.pthread_sigmask(signal.SIG_SETMASK, _forking.mask)
 
 
+def script() -> Path | None:
+    """Return the file of the user's script, or None in a notebook, at a prompt or in what standard input gave."""
+    file = getattr(sys.modules["__main__"], "__file__", None)  # "<stdin>" there
+    return Path(file) if file and Path(file).is_file() else None
+
+
 def may_be_imported() -> bool:
     """Return whether processes may import the user's script: it has a guard, or there is none, as in a notebook."""
-    file = getattr(sys.modules["__main__"], "__file__", None)
+    file = script()
     with suppress(OSError, ValueError):
-        return file is None or "__main__" in Path(file).read_text(encoding="utf-8")
+        return file is None or "__main__" in file.read_text(encoding="utf-8")
     return True
 
 
@@ -165,7 +171,7 @@ class Child:
         before = os.environ.get(_SAFE_PATH)
         self.process = context.Process(target=_work, args=(before, work, theirs, *arguments), daemon=daemon)
         try:
-            with safe_path(), worker_surroundings():
+            with safe_path(), worker_surroundings(), _without_a_script_that_is_none():
                 self.process.start()
         except BaseException:  # a Ctrl-C that waited until the process was there
             if self.process.pid:
@@ -250,6 +256,17 @@ def worker_surroundings() -> Iterator[None]:
         finally:
             if has_masks:
                 signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+@contextmanager
+def _without_a_script_that_is_none() -> Iterator[None]:
+    """Have the Pythons that are started in this block not look for a file that standard input is called by."""
+    main = vars(sys.modules["__main__"])
+    hidden = {"__file__": main.pop("__file__")} if "__file__" in main and script() is None else {}
+    try:
+        yield
+    finally:
+        main.update(hidden)
 
 
 @contextmanager

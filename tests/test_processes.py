@@ -74,6 +74,25 @@ def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
     assert not (tmp_path / "run").exists()  # once mended, the script begins there
 
 
+def test_standard_input_trains_its_own_task_in_one_process_and_any_other_in_several(tmp_path):
+    """Python calls what it reads there "<stdin>", which no process finds."""
+    text = """
+from csac import SAC, train
+from gymnasium.envs.classic_control import PendulumEnv
+class Mine(PendulumEnv): ...
+options = {"steps": 20, "seeds": 2, "evaluation_interval": 0, "progress": False}
+for task in (Mine, "Pendulum-v1"):
+    runs = train(SAC(batch_size=8), task, **options)
+    print(*[(run.manifest.state, len(run.manifest.program)) for run in runs.runs])
+"""
+    result = subprocess.run(
+        [sys.executable, "-"], input=text, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    together, alone = str(("finished", 2)), str(("finished", 1))
+    assert result.stdout.splitlines() == [f"{together} {together}", f"{alone} {alone}"], result.stderr
+    assert "Traceback" not in result.stderr
+
+
 @pytest.mark.parametrize(
     ("script", "may"),
     [("train()", False), ('if __name__ == "__main__":\n    train()', True), (None, True)],

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import pickle
-import sys
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import gymnasium
 
 from csac.checks import check_whole
-from csac.processes import core_quota, may_be_imported, usable_cores
+from csac.processes import core_quota, may_be_imported, script, usable_cores
 from csac.training.callbacks import Hears
 from csac.training.devices import preallocates
 from csac.types import InputError
@@ -151,8 +150,8 @@ class Plan(NamedTuple):
 
 
 def can_be_sent(task: Task) -> bool:
-    """Return whether another process can be sent the task; it cannot import what a notebook or a terminal defined."""
-    has_script, maker = hasattr(sys.modules["__main__"], "__file__"), task
+    """Return whether another process can be sent the task; none can import what a notebook or a terminal defined."""
+    has_script, maker = script() is not None, task
     if isinstance(task, str):
         known = gymnasium.registry.get(task)
         if has_script or known is None:

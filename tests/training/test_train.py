@@ -204,7 +204,7 @@ def test_what_a_notebook_defines_is_not_sent_to_a_process(monkeypatch):
     tasks: list[Any] = [notebook.Cell, partial(notebook.Cell), "Cell-v0", lambda: None]
     assert not any(map(can_be_sent, tasks))
     assert can_be_sent("Pendulum-v1")
-    notebook.__file__ = "script.py"
+    notebook.__file__ = __file__
     assert can_be_sent(notebook.Cell)
 
 
