@@ -16,7 +16,7 @@ from csac.tasks.events import EpisodeEvents
 from csac.tasks.failures import EnvironmentFailure
 from csac.tasks.registry import Task
 from csac.tasks.workers import Workers
-from csac.types import Snapshot
+from csac.types import InputError, Snapshot
 
 Place = tuple[int, ...]  # of an environment: its seed's, and its own where a seed has several
 
@@ -193,6 +193,16 @@ class SeedEnvironments:
             "environment": inner.values if inner else {},
         }
         return Snapshot(arrays, values)
+
+    def refuse_misfit(self, saved: Snapshot, actions: np.ndarray) -> None:
+        """Raise InputError where `save` was of a task with other sizes; `actions` are those that were to come next."""
+        first = "observation" if self.spec.environments == 1 else "0.observation"
+        before, now = (saved.arrays[first].size, actions.shape[-1]), (self.spec.observation_size, self.spec.action_size)
+        if before != now:
+            raise InputError(
+                f"{self.task_name}: (observations, actions) were {before} and are {now} now: "
+                "resume with the task and the versions of its packages that the manifest names"
+            )
 
     def restore(self, index: int, saved: Snapshot) -> bool:
         """Let the seed at this place go on from `save`; return false where an episode of it had to start anew.

@@ -142,9 +142,10 @@ class Loop:
         for index, (run, point) in enumerate(zip(self.runs, points, strict=True)):
             assert point.checkpoint
             saved, origin = point.checkpoint.state(), run.manifest.forked_from
+            environment = saved.part("environment")
+            self.environments.refuse_misfit(environment, saved.arrays["actions"])
             learnt.append(saved.part("learner"))
             self._actions[index] = saved.arrays["actions"]
-            environment = saved.part("environment")
             if origin and origin.step == self.step and origin.changed("task "):
                 environment.values["exact"] = False
             if not self.environments.restore(index, environment):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
+from gymnasium.spaces import Box
+from probes import Probe
 from resuming import ADAPTIVE, LEARNERS, SMALL, Crash, contents, crash_at, run
 
 import csac
@@ -99,6 +103,24 @@ def test_what_would_be_another_run_is_refused(tmp_path, changes, name):
     with pytest.raises(InputError, match=name):
         run(tmp_path / "run", resume=True, **{"steps": 200, **changes})
     assert contents(made.runs[0]) == before
+
+
+def sized(observations: int, actions: int) -> type[Probe]:
+    class Growing(Probe):
+        observation_space = Box(-1.0, 1.0, (observations,), np.float32)
+        action_space = Box(-1.0, 1.0, (actions,), np.float32)
+
+        def first_observation(self):
+            return np.zeros(observations, np.float32)
+
+    return Growing
+
+
+@pytest.mark.parametrize("sizes", [(2, 1), (1, 2)], ids=["observations", "actions"])
+def test_a_resume_of_a_task_whose_sizes_have_changed_names_them(tmp_path, sizes):
+    run(tmp_path / "run", steps=100, task=sized(1, 1))
+    with pytest.raises(InputError, match=re.escape(f"were (1, 1) and are {sizes} now")):
+        run(tmp_path / "run", steps=200, task=sized(*sizes), resume=True)
 
 
 @pytest.mark.parametrize(
