@@ -193,8 +193,9 @@ def _undisturbed(is_pybullet: bool) -> Iterator[None]:
 def _silence_mujoco() -> None:
     """Send MuJoCo's warnings to the log: by itself it prints them, and writes MUJOCO_LOG.TXT where the user works."""
     try:
-        with safe_path():  # what draws for MuJoCo asks a Python of its own for its version
+        with safe_path():  # GLFW, which draws for MuJoCo and for Gymnasium, asks a Python of its own for its version
             mujoco = importlib.import_module("mujoco")
+            importlib.import_module("glfw")
     except Exception:  # a task that needs it says so
         return
     if mujoco.get_mju_user_warning() is None:
