@@ -48,7 +48,8 @@ def evaluate_run(
 
     The episodes are the same for every seed, and none that training or its evaluations have seen. The task is the one
     that the run began with, but for these `perturbations`, which last from beginning to end. The episodes are shared by
-    `processes`, by default as many as pay; 1 is this one. Whatever their number, the results are the same.
+    `processes`, by default as many as pay; 1 is this one. Whatever their number, the results are the same. What was
+    trained with `evaluation_environments=0` has one environment at a time here too.
     `on_progress(episodes done, of how many)` is called after each batch of episodes. `trust_task` lets the task import
     its module though nobody has named it here (`csac.tasks.trust`).
 
@@ -64,13 +65,17 @@ def evaluate_run(
     if not chosen:
         raise InputError(f"{runs.path} holds no {which} policies yet: the first evaluation writes them")
     policies = {run.seed: load_run(run, which) for run in chosen}
-    evaluator = Evaluator(task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events)
+    environments = runs.config.evaluation_environments or 1
+    evaluator = Evaluator(
+        task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events, environments=environments
+    )
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     with closing(Environment(task, arguments)) as environment:
         environment.perturb(evaluator.perturbed)
         for policy in policies.values():
             check_contract(policy, environment)
-    processes = choose_processes(evaluator, len(policies)) if processes is None else processes
+    if processes is None:
+        processes = choose_processes(evaluator, len(policies)) if runs.config.evaluation_environments else 1
     with closing(evaluator if processes == 1 else EvaluationPool(evaluator, processes)) as workers:
         results = workers.begin(list(policies.values()), deterministic, on_progress).results()
     for label, result in zip(policies, results, strict=True):

@@ -8,11 +8,13 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.mujoco.hopper_v4 import HopperEnv
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import TimeLimit
 from resuming import LEARNERS, Crash, contents, crash_at, run
 
 from csac import InputError, load
 from csac.evaluation.evaluator import evaluate
+from csac.evaluation.play import evaluate_run
 
 
 class OneHopper(HopperEnv):
@@ -61,6 +63,14 @@ def test_it_resumes_exactly(whole, tmp_path):
         run(tmp_path / "again", task=HOPPER, evaluation_environments=0, on_evaluation=crash_at(300))
     again = run(tmp_path / "again", task=HOPPER, evaluation_environments=0, resume=True)
     assert contents(again.runs[0]) == contents(whole)
+
+
+def test_evaluate_keeps_to_one_instance_too(tmp_path, monkeypatch):
+    monkeypatch.setitem(gymnasium.registry, "One-v0", EnvSpec("One-v0", lambda **_: single()))
+    run(tmp_path / "run", task="One-v0", steps=100, evaluation_environments=0)
+    ((_, episodes),) = evaluate_run(tmp_path / "run", episodes=3)
+    assert len(episodes) == 3
+    assert OneHopper.live == 0
 
 
 def test_fewer_environments_give_the_same_numbers(tmp_path):
