@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 EPISODES_AT_ONCE = 10  # rows of every batch that the policy sees: rounding depends on its shape
 LONGEST_EPISODE = 100_000  # steps; a task that never ends would never let training go on
-STEPS_BETWEEN_STOPS = 1_000
 
 _SEED_LIMIT = 2**32
 
@@ -126,7 +125,7 @@ class Evaluator:
     ) -> list[EvaluationEpisode]:
         """Return the episodes of the batch that begins with number `first`.
 
-        `should_stop` is asked every 1,000 steps.
+        `should_stop` is asked before each step.
 
         Raises:
             InputError, EvaluationFailure: as `run`.
@@ -222,11 +221,10 @@ class Evaluator:
         observations = np.zeros((EPISODES_AT_ONCE, observation_size), np.float32)
         noise = None if deterministic else np.zeros((EPISODES_AT_ONCE, action_size), np.float32)
         self._ignores_seed = start(episodes, observations[: len(episodes)], self._ignores_seed)
-        running, steps = list(enumerate(episodes)), 0
+        running = list(enumerate(episodes))
         while running:
-            if should_stop and steps % STEPS_BETWEEN_STOPS == 0 and should_stop():
+            if should_stop and should_stop():
                 raise EvaluationStopped
-            steps += 1
             if self.watch:
                 self.watch(observations[[row for row, _ in running]])
             if noise is not None:

@@ -47,7 +47,7 @@ class Pending:
         """Return each policy's episodes in order, or its first failure, which does not end the others. Waits.
 
         Raises:
-            EvaluationStopped: `should_stop` said so; it is asked every 1,000 steps.
+            EvaluationStopped: `should_stop` said so; it is asked before each step.
         """
         for batch in self._evaluator.batches(len(self._policies)):
             if batch not in self._answers and not self._is_spared(batch):

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
-from gymnasium.wrappers import NormalizeObservation, NormalizeReward
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward, TimeLimit
 
 from csac.tasks.failures import EnvironmentFailure
+from csac.tasks.registry import adapter_of
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from csac.tasks.environment import Environment
+    from csac.tasks.registry import Task
 
 
 def json_arguments(arguments: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -68,8 +70,24 @@ def seed_warning(environment: Environment) -> str | None:
             f"{environment.task_name}: reset(seed=...) gives other observations for the same seed: runs do not repeat"
         )
     if np.array_equal(first, other):
-        return f"{environment.task_name}: reset(seed=...) gives the same observation for every seed"
+        return (
+            f"{environment.task_name}: reset(seed=...) gives the same observation for every seed: episodes may be one"
+        )
     return None
+
+
+def limit_warning(environment: Environment, task: Task, longest: int) -> str | None:
+    """Return a line where no time limit is known, so that an evaluation episode may take `longest` steps, else None."""
+    wrapper, spec = environment.raw, environment.raw.spec
+    while isinstance(wrapper, gymnasium.Wrapper) and not isinstance(wrapper, TimeLimit):
+        wrapper = wrapper.env
+    if isinstance(wrapper, TimeLimit) or (spec and spec.max_episode_steps) or adapter_of(task):
+        return None
+    how = "--env-kwargs '{\"max_episode_steps\": 1000}'" if isinstance(task, str) else "gymnasium.wrappers.TimeLimit"
+    return (
+        f"{environment.task_name} has no time limit: an evaluation episode that does not end by itself takes "
+        f"{longest:,} steps ({how} sets one)"
+    )
 
 
 def wrapper_warnings(environment: Environment) -> list[str]:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from csac.algorithms import ALGORITHMS
 from csac.checks import check_whole, did_you_mean
+from csac.evaluation.evaluator import LONGEST_EPISODE
 from csac.presets import matching_preset
 from csac.record.config import SEED_LIMIT, RunConfig
 from csac.record.manifest import Manifest
 from csac.synonyms import called_in_python
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
-from csac.tasks.preflight import json_arguments, seed_warning, try_task, wrapper_warnings
+from csac.tasks.preflight import json_arguments, limit_warning, seed_warning, try_task, wrapper_warnings
 from csac.tasks.registry import check_events, events_of
 from csac.tasks.trust import remember
 from csac.types import InputError
@@ -72,7 +73,8 @@ def make_configs(
     with closing(Environment(task, arguments)) as environment:
         spec, name = environment.spec, environment.task_name
         try_task(environment)
-        notes = [*wrapper_warnings(environment), *filter(None, [seed_warning(environment)])]
+        told = seed_warning(environment), limit_warning(environment, task, LONGEST_EPISODE)
+        notes = [*wrapper_warnings(environment), *filter(None, told)]
         remember(task)
         asked_for = tuple(map(str, perturbations_of(asked or ())))
         configs = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -10,13 +11,14 @@ import numpy as np
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
+from csac.evaluation.pending import EvaluationStopped
 from csac.evaluation.pool import EvaluationPool
 from csac.tasks.events import info_name
 from csac.tasks.perturbations import perturbations_of, values_at
 from csac.training.callbacks import mean_return
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from contextlib import ExitStack
 
     from csac.evaluation.evaluator import EvaluationEpisode
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from csac.training.notifier import Notifier
     from csac.training.program import Program, Watcher
     from csac.types import PolicyNetwork
+
+SECONDS_TO_FINISH = 10.0  # that an evaluation has once a stop is asked for
 
 
 class Evaluations:
@@ -67,7 +71,10 @@ class Evaluations:
         self._perturbations = perturbations_of(config.perturbations)
         self._pending: tuple[int, list[int], list[Policy], Any] | None = None
         self.step = int(runs[0].evaluations["step"].max(initial=0))  # of the newest one
-        self.wants_stop = False  # whether the watcher has said so of an evaluation
+        self.wants_stop = False  # whether the watcher has said so of an evaluation, or one was broken off
+        self.broken_off: int | None = None  # the step of that one
+        self.should_stop: Callable[[], bool] = lambda: False
+        self._stop_at = 0.0  # when, once a stop was asked for
         self._missing_events = {info_name(event) for event in config.events} if not len(runs[0].evaluations) else set()
 
     @property
@@ -88,6 +95,9 @@ class Evaluations:
     def begin(self, step: int, networks: Sequence[PolicyNetwork], task_step: int) -> None:
         """Begin to evaluate each seed's network after `step`, on the task of `task_step`."""
         self.finish()
+        if self.broken_off is not None:  # this one is left to a resume
+            self.broken_off = step
+            return
         self.step = step
         indices = [i for i in np.flatnonzero(self.environments.alive).tolist() if is_finite(networks[i])]
         policies = [self.policy(networks[i], step) for i in indices]
@@ -97,12 +107,18 @@ class Evaluations:
             self.finish()
 
     def finish(self) -> None:
-        """Wait for the evaluation in progress, if there is one, and record it."""
+        """Wait for the evaluation in progress, if there is one, and record it; a stop breaks off a long one."""
         if not self._pending:
             return
         (step, indices, policies, pending), self._pending = self._pending, None
+        try:
+            answers = pending.results(self._is_late)
+        except EvaluationStopped:
+            self.broken_off, self.wants_stop = step, True
+            self._note(self.runs[0], f"the evaluation at step {step:,} is broken off, as a stop was asked for")
+            return
         results: dict[int, tuple[Policy, list[EvaluationEpisode]]] = {}
-        for index, policy, result in zip(indices, policies, pending.results(), strict=True):
+        for index, policy, result in zip(indices, policies, answers, strict=True):
             run = self.runs[index]
             if isinstance(result, EvaluationFailure):
                 self._note(run, f"warning: seed {run.seed}: the evaluation at step {step:,} failed: {result}")
@@ -116,6 +132,13 @@ class Evaluations:
             means = {self.runs[index].seed: mean_return(episodes) for index, (_, episodes) in results.items()}
             self.watcher.evaluated(step, means)
         self.wants_stop = self._notifier.evaluated(step, results) or self.wants_stop
+
+    def _is_late(self) -> bool:
+        """Return whether a stop was asked for so long ago that nobody waits for the evaluation in progress."""
+        if not self.should_stop():
+            return False
+        self._stop_at = self._stop_at or time.monotonic() + SECONDS_TO_FINISH
+        return time.monotonic() >= self._stop_at
 
     def _record(self, index: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> None:
         """Record a run's evaluation, and its policy where it is the best so far."""

@@ -83,8 +83,11 @@ class Loop:
         Raises:
             OSError: a run directory can no longer be written.
         """
-        is_stopping = False
+        is_stopping, self.evaluations.should_stop = False, should_stop
         self.watcher.wait_for_turn(self.step)
+        if self._is_owed:
+            self._evaluate(self.step)
+            self._saved_at, is_stopping = -1, self.evaluations.wants_stop  # its rows are in no checkpoint yet
         while self.step < self.steps and self.environments.is_any_alive and not is_stopping:
             is_stopping = self._advance()
             is_last = self.step == self.steps
@@ -131,6 +134,7 @@ class Loop:
         """Reset the environments, or restore what `save` wrote."""
         keep = self.config.keep_checkpoints
         self._writers = [Writer(run.checkpoints, keep) for run in self.runs]
+        self._is_owed = False  # an evaluation of this step, which was broken off
         self._perturb(max(self.step - self._stride, 0))  # as before the last step of the checkpoint
         if not self.step:
             self._observations = self.environments.reset()
@@ -144,6 +148,7 @@ class Loop:
             saved, origin = point.checkpoint.state(), run.manifest.forked_from
             environment = saved.part("environment")
             self.environments.refuse_misfit(environment, saved.arrays["actions"])
+            self._is_owed = self._is_owed or saved.values.get("evaluation_owed", False)
             learnt.append(saved.part("learner"))
             self._actions[index] = saved.arrays["actions"]
             if origin and origin.step == self.step and origin.changed("task "):
@@ -245,6 +250,8 @@ class Loop:
     def _snapshot(self, index: int) -> Snapshot:
         saved = Snapshot.joined({"learner": self.learner.save(index), "environment": self.environments.save(index)})
         saved.arrays["actions"] = self._actions[index]
+        if self.evaluations.broken_off == self.step:
+            saved.values["evaluation_owed"] = True
         return saved
 
     def _policy(self, index: int) -> Policy:

@@ -14,7 +14,14 @@ import probes
 import pytest
 
 from csac.tasks.environment import Environment
-from csac.tasks.preflight import json_arguments, seed_globals, seed_warning, try_task, wrapper_warnings
+from csac.tasks.preflight import (
+    json_arguments,
+    limit_warning,
+    seed_globals,
+    seed_warning,
+    try_task,
+    wrapper_warnings,
+)
 from csac.types import InputError
 
 
@@ -104,6 +111,18 @@ def test_a_task_that_ignores_its_seed_is_told():
     for task in ("Hopper-v4", "probes:Failing-v0"):
         environment = Environment(task, {"where": "reset"} if "Failing" in task else None)
         assert seed_warning(environment) is None
+
+
+def test_a_task_without_a_time_limit_is_told():
+    limitless: dict[Any, str] = {probes.Endless: "gymnasium.wrappers.TimeLimit", "probes:Endless-v0": "--env-kwargs"}
+    for task, how in limitless.items():
+        assert f"({how}" in str(limit_warning(Environment(task), task, 9))
+    limited: dict[Any, Any] = {
+        "Hopper-v4": None,
+        "probes:Endless-v0": {"max_episode_steps": 7},
+        lambda: gymnasium.wrappers.TimeLimit(probes.Endless(), 9): None,
+    }
+    assert [limit_warning(Environment(task, given), task, 9) for task, given in limited.items()] == [None] * 3
 
 
 def test_global_generators_are_seeded():

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 import shutil
+import signal
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.hopper_v4 import HopperEnv
 from gymnasium.spaces import Box
 from probes import Probe
 from resuming import ADAPTIVE, LEARNERS, SMALL, Crash, contents, crash_at, run
@@ -16,9 +18,12 @@ from resuming import ADAPTIVE, LEARNERS, SMALL, Crash, contents, crash_at, run
 import csac
 from csac import InputError
 from csac.algorithms import PPO, SAC
+from csac.record.config import EVALUATION_SEED
 from csac.record.run import RunDirectory
 from csac.record.sets import find_sets
+from csac.training import evaluations
 from csac.training.checkpoint import steps_in
+from csac.training.signals import Interrupted
 
 CHANGES = ("friction=1.5@150", "action_noise=0.05@210", "observation_noise=0.01@330")
 
@@ -103,6 +108,26 @@ def test_what_would_be_another_run_is_refused(tmp_path, changes, name):
     with pytest.raises(InputError, match=name):
         run(tmp_path / "run", resume=True, **{"steps": 200, **changes})
     assert contents(made.runs[0]) == before
+
+
+@pytest.mark.parametrize("at", [2, 5], ids=["between", "last"])
+def test_a_stop_breaks_off_a_long_evaluation_which_the_resume_makes(tmp_path, monkeypatch, at):
+    whole, reset, begun = run(tmp_path / "whole"), HopperEnv.reset, []
+
+    def interrupting(self, *, seed=None, options=None):
+        begun.extend([seed] * (seed == EVALUATION_SEED))
+        if seed == EVALUATION_SEED and len(begun) == at:
+            signal.raise_signal(signal.SIGINT)
+        return reset(self, seed=seed, options=options)
+
+    monkeypatch.setattr(evaluations, "SECONDS_TO_FINISH", 0.0)
+    monkeypatch.setattr(HopperEnv, "reset", interrupting)
+    with pytest.raises(Interrupted):
+        run(tmp_path / "run")
+    stopped = RunDirectory.open(tmp_path / "run" / "seed-0")
+    assert (stopped.manifest.steps_done, stopped.evaluations["step"].max()) == (100 * at, 100 * (at - 1))
+    resumed = run(tmp_path / "run", resume=True)
+    assert contents(resumed.runs[0]) == contents(whole.runs[0])
 
 
 def sized(observations: int, actions: int) -> type[Probe]:
