@@ -246,7 +246,7 @@ def _filming(environment: Environment, task: str, video: str | Path | None) -> I
     if video is None:
         yield _Window()
         return
-    path = Path(video)
+    path = Path(video).absolute()  # a task may change where we are
     aside = path.with_name(f".{os.getpid()}.{path.name}")
     film = _Film(environment, task, aside)
     try:
