@@ -194,7 +194,7 @@ class SeedEnvironments:
         }
         return Snapshot(arrays, values)
 
-    def refuse_misfit(self, saved: Snapshot, actions: np.ndarray) -> None:
+    def refuse_incompatible(self, saved: Snapshot, actions: np.ndarray) -> None:
         """Raise InputError where `save` was of a task with other sizes; `actions` are those that were to come next."""
         first = "observation" if self.spec.environments == 1 else "0.observation"
         before, now = (saved.arrays[first].size, actions.shape[-1]), (self.spec.observation_size, self.spec.action_size)

@@ -147,7 +147,7 @@ class Loop:
             assert point.checkpoint
             saved, origin = point.checkpoint.state(), run.manifest.forked_from
             environment = saved.part("environment")
-            self.environments.refuse_misfit(environment, saved.arrays["actions"])
+            self.environments.refuse_incompatible(environment, saved.arrays["actions"])
             self._is_owed = self._is_owed or saved.values.get("evaluation_owed", False)
             learnt.append(saved.part("learner"))
             self._actions[index] = saved.arrays["actions"]
