@@ -125,7 +125,8 @@ def test_the_working_directory_is_searched_for_a_named_module_alone(tmp_path):
 
 def test_processes_that_are_started_search_it_last_too(tmp_path):
     """Python itself would search it first in them: what lies there by chance would be run."""
-    (tmp_path / "random.py").write_text("raise SystemExit('the random.py of the working directory')")
+    for name in ("random.py", "struct.py"):
+        (tmp_path / name).write_text(f"raise SystemExit('the {name} of the working directory')")
     code = """
 import sys
 sys.path = [place for place in sys.path if place]
