@@ -11,8 +11,6 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from csac.types import Algorithm
-
 # Actor and critics have the same activation, and no layer norm.
 _ALIKE: Mapping[str, Any] = MappingProxyType(
     {
@@ -169,11 +167,11 @@ def hyperparameters(preset: str, algorithm: str, task: str) -> dict[str, Any]:
     return {**algorithms[algorithm], **_TASKS.get(preset, {}).get((algorithm, task.rpartition(":")[2]), {})}
 
 
-def matching_preset(algorithm: type[Algorithm], task: str, values: Mapping[str, Any]) -> str | None:
+def matching_preset(algorithm: Any, task: str, values: Mapping[str, Any]) -> str | None:
     """Return the preset that gives an algorithm just these hyperparameters, the others as by default, or None."""
     for preset, algorithms in _ALGORITHMS.items():
         if algorithm.name in algorithms:
             preset_values = hyperparameters(preset, algorithm.name, task)
-            if dataclasses.asdict(algorithm(**preset_values)) == values:  # pyright: ignore[reportArgumentType, reportCallIssue]
+            if dataclasses.asdict(algorithm(**preset_values)) == values:
                 return preset
     return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias
 
 if TYPE_CHECKING:
     import jax
@@ -162,9 +162,6 @@ class Algorithm(Protocol):
 
     Every method is pure and speaks of one seed; `training` adds the seed axis.
     """
-
-    name: ClassVar[str]
-    """The name in `ALGORITHMS`, on the command line and in the manifest."""
 
     @property
     def cadence(self) -> Cadence:

@@ -89,7 +89,7 @@ def _checked(value: Any, hint: Any) -> Any:
     if get_origin(hint) in (Union, UnionType):
         return _one_of(value, get_args(hint))
     kind, *limits = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    value = _CONVERSIONS.get(get_origin(kind) or kind, _whole)(value, kind)
+    value = _CONVERSIONS.get(get_origin(kind) or kind, lambda given, _: given)(value, kind)
     # A number must keep its range in 32 bits: 1 - 1e-9 is 1 there.
     rounded = float(np.float32(value)) if kind is float else value
     for limit in limits:
@@ -140,10 +140,16 @@ def _choice(value: Any, kind: Any) -> str:
     return value
 
 
-def _widths(value: Any, kind: Any) -> tuple[int, ...]:
+def _several(value: Any, kind: Any) -> tuple[Any, ...]:
     if not isinstance(value, tuple | list):
-        raise ValueError("a tuple of whole numbers")
-    return tuple(map(_whole, value))
+        raise ValueError("a tuple of whole numbers" if get_args(kind)[:1] == (int,) else "a tuple")
+    return tuple(_checked(one, get_args(kind)[0]) for one in value)
 
 
-_CONVERSIONS: dict[Any, Callable[[Any, Any], Any]] = {float: _number, bool: _switch, Literal: _choice, tuple: _widths}
+_CONVERSIONS: dict[Any, Callable[[Any, Any], Any]] = {
+    float: _number,
+    int: _whole,
+    bool: _switch,
+    Literal: _choice,
+    tuple: _several,
+}

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, Suppress, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from csac.checks import did_you_mean
-from csac.cli.parsing import JSON, options_of, parse, value_of
+from csac.cli.parsing import JSON, chosen_algorithm, options_of, parse, value_of
 from csac.presets import PRESETS, hyperparameters
 from csac.record.config import RunConfig
 from csac.seeds import EVALUATION_SEED
@@ -38,7 +37,9 @@ Constant = Annotated[
 ]
 Trust = Annotated[
     Flag,
-    arg(help="Allow the task to import its module although you have never named it on this machine; read it first."),
+    arg(
+        help="Allow the run's task or algorithm to import its module although you have never named it on this machine."
+    ),
 ]
 Names = Annotated[
     tuple[str, ...],
@@ -113,7 +114,15 @@ class Train(_Training):
         if "none" in self.perturbations and len(self.perturbations) > 1:
             raise InputError("--perturb none leaves everything out: give it alone")
         planned = () if "none" in self.perturbations else self.perturbations or None  # None: as the source has it
-        others = ("task", "algorithm", self.algorithm, "preset", "hyperparameters", "seed", "task_is_callable")
+        others = (
+            "task",
+            "algorithm",
+            _field_of(self.algorithm),
+            "preset",
+            "hyperparameters",
+            "seed",
+            "task_is_callable",
+        )
         given = {name: value for name, value in vars(self).items() if name not in others}
         return {**given, "perturbations": planned, "events": self.events or None}
 
@@ -149,7 +158,9 @@ class Tune(_Training):
 
     def home(self) -> Path:
         """Return the directory of the search."""
-        return self.directory or Path("runs", "tune", self.task.replace("/", "-").replace(":", "-"), self.algorithm)
+        from csac.record.sets import as_folder
+
+        return self.directory or Path("runs", "tune", as_folder(self.task), as_folder(self.algorithm))
 
 
 @dataclass(frozen=True)
@@ -265,7 +276,12 @@ def parse_training(base: type[Any], words: list[str], program: str) -> Any:
 
 def learner_of(options: Any) -> Any:
     """Return the algorithm with its hyperparameters, as `parse_training` has parsed them."""
-    return getattr(options, options.algorithm)
+    return getattr(options, _field_of(options.algorithm))
+
+
+def _field_of(algorithm: str) -> str:
+    """Return the field of a command that has the hyperparameters of an algorithm, a name or `module:Class`."""
+    return algorithm.rpartition(":")[2]
 
 
 def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
@@ -273,12 +289,9 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
     from csac.algorithms import ALGORITHMS
 
     source, preset = _source(words), value_of(words, "--preset")
-    name = value_of(words, "--algorithm", source.config.algorithm if source else "csac")
-    if name not in ALGORITHMS:
-        hint = did_you_mean(name, ALGORITHMS) or f"choose {' or '.join(ALGORITHMS)}"
-        raise InputError(f"no algorithm is called {name!r}: {hint}")
+    name, kind = chosen_algorithm(words, source.config.algorithm if source else None)
     defaults: dict[str, Any] = {"algorithm": name, "preset": preset}
-    learner = ALGORITHMS[name](**(hyperparameters(preset, name, task) if preset else {}))
+    learner = kind(**(hyperparameters(preset, name, task) if preset else {}))
     if source:
         kept = ("steps", "environments", "evaluation_interval", "evaluation_episodes", "evaluation_seed")
         defaults |= {item: getattr(source.config, item) for item in kept}
@@ -290,9 +303,10 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
             learner = algorithm_of(source.config)
     hint = arg(help_behavior_hint=f"(default: {preset or 'none'})")
     hints: dict[str, Any] = get_type_hints(base, include_extras=True)
-    hints |= {"algorithm": Literal[tuple(ALGORITHMS)], "preset": Annotated[Literal[PRESETS] | None, hint]}  # pyright: ignore[reportInvalidTypeForm]
+    names = tuple(dict.fromkeys([*ALGORITHMS, name]))
+    hints |= {"algorithm": Literal[names], "preset": Annotated[Literal[PRESETS] | None, hint]}  # pyright: ignore[reportInvalidTypeForm]
     fields = [(item, hints[item], _defaulting(value)) for item, value in defaults.items()]
-    fields.append((name, OmitArgPrefixes[type(learner)], field(default=learner)))
+    fields.append((_field_of(name), OmitArgPrefixes[type(learner)], field(default=learner)))
     return dataclasses.make_dataclass(
         base.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace={"__doc__": base.__doc__}
     )

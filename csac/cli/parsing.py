@@ -16,6 +16,7 @@ import tyro
 from tyro.conf import DisallowNone
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from csac.checks import did_you_mean
 from csac.synonyms import called_here
 from csac.types import InputError
 
@@ -62,6 +63,30 @@ def value_of(words: list[str], option: str, default: Any = None) -> Any:
         elif word.startswith(f"{option}="):
             value = word.partition("=")[2]
     return value
+
+
+def chosen_algorithm(words: list[str], begun_with: str | None) -> tuple[str, Any]:
+    """Return the name and the class of the algorithm: the words', else that of the runs to begin with, else CSAC.
+
+    A class from elsewhere is imported where the words name it, never because a run's manifest does.
+
+    Raises:
+        InputError: there is none of that name, or nobody here has named its module.
+    """
+    from csac.algorithms import ALGORITHMS
+
+    typed = value_of(words, "--algorithm")
+    name = typed or begun_with or "csac"
+    if name in ALGORITHMS:
+        return name, ALGORITHMS[name]
+    if ":" not in name:
+        hint = did_you_mean(name, ALGORITHMS) or f"choose {' or '.join(ALGORITHMS)}, or module:Class"
+        raise InputError(f"no algorithm is called {name!r}: {hint}")
+    if not typed:
+        raise InputError(f"{value_of(words, '--from')} was trained by {name}: to run its code, add --algorithm {name}")
+    from csac.training.config import class_typed  # Gymnasium comes with it
+
+    return name, class_typed(name)
 
 
 def json_object(text: str) -> dict[str, Any]:

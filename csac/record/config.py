@@ -30,7 +30,7 @@ class RunConfig:
     task: str
     """A Gymnasium id such as HalfCheetah-v4, or module:Id for an environment that a module registers."""
     algorithm: str = "csac"
-    """The algorithm; its own options are listed below."""
+    """The algorithm, or module:Class for one of your own; its own options are listed below."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)
     """Every hyperparameter of the algorithm, so that no later default changes what a run is."""
     seed: int = 0
@@ -77,6 +77,12 @@ class RunConfig:
             object.__setattr__(self, name, as_json(name, getattr(self, name)))
         for name in ("perturbations", "events"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
+
+    @property
+    def title(self) -> str:
+        """The algorithm's name in tables and pictures: SAC of sac, MySAC of my_module:MySAC."""
+        module, _, name = self.algorithm.rpartition(":")
+        return name if module else name.upper()
 
 
 _RANGES = (

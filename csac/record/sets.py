@@ -117,12 +117,17 @@ def run_path(directory: Path, seed: int) -> Path:
 def new_set_directory(task: str, algorithm: str) -> Path:
     """Return `runs/<task>/<algorithm>/<date-time>`, with a number behind it where that is taken."""
     moment = datetime.now().strftime("%Y%m%d-%H%M%S")
-    first = Path("runs", task.replace("/", "-").replace(":", "-"), algorithm, moment).absolute()
+    first = Path("runs", as_folder(task), as_folder(algorithm), moment).absolute()
     path, number = first, 1
     while os.path.lexists(path):
         number += 1
         path = first.with_name(f"{moment}-{number}")
     return path
+
+
+def as_folder(name: str) -> str:
+    """Return the name of a task or of an algorithm as that of a folder."""
+    return name.replace("/", "-").replace(":", "-")
 
 
 def find_sets(directory: str | Path, on_damaged: Callable[[InputError], None] | None = None) -> list[RunSet]:

@@ -179,7 +179,7 @@ def labels(arms: Sequence[Arm]) -> list[str]:
 
 def name_of(config: RunConfig) -> str:
     """Return the algorithm, the preset that a run follows, if any, and what was fitted to its length beside that."""
-    name, own, make = config.algorithm.upper(), config.hyperparameters, ALGORITHMS.get(config.algorithm)
+    name, own, make = config.title, config.hyperparameters, ALGORITHMS.get(config.algorithm)
     for preset in PRESETS:
         with suppress(InputError):  # of a preset that says nothing of the algorithm
             given: Any = hyperparameters(preset, config.algorithm, config.task)
@@ -228,12 +228,12 @@ def train_command(config: RunConfig, seeds: Sequence[int]) -> str:
 
 def _options(config: RunConfig) -> list[str]:
     """Return the options of the hyperparameters: what is not as by default, or as in a preset if that is shorter."""
-    make: Any = ALGORITHMS[config.algorithm]
+    make: Any = ALGORITHMS.get(config.algorithm)
     choices = []
     for preset in (None, *PRESETS):
         with suppress(InputError):
             given = hyperparameters(preset, config.algorithm, config.task) if preset else {}
-            values = json.loads(json.dumps(dataclasses.asdict(make(**given))))
+            values = json.loads(json.dumps(dataclasses.asdict(make(**given)))) if make else {}
             changed = {name: own for name, own in config.hyperparameters.items() if own != values.get(name)}
             options = [word for name, value in changed.items() for word in _option(name, value)]
             choices.append([*(["--preset", preset] if preset else []), *options])

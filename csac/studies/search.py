@@ -94,7 +94,8 @@ def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: S
         InputError: something is wanted that is not searched, is given or does nothing here; or nothing is left.
     """
     values: dict[str, Any] = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
-    space = {name: one for name, one in SPACES[algorithm.name].items() if name in values}
+    family = getattr(algorithm, "name", type(algorithm).__name__)  # one's own is searched as what it derives from
+    space = {name: one for name, one in SPACES.get(family, {}).items() if name in values}
     free = {
         name: dimension
         for name, dimension in space.items()
@@ -103,7 +104,7 @@ def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: S
     for name in wanted or ():
         if name not in space:
             hint = did_you_mean(name, space) or f"there is {', '.join(space)}"
-            raise InputError(f"{name!r} is not searched for {algorithm.name}: {hint}")
+            raise InputError(f"{name!r} is not searched for {family}: {hint}")
         if name not in free:
             raise InputError(f"{name} cannot be searched: it is given, learnt, or does nothing with the other options")
     found = {name: dimension for name, dimension in free.items() if wanted is None or name in wanted}

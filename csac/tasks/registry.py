@@ -17,6 +17,7 @@ from csac.checks import closest
 from csac.processes import safe_path
 from csac.tasks.failures import message, raise_interrupt, raised
 from csac.tasks.pybullet import ADAPTERS, FAMILIES, Adapter, quietly
+from csac.tasks.trust import module_of
 from csac.types import InputError
 
 Task = str | Callable[..., gymnasium.Env]
@@ -68,7 +69,7 @@ def registered(task: str) -> str:
     """Return the registered id of a task, after importing its module where one is named. Raises InputError."""
     module, _, name = task.rpartition(":")
     if module:
-        _import_module(task, module)
+        import_module_of(task)
     _register_known(name)
     if name in gymnasium.registry:
         return name
@@ -78,20 +79,21 @@ def registered(task: str) -> str:
     raise InputError(f"no task is called {task}: {hint}")
 
 
-def _import_module(task: str, module: str) -> None:
-    """Import the module of a task, which the user has named. Raises InputError.
+def import_module_of(name: str) -> Any:
+    """Import and return the module of a task, or of an algorithm, which the user has named. Raises InputError.
 
     The working directory is searched last, and stays on the path for what the module imports later. What the user has
     not named is never looked for there.
     """
+    module = module_of(name)
     with suppress(OSError):  # a folder that is gone
         if os.getcwd() not in sys.path:
             sys.path.append(os.getcwd())
     try:
-        importlib.import_module(module)
+        return importlib.import_module(module)
     except BaseException as error:
         raise_interrupt(error)
-        raise InputError(f"{task}: the module {module} cannot be imported: {raised(error)}") from error
+        raise InputError(f"{name}: the module {module} cannot be imported: {raised(error)}") from error
 
 
 def adapter_of(task: object) -> Adapter | None:

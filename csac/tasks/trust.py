@@ -1,8 +1,8 @@
 """Whose modules may be imported: only those that the person at this keyboard has named, never those that a run names.
 
-A task `module:Id` runs the code of its module. Who types it, to train or with `--trust-task`, wants that; who
-evaluates, plays or resumes somebody else's run may not know of it. Each module that was named is noted, with the place
-of its package, in a file below $XDG_STATE_HOME/csac or ~/.local/state/csac.
+A task `module:Id` or an algorithm `module:Class` runs the code of its module. Who types it, to train or with
+`--trust-task`, wants that; who evaluates, plays or resumes somebody else's run may not know of it. Each module that was
+named is noted, with the place of its package, in a file below $XDG_STATE_HOME/csac or ~/.local/state/csac.
 """
 
 from __future__ import annotations

@@ -16,12 +16,13 @@ from csac.synonyms import called_in_python
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.preflight import json_arguments, limit_warning, seed_warning, try_task, wrapper_warnings
-from csac.tasks.registry import check_events, events_of
-from csac.tasks.trust import remember
+from csac.tasks.registry import check_events, events_of, import_module_of
+from csac.tasks.trust import refuse_untrusted, remember
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from pathlib import Path
 
     from csac.tasks.registry import Task
     from csac.training.resume import Source
@@ -47,6 +48,7 @@ class TrainOptions(TypedDict, total=False):
 
 RUN_OPTIONS = tuple(TrainOptions.__annotations__)
 MOST_SEEDS = 10_000
+PROTOCOL = ("cadence", "memory", "init", "act", "update", "policy")  # `csac.types.Algorithm`
 
 
 def make_configs(
@@ -76,11 +78,12 @@ def make_configs(
         told = seed_warning(environment), limit_warning(environment, task, LONGEST_EPISODE)
         notes = [*wrapper_warnings(environment), *filter(None, told)]
         remember(task)
+        remember(name_of(algorithm))
         asked_for = tuple(map(str, perturbations_of(asked or ())))
         configs = [
             RunConfig(
                 task=name,
-                algorithm=algorithm.name,
+                algorithm=name_of(algorithm),
                 hyperparameters=hyperparameters,
                 seed=seed,
                 environment_arguments=arguments,
@@ -107,27 +110,80 @@ def labels(seeds: int, first_seed: int) -> list[int]:
 
 def make_manifest(config: RunConfig, program: Sequence[int]) -> Manifest:
     """Return the manifest of a new run that shares its program with these seeds."""
-    preset = matching_preset(ALGORITHMS[config.algorithm], config.task, config.hyperparameters)
+    known = ALGORITHMS.get(config.algorithm)
+    preset = matching_preset(known, config.task, config.hyperparameters) if known else None
     return Manifest(config=config, preset=preset, program=tuple(program))
 
 
-def algorithm_of(config: RunConfig) -> Algorithm:
-    """Return the algorithm of a run with its hyperparameters. Raises InputError where this csac does not know them."""
-    if config.algorithm not in ALGORITHMS:
-        raise InputError(f"the run's algorithm {config.algorithm!r} is unknown: {' or '.join(ALGORITHMS)} are known")
-    make: Any = ALGORITHMS[config.algorithm]
+def name_of(algorithm: Algorithm) -> str:
+    """Return what the manifest calls an algorithm: a name of `ALGORITHMS`, or `module:Class` of one from elsewhere."""
+    kind = type(algorithm)
+    return next((name for name, own in ALGORITHMS.items() if own is kind), f"{kind.__module__}:{kind.__qualname__}")
+
+
+def class_named(name: str) -> Any:
+    """Return the algorithm of this name, or the class `module:Class`, whose module it imports: ask `trust` first.
+
+    Raises:
+        InputError: there is none, or nothing can import it.
+    """
+    if name in ALGORITHMS:
+        return ALGORITHMS[name]
+    module, _, kind = name.rpartition(":")
+    if not module:
+        raise InputError(f"the algorithm {name!r} is unknown: {' or '.join(ALGORITHMS)} are known, or module:Class")
+    if module == "__main__" or "." in kind:
+        raise InputError(f"no module can give {name}: call csac.train with the algorithm and resume=True")
+    found = getattr(import_module_of(name), kind, None)
+    if not (isinstance(found, type) and dataclasses.is_dataclass(found)):
+        raise InputError(f"the module {module} has no algorithm {kind}, a dataclass")
+    return found
+
+
+def class_typed(name: str) -> Any:
+    """Return the class `module:Class` that the user has typed. Raises InputError also where it has no defaults."""
+    kind = class_named(name)
+    for item in dataclasses.fields(kind):
+        if item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING:
+            raise InputError(f"{item.name} of {name} has no default: each option needs one")
+    check_algorithm(kind())
+    return kind
+
+
+def algorithm_of(config: RunConfig, run: str | Path = "the run", trust_task: bool = False) -> Algorithm:
+    """Return the algorithm of a run with its hyperparameters; one from elsewhere if its module is trusted.
+
+    Raises:
+        InputError: this csac does not know them, or nobody here has named the module, which is not imported then.
+    """
+    refuse_untrusted(config.algorithm if config.algorithm not in ALGORITHMS else "", run, trust_task)
+    make = class_named(config.algorithm)
     unknown = config.hyperparameters.keys() - {item.name for item in dataclasses.fields(make)}
     if unknown:
         raise InputError(f"the run has unknown hyperparameters: {', '.join(sorted(unknown))}")
-    return make(**{name: tuple(v) if isinstance(v, list) else v for name, v in config.hyperparameters.items()})
+    algorithm = make(**{name: tuple(v) if isinstance(v, list) else v for name, v in config.hyperparameters.items()})
+    check_algorithm(algorithm)
+    return algorithm
 
 
-def check_algorithm(algorithm: object) -> None:
+def check_algorithm(algorithm: Any) -> None:
     """Raise InputError for what is no algorithm with its hyperparameters: a name, a class, something else."""
     if isinstance(algorithm, type) or not (dataclasses.is_dataclass(algorithm) and hasattr(algorithm, "update")):
         given = algorithm.__name__ if isinstance(algorithm, type) else str(algorithm)
         names = {name: kind.__name__ for name, kind in ALGORITHMS.items()}
         raise InputError(f"{given:.60} is no algorithm with hyperparameters: give {names.get(given.lower(), 'CSAC')}()")
+    kind: Any = type(algorithm)
+    if not kind.__dataclass_params__.frozen:
+        raise InputError(f"{kind.__name__} is to be a frozen dataclass: write @dataclass(frozen=True)")
+    if missing := [name for name in PROTOCOL if not hasattr(algorithm, name)]:
+        raise InputError(
+            f"{kind.__name__} has no {' or '.join(missing)}, which an algorithm needs (csac.types.Algorithm)"
+        )
+    for item in dataclasses.fields(algorithm):
+        if dataclasses.is_dataclass(getattr(algorithm, item.name)):
+            raise InputError(
+                f"{item.name} of {kind.__name__} cannot be kept in a manifest: use numbers, texts and tuples"
+            )
 
 
 def _refuse_unknown(given: TrainOptions, algorithm: Algorithm) -> None:

@@ -67,7 +67,7 @@ class Evaluations:
             self.evaluator = pool = EvaluationPool(self._evaluator, program.evaluation_processes)
             opened.callback(pool.close)
             pool.start()
-        self._algorithm = program.algorithm.name
+        self._algorithm = config.algorithm
         self._perturbations = perturbations_of(config.perturbations)
         self._pending: tuple[int, list[int], list[Policy], Any] | None = None
         self.step = int(runs[0].evaluations["step"].max(initial=0))  # of the newest one

@@ -38,9 +38,9 @@ class Learnt:
         state: the algorithm's own `State`, a tree of NumPy arrays: actor, critics, targets, optimisers.
     """
 
-    def __init__(self, run: RunDirectory, checkpoint: Checkpoint) -> None:
+    def __init__(self, run: RunDirectory, checkpoint: Checkpoint, trust_task: bool = False) -> None:
         self.run, self.step, self._checkpoint = run, checkpoint.step, checkpoint
-        self.algorithm = algorithm_of(run.config)
+        self.algorithm = algorithm_of(run.config, run.path, trust_task)
         self._contract = load_run(run).contract
         spec, saved = self._contract.spec._replace(environments=run.config.environments), checkpoint.state()
         learner, steps = saved.part("learner"), run.config.steps
@@ -91,7 +91,7 @@ class Learnt:
         pairs = [self.state] if hasattr(self.state, "critics") else list(self.state)
         critics = [c for pair in pairs for c in getattr(pair, "critics", [getattr(pair, "critic", None)])]
         if any(critic is None for critic in critics):
-            raise InputError(f"{self.algorithm.name} has no critics Q(s, a); CSAC, SAC, TD3 and SD3 have")
+            raise InputError(f"{self.run.config.algorithm} has no critics Q(s, a); CSAC, SAC, TD3 and SD3 have")
         statistics = getattr(self.state, "observation_statistics", None)
         if getattr(self.algorithm, "critic_normalisation", "none") == "batch":
             critics = self._folded(critics, statistics)
@@ -120,13 +120,16 @@ class Learnt:
         return jax.tree.map(np.asarray, jax.vmap(unpack, (0, None))(in_order, self._contract.spec))
 
 
-def load_checkpoint(directory: str | os.PathLike[str], seed: int | None = None, step: int | None = None) -> Learnt:
+def load_checkpoint(
+    directory: str | os.PathLike[str], seed: int | None = None, step: int | None = None, trust_task: bool = False
+) -> Learnt:
     """Return what a seed has learnt by its newest checkpoint, or the one of a step.
 
     Args:
         directory: a set of runs, or one run.
         seed: the seed's label; by default the one that `csac.load` takes.
         step: one of those that are kept (`keep_checkpoints`).
+        trust_task: whether to import the module of an algorithm of one's own that nobody has named here.
 
     Raises:
         InputError: there is no such run, seed or checkpoint.
@@ -137,4 +140,4 @@ def load_checkpoint(directory: str | os.PathLike[str], seed: int | None = None, 
     checkpoint, complaints = newest_sound(run.checkpoints, step)
     if checkpoint is None or (step is not None and checkpoint.step != step):
         raise InputError("; ".join(complaints) or f"{run.path} has no checkpoint{f' of step {step}' if step else ''}")
-    return Learnt(run, checkpoint)
+    return Learnt(run, checkpoint, trust_task)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import gymnasium
 
@@ -78,15 +78,18 @@ def choose_groups(
     existing: Mapping[int, RunDirectory],
     seeds_per_process: int | None,
     device: str,
-    task: Task,
+    *sent: Any,
 ) -> list[list[int]]:
-    """Return the seeds of each program: as they were, as asked for, or as pays here."""
+    """Return the seeds of each program: as they were, as asked for, or as pays here.
+
+    A program's process is `sent` its task and its algorithm: where that cannot be, all seeds train together, in ours.
+    """
     known = {existing[seed].manifest.program for seed in seeds if seed in existing}
     together = [[seed for seed in group if seed in seeds] for group in sorted(known) if len(group) > 1]
     rest = [seed for seed in seeds if not any(seed in group for group in together)]
     size = seeds_per_process
     if size is None:
-        size = len(rest) if not can_be_sent(task) else 1
+        size = len(rest) if not all(map(can_be_sent, sent)) else 1
         if device == "gpu":
             processes = max(1, min(len(rest) // SEEDS_PER_GPU_PROCESS, len(usable_cores()) // 2, PROCESSES_PER_GPU))
             size = max(1, -(-len(rest) // (1 if preallocates() else processes)))
@@ -127,10 +130,11 @@ class Plan(NamedTuple):
         stepping = self.environment_processes if has_processes else self.environment_processes or 0
         most = config.environments if config.environments > 1 else 0
         check_whole("environment_processes", stepping or 0, 0, most)
-        if (processes or stepping or len(directories) > 1) and not can_be_sent(self.task):
+        used_by = {"task": processes or stepping or len(directories) > 1, "algorithm": len(directories) > 1}
+        for name in (name for name, is_used in used_by.items() if is_used and not can_be_sent(getattr(self, name))):
             raise InputError(
-                "the task cannot be sent to another process: make it a function of a module that can be imported, or "
-                "train with seeds_per_process=seeds, evaluation_processes=0 and environment_processes=0"
+                f"the {name} cannot be sent to another process: define it in a module that can be imported, or train "
+                "with seeds_per_process=seeds, evaluation_processes=0 and environment_processes=0"
             )
         return [
             Program(
@@ -149,8 +153,8 @@ class Plan(NamedTuple):
         ]
 
 
-def can_be_sent(task: Task) -> bool:
-    """Return whether another process can be sent the task; none can import what a notebook or a terminal defined."""
+def can_be_sent(task: Task | Algorithm) -> bool:
+    """Return whether another process can be sent a task or an algorithm: it cannot import what a notebook defined."""
     has_script, maker = script() is not None, task
     if isinstance(task, str):
         known = gymnasium.registry.get(task)

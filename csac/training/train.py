@@ -122,10 +122,10 @@ def train(
         source = Source.find(start_from, wanted)
     configs, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
     choose_device(configs[0].device)  # the task's module may have changed JAX's settings
-    place = place or new_set_directory(configs[0].task, algorithm.name)
+    place = place or new_set_directory(configs[0].task, configs[0].algorithm)
     existing = _existing(place, configs, resume, source, algorithm.cadence.has_schedule)
 
-    groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task)
+    groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task, algorithm)
     plan = Plan(
         algorithm=algorithm,
         task=task,
@@ -163,8 +163,8 @@ def resume(
 ) -> TrainedRuns:
     """Resume a run, or every run of a set, from its newest checkpoint; everything but `steps` comes from its manifest.
 
-    `trust_task` lets the task import its module though nobody has named it here (`csac.tasks.trust`); the other
-    arguments are those of `train`.
+    `trust_task` lets the task, and an algorithm of one's own, import a module that nobody has named here
+    (`csac.tasks.trust`); the other arguments are those of `train`.
 
     Raises:
         InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
@@ -178,7 +178,7 @@ def resume(
     refuse_untrusted(config.task, runs.path, trust_task)
     watch = Watch(reporter, progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
-    algorithm = algorithm_of(config)
+    algorithm = algorithm_of(config, runs.path, trust_task)
     if steps is not None:
         _extend(runs, steps, algorithm.cadence.has_schedule)
     existing = {run.seed: run for run in runs.runs}
@@ -312,7 +312,7 @@ def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:
     changes = by_step(perturbations_of(runs.config.perturbations))
     marks = [(step, text) for step, text in changes if step <= rows["step"].max()]
     try:
-        learning_curve([(runs.config.algorithm.upper(), rows)], runs.curve, title=runs.config.task, marks=marks)
+        learning_curve([(runs.config.title, rows)], runs.curve, title=runs.config.task, marks=marks)
     except Exception as error:
         note(f"note: the curve could not be drawn ({type(error).__name__}: {' '.join(str(error).split())})")
 

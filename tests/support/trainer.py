@@ -12,6 +12,7 @@ from csac.record.config import RunConfig
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
 from csac.training.callbacks import Answer
+from csac.training.config import name_of
 from csac.training.loop import Loop
 from csac.training.program import Program
 from csac.training.resume import ResumePoint
@@ -64,7 +65,7 @@ def run(
         for seed in seeds:
             config = RunConfig(
                 task=task if isinstance(task, str) else "probe",
-                algorithm=algorithm.name,
+                algorithm=name_of(algorithm),
                 hyperparameters=dataclasses.asdict(algorithm),  # pyright: ignore[reportArgumentType]
                 seed=seed,
                 steps=steps,

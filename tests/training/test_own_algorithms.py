@@ -1,0 +1,187 @@
+"""The algorithms that docs/adding-an-algorithm.md shows, from a module outside the package: trained to exported."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+from resuming import SMALL, Crash, contents, crash_at, run
+
+import csac
+from csac import InputError
+from csac.algorithms import SAC
+from csac.record.run import RunDirectory
+from csac.training.config import algorithm_of
+from csac.training.program import can_be_sent
+from csac.types import Spec
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "adding-an-algorithm.md").read_text()
+MODULES = dict(re.findall(r"^```python\n# (\w+)\.py\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE))
+OPTIONS = shlex.split(
+    "--actor-hidden-sizes 8 8 --critic-hidden-sizes 8 8 --batch-size 8 --warmup-steps 40 --replay-size 150 "
+    "--effort-weight 0.5 --steps 200 --evaluation-interval 100 --evaluation-episodes 2"
+)
+BROKEN = """
+from dataclasses import dataclass
+
+@dataclass(frozen=True)
+class Half:
+    cadence: int = 0
+    def update(self): ...
+
+@dataclass(frozen=True, kw_only=True)
+class Required(Half):
+    width: int
+
+@dataclass
+class Melting:
+    def update(self): ...
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """The page's modules in a folder, where Python looks, each with a line that tells of its import."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    folder, marker = tmp_path / "modules", tmp_path / "imported"
+    folder.mkdir()
+    for name, code in MODULES.items():
+        (folder / f"{name}.py").write_text(f"{code}\n\nopen({str(marker)!r}, 'w').close()\n")
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.syspath_prepend(str(folder))
+    calm, reinforce = importlib.import_module("calm"), importlib.import_module("reinforce")
+    yield SimpleNamespace(
+        folder=folder,
+        marker=marker,
+        calm=calm.CalmSAC(effort_weight=0.5, **SMALL),
+        reinforce=reinforce.Reinforce(rollout_steps=50),
+    )
+    for name in MODULES:
+        sys.modules.pop(name, None)
+
+
+def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "csac", *words], cwd=folder, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("name", ["calm", "reinforce"])
+def test_one_is_trained_killed_resumed_evaluated_and_exported(tmp_path, own, name):
+    algorithm = getattr(own, name)
+    whole = run(tmp_path / "whole", algorithm).runs[0]
+    with pytest.raises(Crash):
+        run(tmp_path / "again", algorithm, on_evaluation=crash_at(300))
+    again = csac.resume(tmp_path / "again", progress=False).runs[0]
+    assert contents(again) == contents(whole)
+    assert again.config.algorithm == f"{name}:{type(algorithm).__name__}"
+    assert algorithm_of(again.config) == algorithm
+    assert csac.load(again).contract.algorithm == again.config.algorithm
+    assert csac.load_checkpoint(again.path).algorithm == algorithm
+    own.marker.unlink()
+    for words in (["evaluate", "--episodes", "2"], ["export", "--episodes", "2"], ["report", "--out", "page.html"]):
+        done = command(tmp_path, words[0], str(again.path), *words[1:])
+        assert done.returncode == 0, done.stderr
+    assert not own.marker.exists()
+
+
+def test_its_loss_is_that_of_sac_and_what_the_action_costs(own):
+    plain, key, spec = SAC(**SMALL), jax.random.key(0), Spec(3, 2)
+    state = plain.init(key, spec, 100)
+    given = state.actor, jnp.ones(3), jnp.zeros(2)
+    fixed: dict[str, Any] = {"critics": state.critics, "temperature": jnp.ones(())}
+    effort = 0.5 * jnp.sum(plain.act(state, given[1], key, explore=False) ** 2)
+    difference = own.calm.actor_loss(*given, **fixed)[0] - plain.actor_loss(*given, **fixed)[0]
+    assert float(difference) == pytest.approx(float(effort), rel=1e-4)
+
+
+def test_seeds_train_in_processes_and_from_the_command_line(tmp_path, own):
+    seeds = ["--seeds", "2", "--directory", str(tmp_path / "typed")]
+    done = command(own.folder, "train", "Hopper-v4", "--algorithm", "calm:CalmSAC", *OPTIONS, *seeds)
+    assert done.returncode == 0, done.stderr
+    options: Any = {"evaluation_processes": 0, "tensorboard": False, "progress": False, "seeds": 2}
+    runs = csac.train(
+        own.calm, "Hopper-v4", steps=200, evaluation_interval=100, evaluation_episodes=2, directory=tmp_path / "called",
+        seeds_per_process=1, **options,
+    )  # fmt: skip
+    for seed, one in enumerate(runs.runs):
+        assert contents(RunDirectory.open(tmp_path / "typed" / f"seed-{seed}")) == contents(one)
+    done = command(own.folder, "resume", str(tmp_path / "typed"), "--steps", "300")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_strangers_algorithm_is_not_imported(tmp_path, own, monkeypatch):
+    stopped = run(tmp_path / "run", own.calm, 200).runs[0].path
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another"))
+    own.marker.unlink()
+    done = command(own.folder, "resume", str(stopped), "--steps", "300")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert f"wants to run the code of the module calm in {own.folder / 'calm.py'}" in done.stderr
+    done = command(own.folder, "train", "Hopper-v4", "--from", str(stopped))
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "add --algorithm calm:CalmSAC" in done.stderr
+    assert not own.marker.exists()
+    done = command(own.folder, "resume", str(stopped), "--steps", "300", "--trust-task")
+    assert done.returncode == 0, done.stderr
+    assert own.marker.exists()
+    assert command(own.folder, "resume", str(stopped), "--steps", "400").returncode == 0
+
+
+def test_one_that_no_module_can_give_is_resumed_with_the_class_given(tmp_path, own):
+    class Local(type(own.calm)): ...
+
+    local = Local(**SMALL)
+    assert not can_be_sent(local)
+    with pytest.raises(Crash):
+        run(tmp_path / "run", local, seeds=2, on_evaluation=crash_at(300))
+    with pytest.raises(InputError, match=r"Local: call csac\.train with the algorithm and resume=True"):
+        csac.resume(tmp_path / "run")
+    assert run(tmp_path / "run", local, seeds=2, resume=True).runs[0].manifest.steps_done == 500
+    with pytest.raises(InputError, match="the algorithm cannot be sent to another process"):
+        run(tmp_path / "two", local, seeds=2, seeds_per_process=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("calm:Nothing", "the module calm has no algorithm Nothing"),
+        ("calm:policy_at", "the module calm has no algorithm policy_at"),
+        ("reinforce:State", "the module reinforce has no algorithm State"),
+        ("broken:Half", "Half has no memory or init or act or policy"),
+        ("broken:Melting", "Melting is to be a frozen dataclass"),
+        ("broken:Required", "width of broken:Required has no default"),
+        ("nowhere:SAC", "the module nowhere cannot be imported"),
+        ("calm", "no algorithm is called 'calm': choose csac or sac"),
+    ],
+)
+def test_what_is_no_algorithm_is_told_in_one_line(own, name, message):
+    (own.folder / "broken.py").write_text(BROKEN)
+    done = command(own.folder, "train", "Pendulum-v1", "--algorithm", name)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert message in done.stderr
+
+
+def test_what_a_manifest_cannot_keep_is_refused(tmp_path, own):
+    odd = replace(own.reinforce, std=own.calm)
+    with pytest.raises(InputError, match="std of Reinforce cannot be kept in a manifest"):
+        run(tmp_path / "run", odd)
+
+
+def test_a_manifest_that_was_changed_is_told(tmp_path, own):
+    stopped = run(tmp_path / "run", own.reinforce, 200).runs[0]
+    manifest = stopped.path / "manifest.json"
+    fields = json.loads(manifest.read_text())
+    fields["config"]["hyperparameters"]["colour"] = 1
+    manifest.write_text(json.dumps(fields))
+    with pytest.raises(InputError, match="unknown hyperparameters: colour"):
+        csac.resume(stopped.path, steps=300)
