@@ -26,12 +26,6 @@ def make_critic(key: Key, spec: Spec, hidden_sizes: Sequence[int], hidden: Hidde
     return make_mlp(key, spec.observation_size + spec.action_size, hidden_sizes, 1, hidden)
 
 
-def make_critics(key: Key, spec: Spec, hidden_sizes: Sequence[int], hidden: Hidden = PLAIN) -> Critics:
-    """Return two independent critics."""
-    first_key, second_key = jax.random.split(key)
-    return make_critic(first_key, spec, hidden_sizes, hidden), make_critic(second_key, spec, hidden_sizes, hidden)
-
-
 def q_value(critic: MLP, observation: Observation, action: Action) -> Scalar:
     """Return one critic's value of one pair."""
     return critic(jnp.concatenate([observation, action]))[0]

@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from csac.algorithms.shapes import Count, Key, Scalar
-from csac.types import LAYER_NORM_EPSILON, Activation, Layer, Metrics
+from csac.types import LAYER_NORM_EPSILON, Activation, InputError, Layer, Metrics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -97,6 +97,23 @@ def make_orthogonal_mlp(
         for k, gain, n_in, n_out in zip(keys, gains, sizes[:-1], sizes[1:], strict=True)
     ]
     return MLP(_normed(layers, hidden), hidden.activation)
+
+
+def learnable(network: Any) -> Any:
+    """Return a network, all of whose leaves are arrays. Raises InputError where one is not."""
+    for leaf in jax.tree.leaves(network):
+        if not eqx.is_array(leaf):
+            kind = type(network).__name__
+            raise InputError(f"{kind} has {leaf!r:.40}, which cannot be learnt: make its field eqx.field(static=True)")
+    return network
+
+
+def plain_layers(network: Any) -> tuple[Layer, ...]:
+    """Return the layers by which an MLP leaves as part of a policy. Raises InputError for any other network."""
+    if isinstance(network, MLP):
+        return network.layers
+    kind = type(network).__name__
+    raise InputError(f"{kind} is no MLP, and policies leave as plain layers: have `policy` give such, or use an MLP")
 
 
 def polyak(targets: Any, sources: Any, rate: float) -> Any:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from csac.algorithms.architecture import Architecture
-from csac.algorithms.critics import make_critics
+from csac.algorithms.critics import make_critic
 from csac.algorithms.exploration import Noise, noise_of
 from csac.algorithms.hyperparameters import (
     COUNT,
@@ -25,7 +25,17 @@ from csac.algorithms.hyperparameters import (
     check_hyperparameters,
 )
 from csac.algorithms.memory import Replay
-from csac.algorithms.networks import MLP, Schedule, copy_tree, follow, init_optimiser, make_mlp, make_optimiser
+from csac.algorithms.networks import (
+    MLP,
+    Schedule,
+    copy_tree,
+    follow,
+    init_optimiser,
+    learnable,
+    make_mlp,
+    make_optimiser,
+    plain_layers,
+)
 from csac.algorithms.shapes import Action, Count, Key, Scalar
 from csac.algorithms.statistics import Statistics, normaliser_of
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
@@ -113,6 +123,14 @@ class OffPolicy(Architecture):
         discount = self.discount if transition.steps is None else self.discount**transition.steps
         return discount * (1.0 - transition.terminated)
 
+    def make_actor(self, key: Key, spec: Spec, outputs: int) -> Any:
+        """Return a random actor, a map from [observation] to [outputs]: override it for another network."""
+        return make_mlp(key, spec.observation_size, self.actor_hidden_sizes, outputs, self.actor_hidden)
+
+    def make_critic(self, key: Key, spec: Spec) -> Any:
+        """Return a random critic, a map from [observation + action] to [1]: override it for another network."""
+        return make_critic(key, spec, self.critic_hidden_sizes, self.critic_hidden)
+
     def optimiser(self, learning_rate: float, planned: int = 1) -> optax.GradientTransformation:
         """Return the networks' Adam. The number of steps `planned` counts where it begins: its state keeps it."""
         adam = make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)
@@ -142,8 +160,11 @@ class TwinCritics(OffPolicy):
         planned = self.updates(spec, steps)
         actor_adam = self.optimiser(self.actor_learning_rate, planned // self.policy_delay)
         actor_key, critics_key = jax.random.split(key)
-        actor = make_mlp(actor_key, spec.observation_size, self.actor_hidden_sizes, actor_outputs, self.actor_hidden)
-        critics = make_critics(critics_key, spec, self.critic_hidden_sizes, self.critic_hidden)
+        actor = learnable(self.make_actor(actor_key, spec, actor_outputs))
+        first_key, second_key = jax.random.split(critics_key)
+        critics = learnable(self.make_critic(first_key, spec)), learnable(self.make_critic(second_key, spec))
+        if self.critic_normalisation == "batch" and not isinstance(critics[0], MLP):
+            raise InputError(f"critic_normalisation batch is for MLPs, not for {type(critics[0]).__name__}")
         return {
             "actor": actor,
             "critics": critics,
@@ -179,5 +200,5 @@ def improve_delayed(
 def policy_network(actor: MLP, statistics: Statistics | None, head: Literal["tanh_gaussian", "tanh"]) -> PolicyNetwork:
     """Return the actor's layers, and what it sees observations by."""
     return PolicyNetwork(
-        PolicyParameters((actor.layers,), normaliser=normaliser_of(statistics)), actor.activation, head
+        PolicyParameters((plain_layers(actor),), normaliser=normaliser_of(statistics)), actor.activation, head
     )

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from csac.algorithms.critics import Critics, make_critic, min_q, q_value
+from csac.algorithms.critics import Critics, min_q, q_value
 from csac.algorithms.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE
-from csac.algorithms.networks import MLP, copy_tree, gradient_step, init_optimiser, make_mlp, polyak
+from csac.algorithms.networks import MLP, copy_tree, gradient_step, init_optimiser, learnable, plain_layers, polyak
 from csac.algorithms.off_policy import OffPolicy
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.types import Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
@@ -131,9 +131,8 @@ class SD3(OffPolicy):
     def _make_pair(self, key: Key, spec: Spec, steps: int) -> Pair:
         planned = self.updates(spec, steps)
         actor_key, critic_key = jax.random.split(key)
-        widths = self.actor_hidden_sizes
-        actor = make_mlp(actor_key, spec.observation_size, widths, spec.action_size, self.actor_hidden)
-        critic = make_critic(critic_key, spec, self.critic_hidden_sizes, self.critic_hidden)
+        actor = learnable(self.make_actor(actor_key, spec, spec.action_size))
+        critic = learnable(self.make_critic(critic_key, spec))
         return Pair(
             actor=actor,
             critic=critic,
@@ -157,9 +156,7 @@ class SD3(OffPolicy):
     def policy(self, state: State) -> PolicyNetwork:
         """Return both actors' and both critics' layers: the critics choose the actor."""
         actors, critics = (state.first.actor, state.second.actor), (state.first.critic, state.second.critic)
-        parameters = PolicyParameters(
-            tuple(actor.layers for actor in actors), tuple(critic.layers for critic in critics)
-        )
+        parameters = PolicyParameters(tuple(map(plain_layers, actors)), tuple(map(plain_layers, critics)))
         return PolicyNetwork(parameters, actors[0].activation, "tanh", critics[0].activation)
 
 

@@ -58,6 +58,7 @@ def _bytes_per_seed(algorithm: Algorithm, steps: int, spec: Spec) -> int:
     """
     key = jax.ShapeDtypeStruct((2,), "uint32")
     state, memory = jax.eval_shape(lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), key)
+    jax.eval_shape(lambda state: algorithm.policy(state).parameters, state)  # refuses networks that cannot leave
     units = sum(leaf.shape[-1] for leaf in jax.tree.leaves(state) if len(leaf.shape) == 2)
     kept = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((state, memory)))
     return kept + 4 * algorithm.cadence.transitions_per_update * (memory.rows.shape[1] + units)

@@ -15,7 +15,7 @@ from equations import SPEC, assert_close, batch_of, begin, linear, transition, t
 from csac.algorithms import CSAC, SAC, TD3
 from csac.algorithms.critics import (
     Critics,
-    make_critics,
+    make_critic,
     min_q,
     normalised_critic_loss,
     q_value,
@@ -38,6 +38,11 @@ NOISE = jnp.asarray(np.random.default_rng(4).normal(size=(16, 2)), jnp.float32)
 
 
 FAR = transitions(16, shift=3.0, scale=2.0)
+
+
+def two_critics() -> Critics:
+    first, second = (make_critic(key, SPEC, (8, 8)) for key in jax.random.split(jax.random.key(0)))
+    return first, second
 
 
 def test_the_moments_are_those_of_all_inputs_of_all_examples():
@@ -84,7 +89,7 @@ def pairs_of(batch: Transition, next_actions: Any) -> Any:
 
 
 def test_a_network_with_the_moments_folded_in_says_what_the_normalised_one_does():
-    (critic, _), batch = make_critics(jax.random.key(0), SPEC, (8, 8)), FAR
+    (critic, _), batch = two_critics(), FAR
     inputs = pairs_of(batch, jnp.tanh(NOISE))
     ours = jax.vmap(partial(normalised_pass, critic), axis_name=BATCH)([inputs[:16], inputs[16:]])
     moments, folded = jax.tree.map(lambda leaf: leaf[0], (ours.moments, ours.folded))
@@ -105,7 +110,7 @@ def next_action(observation: Any, noise: Any) -> Any:
 
 
 def test_loss_and_gradient_are_those_of_one_pass_over_both_batches():
-    critics, batch = make_critics(jax.random.key(0), SPEC, (8, 8)), FAR
+    critics, batch = two_critics(), FAR
 
     def ours(critics):
         loss = partial(normalised_critic_loss, critic_target=soft_target, next_action=next_action)
@@ -134,7 +139,7 @@ class Learning(NamedTuple):
 
 def test_the_critics_of_the_actors_loss_are_the_new_ones_by_the_moments_of_the_step():
     optimiser, batch = make_optimiser(0.1), FAR
-    critics = make_critics(jax.random.key(0), SPEC, (8, 8))
+    critics = two_critics()
     state = Learning(critics, None, init_optimiser(optimiser, critics))
     learnt, folded, metrics = update_critics(optimiser, state, batch, NOISE, soft_target, next_action)
     assert set(metrics) == {"critic_loss", "q_mean"}

@@ -1,4 +1,4 @@
-"""The algorithms that docs/adding-an-algorithm.md shows, from a module outside the package: trained to exported."""
+"""The algorithms that two pages of docs/ show, from modules outside the package: trained, resumed, exported."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from csac.training.program import can_be_sent
 from csac.types import Spec
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "adding-an-algorithm.md").read_text()
-MODULES = dict(re.findall(r"^```python\n# (\w+)\.py\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE))
+PAGES = "".join((ROOT / "docs" / f"{page}.md").read_text() for page in ("adding-an-algorithm", "learning-options"))
+MODULES = dict(re.findall(r"^```python\n# (\w+)\.py\n(.*?)^```$", PAGES, re.DOTALL | re.MULTILINE))
 OPTIONS = shlex.split(
     "--actor-hidden-sizes 8 8 --critic-hidden-sizes 8 8 --batch-size 8 --warmup-steps 40 --replay-size 150 "
     "--effort-weight 0.5 --steps 200 --evaluation-interval 100 --evaluation-episodes 2"
@@ -53,7 +53,7 @@ class Melting:
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """The page's modules in a folder, where Python looks, each with a line that tells of its import."""
+    """The pages' modules in a folder, where Python looks, each with a line that tells of its import."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     folder, marker = tmp_path / "modules", tmp_path / "imported"
     folder.mkdir()
@@ -61,12 +61,13 @@ def own(tmp_path, monkeypatch):
         (folder / f"{name}.py").write_text(f"{code}\n\nopen({str(marker)!r}, 'w').close()\n")
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.syspath_prepend(str(folder))
-    calm, reinforce = importlib.import_module("calm"), importlib.import_module("reinforce")
+    calm, reinforce, residual = map(importlib.import_module, MODULES)
     yield SimpleNamespace(
         folder=folder,
         marker=marker,
         calm=calm.CalmSAC(effort_weight=0.5, **SMALL),
         reinforce=reinforce.Reinforce(rollout_steps=50),
+        residual=residual.ResidualSAC(**SMALL),
     )
     for name in MODULES:
         sys.modules.pop(name, None)
@@ -76,7 +77,7 @@ def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "csac", *words], cwd=folder, capture_output=True, text=True)
 
 
-@pytest.mark.parametrize("name", ["calm", "reinforce"])
+@pytest.mark.parametrize("name", list(MODULES))
 def test_one_is_trained_killed_resumed_evaluated_and_exported(tmp_path, own, name):
     algorithm = getattr(own, name)
     whole = run(tmp_path / "whole", algorithm).runs[0]
