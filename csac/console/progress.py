@@ -68,7 +68,7 @@ class Reporter:
         self._shown = self._passed()
         self._began = self._spoke = self._clock()
         title = Text.assemble((f"{config.algorithm} on {config.task}", "bold"))
-        self._print(title.append(f", {_labels(runs.seeds)}, {config.steps:,} steps each"))
+        self._print(title.append(f", {_labels(runs.seeds)}, {config.steps:,} steps{' each' * (len(runs.runs) > 1)}"))
         for line in (str(runs.path), *notes):
             self._print(Text(line, "dim"))
         if self.console.is_interactive:
