@@ -23,10 +23,12 @@ suppress_warnings = ["ref.python"]  # InputError and Policy have two places: the
 html_theme = "furo"  # system fonts, light and dark; nothing is fetched from elsewhere
 html_title = f"csac {release}"
 html_extra_path = ["index.html"]
+html_static_path, html_css_files = ["static"], ["site.css"]
 html_show_copyright = html_show_sphinx = False
 
 myst_heading_anchors = 3
 smartquotes = False
+highlight_language = "none"  # of blocks that name none: shell lines, and what commands print
 default_role = "code"  # of single backticks in docstrings
 autodoc_member_order = "bysource"
 viewcode_follow_imported_members = False
