@@ -21,7 +21,8 @@ from csac.record.run import RunDirectory
 from csac.record.sets import RunSet
 from csac.training.checkpoint import Checkpoint, newest_sound
 from csac.training.config import algorithm_of
-from csac.training.learner import KEY_DATA, incompatibility
+from csac.training.learner import incompatibility
+from csac.training.one_seed import KEY_DATA
 from csac.training.packing import by_name
 from csac.types import InputError, Transition
 

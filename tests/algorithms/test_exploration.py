@@ -16,7 +16,7 @@ from trainer import run
 from csac import InputError
 from csac.algorithms import CSAC, SAC, SD3, TD3
 from csac.algorithms.exploration import OCTAVES, keys_at, keys_of, noise_of, uniform_of
-from csac.training.learner import OneSeed
+from csac.training.one_seed import OneSeed
 from csac.types import Spec
 
 STEPS = 2**14

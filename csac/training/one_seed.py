@@ -1,0 +1,139 @@
+"""What one seed does in a dispatch, as pure functions: remember, learn, act."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from csac.algorithms.exploration import keys_of, uniform_of
+from csac.training.packing import Packing
+from csac.types import Transition
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from csac.algorithms.exploration import Noise
+    from csac.types import Algorithm, Spec
+
+# Arrays with fewer elements travel packed. Hidden layers of 256 x 256 have more: XLA would copy them out of the row at
+# every use.
+SMALL = 2**15
+
+KEY_DATA = jax.ShapeDtypeStruct((2,), "uint32")
+
+
+class Carry(NamedTuple):
+    """What goes from one dispatch to the next."""
+
+    state: Any  # of the algorithm; packed, the buffers that hold it
+    memory: Any  # a Replay or a Rollout
+    sums: jax.Array  # [metric] over the updates since metrics were last forgotten
+    key: jax.Array  # [2] of the run, as data: each step's own keys are folded from it
+
+
+class OneSeed:
+    """Pure functions of one seed's packed `Carry`. `step` counts environment steps.
+
+    Attributes:
+        state: the shapes of what the algorithm learns.
+        metrics: the names of what an update tells of itself, in the order of the carry's sums.
+        packing: how the state is packed.
+    """
+
+    def __init__(self, algorithm: Algorithm, spec: Spec, steps: int) -> None:
+        self.algorithm, self.spec = algorithm, spec
+        self.cadence = algorithm.cadence.side_by_side(spec.environments)
+        self.noise: Noise = getattr(algorithm, "exploration_noise", "white")
+        # Both are asked for shapes and then to run: traced once.
+        self._first = jax.jit(
+            lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), inline=True
+        )
+        self._update = jax.jit(lambda *arguments: algorithm.update(*arguments), inline=True)
+        self.state, memory = jax.eval_shape(lambda data: self._first(jax.random.wrap_key_data(data)), KEY_DATA)
+        self.metrics = tuple(jax.eval_shape(self._first_metrics, self.state, memory, KEY_DATA))
+        # What acts more often than it learns would take its policy out of the row again and again.
+        self.packing = Packing(self.state, SMALL if self.cadence.update_interval == spec.environments else 0)
+
+    def begin(self, key_data: jax.Array) -> Carry:
+        """Return what a seed begins with."""
+        init_key, run_key = jax.random.split(jax.random.wrap_key_data(key_data))
+        state, memory = self._first(init_key)
+        return Carry(self.packing.pack(state), memory, jnp.zeros(len(self.metrics)), jax.random.key_data(run_key))
+
+    def explore(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
+        """Return a uniformly random action for each observation."""
+        shape = (*observation.shape[:-1], self.spec.action_size)
+        if self.noise == "white":
+            return jax.random.uniform(_keys(carry.key, step)[2], shape, minval=-1.0, maxval=1.0)
+        keys = self._act_keys(carry.key, observation, step)
+        return self._each(lambda _, key: uniform_of(self.noise, key, shape[-1]), observation, keys)
+
+    def act(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
+        """Return the policy's action for each observation, to explore."""
+        return self._act(self.packing.unpack(carry.state), carry.key, observation, step)
+
+    def remember_and_explore(
+        self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
+    ) -> tuple[Carry, jax.Array]:
+        """Add packed transitions [n, width]; return what is carried on, and a uniformly random action."""
+        carry = carry._replace(memory=carry.memory.add(rows, step - len(rows)))
+        return carry, self.explore(carry, observation, step)
+
+    def remember_and_learn(
+        self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
+    ) -> tuple[Carry, jax.Array]:
+        """Add packed transitions [n, width] and make all updates that are due; return also the new policy's action."""
+        memory = carry.memory.add(rows, step - len(rows))
+        draw_key, update_key, _ = _keys(carry.key, step)
+        first = self._updates_before(step)
+
+        def update(i: jax.Array, learnt: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
+            state, sums = learnt
+            batch = self._draw(memory, jax.random.fold_in(draw_key, i), step)
+            state, metrics = self._update(state, batch, jax.random.fold_in(update_key, i), first + i)
+            return state, sums + jnp.stack([metrics[name] for name in self.metrics])
+
+        learnt = self.packing.unpack(carry.state), carry.sums
+        if self.cadence.updates_per_interval == 1:
+            state, sums = update(jnp.int32(0), learnt)
+        else:
+            state, sums = jax.lax.fori_loop(0, self.cadence.updates_per_interval, update, learnt)
+        action = self._act(state, carry.key, observation, step)
+        return Carry(self.packing.pack(state), memory, sums, carry.key), action
+
+    def _first_metrics(self, state: Any, memory: Any, key_data: jax.Array) -> dict[str, jax.Array]:
+        key = jax.random.wrap_key_data(key_data)
+        return self._update(state, self._draw(memory, key, jnp.int32(1)), key, jnp.int32(0))[1]
+
+    def _draw(self, memory: Any, key: jax.Array, count: jax.Array) -> Transition:
+        return memory.draw(key, count, self.cadence.transitions_per_update, self.spec)
+
+    def _updates_before(self, step: jax.Array) -> jax.Array:
+        """Return how many updates came before those that follow environment step `step`."""
+        cadence = self.cadence
+        return (step - cadence.first_update) // cadence.update_interval * cadence.updates_per_interval
+
+    def _act(self, state: Any, key_data: jax.Array, observation: jax.Array, step: jax.Array) -> jax.Array:
+        keys = self._act_keys(key_data, observation, step)
+        return self._each(lambda one, key: self.algorithm.act(state, one, key, True), observation, keys)
+
+    def _act_keys(self, key_data: jax.Array, observation: jax.Array, step: jax.Array) -> jax.Array:
+        """Return the keys to act by, of each environment where there are several; with correlated noise [..., n]."""
+        environments = self.spec.environments
+        if self.noise == "white":
+            key = _keys(key_data, step)[2]
+            return jax.random.split(key, environments) if observation.ndim > 1 else key
+        keys = keys_of(self.noise, jax.random.wrap_key_data(key_data), step, environments)
+        return keys if observation.ndim > 1 else keys[0]
+
+    @staticmethod
+    def _each(function: Callable, observation: jax.Array, keys: jax.Array) -> jax.Array:
+        """Return what a function gives for an observation, or for each [environment, ...] of several."""
+        return function(observation, keys) if observation.ndim == 1 else jax.vmap(function)(observation, keys)
+
+
+def _keys(key_data: jax.Array, step: jax.Array) -> jax.Array:
+    """Return the keys of one environment step: to draw batches, to update, to act."""
+    return jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key_data), step), 3)
