@@ -45,6 +45,13 @@ class Replay:
         start = (count % self.rows.shape[0], 0)
         return replace(self, rows=jax.lax.dynamic_update_slice(self.rows, rows, start))
 
+    def extend(self, rows: Float[Array, "n width"], number: Count, count: Count) -> Replay:
+        """Return the ring with the first `number` of packed rows written over the oldest, wherever `count` lies."""
+        capacity, places = self.rows.shape[0], jnp.arange(len(rows))
+        is_written = (places < number) & (places >= number - capacity)
+        places = jnp.where(is_written, (count + places) % capacity, capacity)  # what lies beyond is dropped
+        return replace(self, rows=self.rows.at[places].set(rows, mode="drop"))
+
     def draw(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
         """Return a batch drawn uniformly with replacement from the `count` rows added, or the newest `capacity`."""
         indices = jax.random.randint(key, (batch_size,), 0, jnp.minimum(count, self.rows.shape[0]))

@@ -27,16 +27,20 @@ class Learner:
 
     What is learnt is kept packed into few buffers, donated at every update: with one for each of CSAC's 74 arrays an
     update takes 2-6 % longer.
+
+    `most_extra` is how many transitions a seed may be given by `extend`.
     """
 
-    def __init__(self, algorithm: Algorithm, spec: Spec, seeds: Sequence[int], steps: int) -> None:
+    def __init__(
+        self, algorithm: Algorithm, spec: Spec, seeds: Sequence[int], steps: int, most_extra: int = 0
+    ) -> None:
         self.algorithm, self.spec, self._steps = algorithm, spec, steps
         self._cadence = algorithm.cadence.side_by_side(spec.environments)
         self._axis = SeedAxis(len(seeds))
         self._updates_summed = 0
         self._waiting = np.zeros((len(seeds), self._cadence.update_interval, row_width(spec)), np.float32)
         keep_programs()
-        self._one = OneSeed(algorithm, spec, steps)
+        self._one = OneSeed(algorithm, spec, steps, most_extra)
         self.network = algorithm.policy(self._one.state)  # for all but its parameters
         # It runs once, and less optimised it is compiled in three quarters of the time.
         begin = jax.jit(self._axis.map(self._one.begin), compiler_options={"xla_backend_optimization_level": 1})
@@ -54,6 +58,7 @@ class Learner:
         self._explore_alone, self._act_alone = (
             jax.jit(self._axis.map(program, (0, 0, None))) for program in (self._one.explore, self._one.act)
         )
+        self._extend = jax.jit(self._axis.map(self._one.extend, (0, 0, 0, None)), donate_argnums=0)
 
     def next_actions(self, observations: np.ndarray, step: int) -> np.ndarray:
         """Return the actions [seed, (environment,) action] for observations of such axes, after `step` steps."""
@@ -82,6 +87,19 @@ class Learner:
         self._carry, next_actions = program(self._carry, given)
         self._waiting[...] = 0.0
         return self._axis.restore(np.asarray(next_actions))
+
+    def extend(self, rows: Sequence[np.ndarray], step: int) -> None:
+        """Give each seed packed transitions [n, width] of its own, n from 0 on; `step` environment steps were made."""
+        numbers = np.array([len(own) for own in rows], np.int32)
+        padded = np.zeros((len(rows), 1 << (int(numbers.max()) - 1).bit_length(), row_width(self.spec)), np.float32)
+        for place, own in zip(padded, rows, strict=True):
+            place[: len(own)] = own
+        given = self._axis.strip(padded), self._axis.strip(numbers), np.int32(self._remembered(step))
+        self._carry = self._extend(self._carry, *given)
+
+    def _remembered(self, step: int) -> int:
+        """Return how many of so many steps are in the memory: the others wait for an update."""
+        return step // self._cadence.update_interval * self._cadence.update_interval
 
     def _of_parcel(self, program: Callable) -> Callable:
         """Return the program of a carry, packed transitions, observations and a step as one of a carry and a parcel."""
@@ -140,8 +158,8 @@ class Learner:
 
     def memory(self, index: int, step: int) -> Ring:
         """Return the memory of the seed at this place, to read only; `step` environment steps were made."""
-        interval = self._cadence.update_interval
-        return Ring(self._axis.of(np.asarray(self._carry.memory.rows), index), step // interval * interval)
+        extra = 0 if self._carry.extra is None else int(self._axis.of(np.asarray(self._carry.extra), index))
+        return Ring(self._axis.of(np.asarray(self._carry.memory.rows), index), self._remembered(step) + extra)
 
     def restore(self, saved: Sequence[Snapshot], memories: Sequence[Callable[[np.ndarray], None]]) -> None:
         """Go on from what `save` returned for each seed; `memories` fill each seed's rows [capacity, width].
@@ -215,4 +233,4 @@ def incompatibility(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapsho
 
 def _lasting(carry: Carry) -> dict[str, Any]:
     """Return what a checkpoint has of a carry; memories are saved apart."""
-    return {"state": carry.state, "sums": carry.sums, "key": carry.key}
+    return {"state": carry.state, "sums": carry.sums, "key": carry.key, "extra": carry.extra}

@@ -31,6 +31,7 @@ class Carry(NamedTuple):
     memory: Any  # a Replay or a Rollout
     sums: jax.Array  # [metric] over the updates since metrics were last forgotten
     key: jax.Array  # [2] of the run, as data: each step's own keys are folded from it
+    extra: jax.Array | None = None  # [] transitions that the memory was given beside those of the steps
 
 
 class OneSeed:
@@ -42,13 +43,14 @@ class OneSeed:
         packing: how the state is packed.
     """
 
-    def __init__(self, algorithm: Algorithm, spec: Spec, steps: int) -> None:
+    def __init__(self, algorithm: Algorithm, spec: Spec, steps: int, most_extra: int = 0) -> None:
         self.algorithm, self.spec = algorithm, spec
         self.cadence = algorithm.cadence.side_by_side(spec.environments)
+        self._no_extra = jnp.int32(0) if most_extra else None
         self.noise: Noise = getattr(algorithm, "exploration_noise", "white")
         # Both are asked for shapes and then to run: traced once.
         self._first = jax.jit(
-            lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), inline=True
+            lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps + most_extra)), inline=True
         )
         self._update = jax.jit(lambda *arguments: algorithm.update(*arguments), inline=True)
         self.state, memory = jax.eval_shape(lambda data: self._first(jax.random.wrap_key_data(data)), KEY_DATA)
@@ -60,7 +62,8 @@ class OneSeed:
         """Return what a seed begins with."""
         init_key, run_key = jax.random.split(jax.random.wrap_key_data(key_data))
         state, memory = self._first(init_key)
-        return Carry(self.packing.pack(state), memory, jnp.zeros(len(self.metrics)), jax.random.key_data(run_key))
+        sums, key = jnp.zeros(len(self.metrics)), jax.random.key_data(run_key)
+        return Carry(self.packing.pack(state), memory, sums, key, self._no_extra)
 
     def explore(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
         """Return a uniformly random action for each observation."""
@@ -78,20 +81,21 @@ class OneSeed:
         self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
     ) -> tuple[Carry, jax.Array]:
         """Add packed transitions [n, width]; return what is carried on, and a uniformly random action."""
-        carry = carry._replace(memory=carry.memory.add(rows, step - len(rows)))
+        carry = self._remember(carry, rows, step)
         return carry, self.explore(carry, observation, step)
 
     def remember_and_learn(
         self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
     ) -> tuple[Carry, jax.Array]:
         """Add packed transitions [n, width] and make all updates that are due; return also the new policy's action."""
-        memory = carry.memory.add(rows, step - len(rows))
+        memory = self._remember(carry, rows, step).memory
+        count = step if carry.extra is None else step + carry.extra
         draw_key, update_key, _ = _keys(carry.key, step)
         first = self._updates_before(step)
 
         def update(i: jax.Array, learnt: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
             state, sums = learnt
-            batch = self._draw(memory, jax.random.fold_in(draw_key, i), step)
+            batch = self._draw(memory, jax.random.fold_in(draw_key, i), count)
             state, metrics = self._update(state, batch, jax.random.fold_in(update_key, i), first + i)
             return state, sums + jnp.stack([metrics[name] for name in self.metrics])
 
@@ -101,7 +105,20 @@ class OneSeed:
         else:
             state, sums = jax.lax.fori_loop(0, self.cadence.updates_per_interval, update, learnt)
         action = self._act(state, carry.key, observation, step)
-        return Carry(self.packing.pack(state), memory, sums, carry.key), action
+        return Carry(self.packing.pack(state), memory, sums, carry.key, carry.extra), action
+
+    def extend(self, carry: Carry, rows: jax.Array, number: jax.Array, step: jax.Array) -> Carry:
+        """Add the first `number` of packed transitions [n, width] that are of no step."""
+        extra = carry.extra + number
+        return carry._replace(memory=carry.memory.extend(rows, number, step + carry.extra), extra=extra)
+
+    @staticmethod
+    def _remember(carry: Carry, rows: jax.Array, step: jax.Array) -> Carry:
+        """Add the packed transitions [n, width] of the steps up to this one."""
+        count = step - len(rows)
+        if carry.extra is None:
+            return carry._replace(memory=carry.memory.add(rows, count))
+        return carry._replace(memory=carry.memory.extend(rows, len(rows), count + carry.extra))
 
     def _first_metrics(self, state: Any, memory: Any, key_data: jax.Array) -> dict[str, jax.Array]:
         key = jax.random.wrap_key_data(key_data)
