@@ -73,6 +73,7 @@ class _Training(RunConfig):
     environment_arguments: Annotated[dict[str, Any], JSON, arg(name="env-kwargs")] = field(default_factory=dict)
     """Keyword arguments for the environment, as a JSON object."""
     hyperparameters: Suppress[dict[str, Any]] = field(default_factory=dict)
+    demonstrations: Suppress[dict[str, Any]] = field(default_factory=dict)
     seed: Suppress[int] = 0
     evaluation_seed: Suppress[int] = EVALUATION_SEED
     task_is_callable: Suppress[bool] = False
@@ -100,6 +101,10 @@ class Train(_Training):
     events: Annotated[Names, arg(help_behavior_hint="(default: the task's own)")] = ()
     """More names to record from the info of an episode's last step, or NAME:sum, NAME:mean over all its steps: each
     becomes a column and a curve, of evaluations and of training episodes."""
+    given: Annotated[
+        str | None, arg(name="demonstrations", metavar="FILE.npz", help_behavior_hint="(default: none)")
+    ] = None
+    """Begin with these transitions in the replay, actions on the environment's scale; or a Minari data set's id."""
     seeds_per_process: Annotated[int | None, arg(help_behavior_hint="(default: 1 on a CPU, a few on a GPU)")] = None
     """Seeds that train in one program."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
@@ -122,9 +127,10 @@ class Train(_Training):
             "hyperparameters",
             "seed",
             "task_is_callable",
+            "given",
         )
         given = {name: value for name, value in vars(self).items() if name not in others}
-        return {**given, "perturbations": planned, "events": self.events or None}
+        return {**given, "perturbations": planned, "events": self.events or None, "demonstrations": self.given}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -58,11 +58,18 @@ class RunConfig:
     """Keyword arguments for the environment."""
     perturbations: tuple[str, ...] = ()
     """Changes of the task in mid-training, such as friction=1.5@300000."""
+    demonstrations: dict[str, Any] = field(default_factory=dict)
+    """What the replay begins with: where it came from, how many transitions, and their file's checksum."""
     events: tuple[str, ...] = ()
     """Names in the last `info` of an episode, or NAME:sum and NAME:mean over its steps; each is a column of
     evaluations.csv and episodes.csv."""
     task_is_callable: bool = False
     """Whether the task is a Python function, which no manifest can name."""
+
+    @property
+    def extra_transitions(self) -> int:
+        """How many transitions the replay is given at most beside those of the steps."""
+        return self.demonstrations.get("transitions", 0)
 
     def __post_init__(self) -> None:
         if self.device == "cuda":
@@ -73,7 +80,7 @@ class RunConfig:
             check_whole(name, getattr(self, name), least, most)
         if self.steps % self.environments:
             raise InputError(f"steps must be a multiple of environments, {self.environments}, not {self.steps:,}")
-        for name in ("hyperparameters", "environment_arguments"):
+        for name in ("hyperparameters", "environment_arguments", "demonstrations"):
             object.__setattr__(self, name, as_json(name, getattr(self, name)))
         for name in ("perturbations", "events"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
@@ -137,7 +144,7 @@ def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -
     for name in sorted(before.keys() | now.keys()):
         old, new = before.get(name), now.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
-            lines += differences(old, new, "environment_arguments." if name == "environment_arguments" else "")
+            lines += differences(old, new, f"{name}." if name in ("environment_arguments", "demonstrations") else "")
         elif not same(_listed(old), _listed(new)):
             lines.append(f"{prefix}{name} is {_listed(old)!r}, not {_listed(new)!r}")
     return lines

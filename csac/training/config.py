@@ -18,6 +18,7 @@ from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.preflight import json_arguments, limit_warning, seed_warning, try_task, wrapper_warnings
 from csac.tasks.registry import check_events, events_of, import_module_of
 from csac.tasks.trust import refuse_untrusted, remember
+from csac.training.demonstrations import Demonstrations, is_told
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from csac.tasks.registry import Task
+    from csac.training.demonstrations import Given
     from csac.training.resume import Source
     from csac.types import Algorithm, Spec
 
@@ -44,6 +46,7 @@ class TrainOptions(TypedDict, total=False):
     environment_arguments: dict[str, Any] | None
     perturbations: str | Perturbation | Iterable[str | Perturbation] | None
     events: Sequence[str] | None
+    demonstrations: Given | None
 
 
 RUN_OPTIONS = tuple(TrainOptions.__annotations__)
@@ -53,8 +56,8 @@ PROTOCOL = ("cadence", "memory", "init", "act", "update", "policy")  # `csac.typ
 
 def make_configs(
     algorithm: Algorithm, task: Task, seeds: Sequence[int], given: TrainOptions, source: Source | None
-) -> tuple[list[RunConfig], Spec, list[str]]:
-    """Return the configuration of each seed's run, the sizes of the task, and what the user should know of it.
+) -> tuple[list[RunConfig], Demonstrations | None, Spec, list[str]]:
+    """Return each seed's configuration, what their replays begin with, the task's sizes, and notes for the user.
 
     The task is made, stepped and perturbed once.
 
@@ -71,10 +74,17 @@ def make_configs(
         events = next(iter(source.runs.values())).config.events
     else:
         events = events_of(task, events or ())
+    offered, read = options.pop("demonstrations", None), None
     hyperparameters = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
     with closing(Environment(task, arguments)) as environment:
         spec, name = environment.spec, environment.task_name
         try_task(environment)
+        facts = offered if is_told(offered) else {}
+        if offered and not facts:
+            if source:
+                raise InputError("demonstrations are for a new run: a fork has the replay that it begins with")
+            read = Demonstrations.read(offered, algorithm, environment.contract_parts)
+            facts = read.facts
         told = seed_warning(environment), limit_warning(environment, task, LONGEST_EPISODE)
         notes = [*wrapper_warnings(environment), *filter(None, told)]
         remember(task)
@@ -88,6 +98,7 @@ def make_configs(
                 seed=seed,
                 environment_arguments=arguments,
                 perturbations=source.perturbations(seed, asked) if source else asked_for,
+                demonstrations=source.runs[seed].config.demonstrations if source else facts,
                 events=tuple(events),
                 task_is_callable=not isinstance(task, str),
                 **options,
@@ -98,7 +109,8 @@ def make_configs(
         refuse_late(changes, configs[0].steps, planned=source is not None and asked is None)
         for item in changes:
             environment.perturb({item.kind: item.value})
-    return configs, spec._replace(environments=configs[0].environments), [f"note: {line}" for line in notes]
+    spec = spec._replace(environments=configs[0].environments)
+    return configs, read, spec, [f"note: {line}" for line in notes]
 
 
 def labels(seeds: int, first_seed: int) -> list[int]:

@@ -30,7 +30,7 @@ def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at
     """
     programs = programs[:at_once]
     per_seed, seeds = (
-        _bytes_per_seed(programs[0].algorithm, config.steps, spec),
+        _bytes_per_seed(programs[0].algorithm, config, spec),
         sum(len(p.directories) for p in programs),
     )
     evaluating = sum(program.evaluation_processes + (program.environment_processes or 0) for program in programs)
@@ -50,14 +50,17 @@ def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at
     )
 
 
-def _bytes_per_seed(algorithm: Algorithm, steps: int, spec: Spec) -> int:
+def _bytes_per_seed(algorithm: Algorithm, config: RunConfig, spec: Spec) -> int:
     """Return the size of what a seed learns and remembers, and of what one update needs beside it.
 
     The latter is the batch, and for each of its transitions a number for every unit of the networks, of which a matrix
     of weights has as many as columns.
     """
+    steps, transitions = config.steps, config.steps + config.extra_transitions
     key = jax.ShapeDtypeStruct((2,), "uint32")
-    state, memory = jax.eval_shape(lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps)), key)
+    state, memory = jax.eval_shape(
+        lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, transitions)), key
+    )
     jax.eval_shape(lambda state: algorithm.policy(state).parameters, state)  # refuses networks that cannot leave
     units = sum(leaf.shape[-1] for leaf in jax.tree.leaves(state) if len(leaf.shape) == 2)
     kept = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((state, memory)))

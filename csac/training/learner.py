@@ -31,9 +31,7 @@ class Learner:
     `most_extra` is how many transitions a seed may be given by `extend`.
     """
 
-    def __init__(
-        self, algorithm: Algorithm, spec: Spec, seeds: Sequence[int], steps: int, most_extra: int = 0
-    ) -> None:
+    def __init__(self, algorithm: Algorithm, spec: Spec, seeds: Sequence[int], steps: int, most_extra: int = 0) -> None:
         self.algorithm, self.spec, self._steps = algorithm, spec, steps
         self._cadence = algorithm.cadence.side_by_side(spec.environments)
         self._axis = SeedAxis(len(seeds))

@@ -15,6 +15,7 @@ from csac.tasks.perturbations import by_step, perturbations_of, values_at
 from csac.tasks.vector import SeedEnvironments
 from csac.tasks.workers import choose_processes
 from csac.training.checkpoint import Writer
+from csac.training.demonstrations import files_of, rows_of
 from csac.training.evaluations import Evaluations, is_finite
 from csac.training.learner import Learner
 from csac.training.notifier import Notifier
@@ -65,7 +66,9 @@ class Loop:
                 program.task, arguments, seeds, self._stride, processes, self.config.events
             )
             stack.callback(self.environments.close)
-            self.learner = Learner(program.algorithm, self.environments.spec, seeds, self.steps)
+            self.learner = Learner(
+                program.algorithm, self.environments.spec, seeds, self.steps, self.config.extra_transitions
+            )
             self._perturbations = perturbations_of(self.config.perturbations)
             self._changes = dict(by_step(self._perturbations))
             self._begin(points)
@@ -133,10 +136,13 @@ class Loop:
     def _begin(self, points: Sequence[ResumePoint]) -> None:
         """Reset the environments, or restore what `save` wrote."""
         keep = self.config.keep_checkpoints
-        self._writers = [Writer(run.checkpoints, keep) for run in self.runs]
+        given = files_of(self.config.demonstrations)
+        self._writers = [Writer(run.checkpoints, keep, given) for run in self.runs]
         self._is_owed = False  # an evaluation of this step, which was broken off
         self._perturb(max(self.step - self._stride, 0))  # as before the last step of the checkpoint
         if not self.step:
+            if given:
+                self.learner.extend([rows_of(run) for run in self.runs], 0)
             self._observations = self.environments.reset()
             self._actions = self.learner.next_actions(self._observations, 0)
             return

@@ -109,8 +109,9 @@ class OneSeed:
 
     def extend(self, carry: Carry, rows: jax.Array, number: jax.Array, step: jax.Array) -> Carry:
         """Add the first `number` of packed transitions [n, width] that are of no step."""
-        extra = carry.extra + number
-        return carry._replace(memory=carry.memory.extend(rows, number, step + carry.extra), extra=extra)
+        assert carry.extra is not None
+        memory = carry.memory.extend(rows, number, step + carry.extra)
+        return carry._replace(memory=memory, extra=carry.extra + number)
 
     @staticmethod
     def _remember(carry: Carry, rows: jax.Array, step: jax.Array) -> Carry:

@@ -184,7 +184,7 @@ def as_begun(run: RunDirectory, options: TrainOptions) -> TrainOptions:
     if given is not None and origin:
         planned = continued(perturbations_of(planned), perturbations_of(given), origin.step)
     events = config.events if options.get("events") is None else options.get("events")
-    return {**options, "perturbations": planned, "events": events}
+    return {**options, "perturbations": planned, "events": events, "demonstrations": config.demonstrations}
 
 
 class Source(NamedTuple):
@@ -243,7 +243,7 @@ class Source(NamedTuple):
         if has_schedule and wanted.steps != before.steps:
             found.append(f"its learning rate has a schedule over {before.steps:,} steps: give as many")
         kept, size = old.get("replay_size", 0), new.get("replay_size", 0)
-        if kept < self.step and kept < size:
+        if kept < self.checkpoints[wanted.seed].transitions[1] and kept < size:
             found.append(f"its replay kept {kept:,} transitions: replay_size cannot be {size:,}")
         if found:
             raise InputError(f"{self.path} does not fit: {'; '.join(found)}")

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from csac.tasks.registry import Task
     from csac.training.callbacks import Callback
     from csac.training.config import TrainOptions
+    from csac.training.demonstrations import Demonstrations
     from csac.types import Algorithm
 
     OnEvaluation = Callable[[int, dict[int, float]], Any]
@@ -99,7 +100,7 @@ def train(
         **options: what a run computes, as `csac.record.config.RunConfig` explains it: `steps`, `device`,
             `environments`, `evaluation_interval`, `evaluation_episodes`, `evaluation_environments`,
             `evaluation_seed`, `checkpoint_interval`, `keep_checkpoints`, `environment_arguments`, `perturbations`,
-            `events`.
+            `events`; and `demonstrations`, what the replay begins with (`docs/learning-options.md`).
 
     Raises:
         InputError: a mistake in the arguments; nothing has been written then.
@@ -120,7 +121,7 @@ def train(
         options = as_begun(RunDirectory.open(run_path(place, wanted[0])), options)
     elif start_from is not None:
         source = Source.find(start_from, wanted)
-    configs, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
+    configs, demonstrations, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
     choose_device(configs[0].device)  # the task's module may have changed JAX's settings
     place = place or new_set_directory(configs[0].task, configs[0].algorithm)
     existing = _existing(place, configs, resume, source, algorithm.cadence.has_schedule)
@@ -139,7 +140,7 @@ def train(
     programs = plan.programs([[run_path(place, seed) for seed in group] for group in groups], existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
 
-    runs = _create(place, configs, groups, existing, source)
+    runs = _create(place, configs, groups, existing, source, demonstrations)
     try:
         return _run(runs, programs, watch, notes)
     except InputError:  # so that the corrected call can use the directory
@@ -254,6 +255,7 @@ def _create(
     groups: list[list[int]],
     existing: dict[int, RunDirectory],
     source: Source | None,
+    demonstrations: Demonstrations | None,
 ) -> TrainedRuns:
     """Create the run of each configuration, or give the existing one its larger number of steps. Raises InputError."""
     for config in configs:
@@ -262,6 +264,8 @@ def _create(
             run = RunDirectory.create(run_path(place, config.seed), source.begun(manifest) if source else manifest)
             if source:
                 source.copy_to(run)
+            if demonstrations:
+                demonstrations.write(run)
         elif config != existing[config.seed].config:
             with existing[config.seed].locked():
                 existing[config.seed].update_manifest(config=config)

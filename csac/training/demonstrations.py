@@ -1,0 +1,158 @@
+"""Demonstrations: transitions of one's own, which a replay begins with, as the first file of its checkpoints."""
+
+from __future__ import annotations
+
+import importlib
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import safetensors.numpy
+
+from csac.algorithms.memory import pack
+from csac.deploy.contract import Contract
+from csac.record.files import write_atomically
+from csac.training.checkpoint import REPLAY, Facts, facts_of, is_unchanged
+from csac.types import InputError, Transition
+
+if TYPE_CHECKING:
+    import os
+
+    from csac.record.run import RunDirectory
+    from csac.tasks.spaces import ContractParts
+    from csac.types import Algorithm
+
+Given = str | Path | Mapping[str, Any]  # a .npz file, a Minari data set's id, or arrays by name
+
+OTHER_NAMES = {"terminations": "terminated", "truncations": "truncated"}  # in `load_checkpoint(run).replay()`
+OUTSIDE = 1e-3  # of half an action's range: more than rounding
+
+
+class Demonstrations(NamedTuple):
+    """The transitions as a run keeps them, and what its manifest tells of them."""
+
+    content: bytes
+    facts: dict[str, Any]
+
+    @classmethod
+    def read(cls, given: Given, algorithm: Algorithm, parts: ContractParts) -> Demonstrations:
+        """Read transitions for a task with these parts. Raises InputError for what is none of such a task's."""
+        if (most := getattr(algorithm, "replay_size", None)) is None:
+            raise InputError(f"demonstrations are for algorithms with a replay, and {algorithm.name} has none")
+        contract = Contract(None, "", "relu", "tanh", *parts)
+        rows = _rows(*_arrays(given, contract), contract)
+        if len(rows) > most:
+            raise InputError(f"demonstrations has {len(rows):,} transitions and replay_size is {most:,}")
+        content = safetensors.numpy.save({"rows": rows})
+        source = "arrays" if isinstance(given, Mapping) else Path(given).name if _is_file(given) else str(given)
+        return cls(content, {"source": source, "transitions": len(rows), **facts_of(content)})
+
+    def write(self, run: RunDirectory) -> None:
+        """Give them to a new run. Raises OSError."""
+        name = next(iter(files_of(self.facts)))
+        (run.checkpoints / REPLAY).mkdir(parents=True, exist_ok=True)
+        write_atomically(run.checkpoints / name, self.content)
+
+
+def is_told(given: object) -> bool:
+    """Return whether this is what a run's configuration tells of its demonstrations."""
+    return isinstance(given, dict) and "sha256" in given
+
+
+def files_of(facts: dict[str, Any]) -> dict[str, Facts]:
+    """Return the file of demonstrations among those of a checkpoint; none where there are none."""
+    own = {name: facts[name] for name in ("bytes", "sha256") if facts}
+    return {f"{REPLAY}/0-{facts['transitions']}.safetensors": own} if facts else {}
+
+
+def rows_of(run: RunDirectory) -> np.ndarray:
+    """Return the packed transitions [n, width] that a run begins with. Raises InputError where they are lost."""
+    ((name, facts),) = files_of(run.config.demonstrations).items()
+    path = run.checkpoints / name
+    if not path.is_file() or not is_unchanged(content := path.read_bytes(), facts):
+        raise InputError(f"{path} is missing or has changed: train anew, in another directory")
+    return safetensors.numpy.load(content)["rows"]
+
+
+def _arrays(given: Given, contract: Contract) -> tuple[dict[str, Any], list[str]]:
+    """Return what was given as arrays by our names, and the names that it has."""
+    if isinstance(given, Mapping):
+        arrays = dict(given)
+    elif _is_file(given):
+        arrays = _of_file(Path(given))
+    elif isinstance(given, str):
+        arrays = _of_minari(given, contract)
+    else:
+        raise InputError(f"demonstrations is a .npz file, a dict of arrays or a Minari id, not {given!r:.40}")
+    return arrays | {name: arrays[other] for name, other in OTHER_NAMES.items() if other in arrays}, list(arrays)
+
+
+def _is_file(given: str | os.PathLike[str]) -> bool:
+    return isinstance(given, Path) or (isinstance(given, str) and given.endswith(".npz"))
+
+
+def _of_file(path: Path) -> dict[str, Any]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except OSError as error:
+        raise InputError(f"demonstrations: cannot read {path}: {error.strerror or error}") from None
+    except (ValueError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"demonstrations: {path} is no .npz file of arrays ({error})") from None
+
+
+def _of_minari(name: str, contract: Contract) -> dict[str, Any]:
+    try:
+        minari = importlib.import_module("minari")
+    except ImportError:
+        told = "is no .npz file; if it is a Minari data set, install what reads it: pip install 'minari[hdf5]'"
+        raise InputError(f"demonstrations: {name!r} {told}") from None
+    try:
+        episodes = list(minari.load_dataset(name, download=True).iterate_episodes())
+        seen = [contract.flatten(episode.observations) for episode in episodes]  # one more than there are actions
+        fields = ("actions", "rewards", "terminations", "truncations")
+        arrays = {name: np.concatenate([getattr(episode, name) for episode in episodes]) for name in fields}
+        arrays["observations"] = np.concatenate([one[:-1] for one in seen])
+        arrays["next_observations"] = np.concatenate([one[1:] for one in seen])
+    except Exception as error:
+        raise InputError(f"demonstrations: Minari cannot give {name!r}: {' '.join(str(error).split())}") from None
+    return arrays
+
+
+def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.ndarray:
+    """Return packed transitions [n, width], actions in [-1, 1]."""
+    wanted = ("observations", "actions", "rewards", "next_observations", "terminations")
+    if missing := [name for name in wanted if name not in arrays]:
+        raise InputError(f"demonstrations lacks {', '.join(missing)}: it has {', '.join(map(str, names)) or 'nothing'}")
+    spec, bounds = contract.spec, contract.bounds
+    number = len(arrays["rewards"]) if hasattr(arrays["rewards"], "__len__") else 0
+    if not number:
+        raise InputError("demonstrations has no transitions")
+
+    def field(name: str, size: int) -> np.ndarray:
+        try:
+            with np.errstate(over="ignore"):  # becomes infinite, which is refused
+                value = contract.flatten(arrays[name]) if "observations" in name else np.asarray(arrays[name])
+                if value.dtype.kind not in "biuf":
+                    raise TypeError(f"{value.dtype} is no type of numbers")
+                flat = value.astype(np.float32)
+        except (InputError, TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"demonstrations: {name}: {' '.join(str(error).split())}") from None
+        if flat.shape[:1] != (number,) or flat.size != number * size:
+            raise InputError(f"demonstrations: {name} has shape {flat.shape}, not {(number, size)[: 1 + (size > 1)]}")
+        if not np.isfinite(flat).all():
+            raise InputError(f"demonstrations: {name} holds what is not finite")
+        return flat.reshape(number, size)
+
+    actions = (field("actions", spec.action_size) - bounds.centre) / np.where(bounds.half > 0, bounds.half, 1.0)
+    if (beyond := float(np.abs(actions).max())) > 1 + OUTSIDE:
+        told = f"at {beyond:.3g} times the task's bounds: give them on its own scale, clipped to its bounds"
+        raise InputError(f"demonstrations: actions are {told}")
+    arrays = {"truncations": np.zeros(number), **arrays}
+    ends = [field(name, 1)[:, 0] for name in ("terminations", "truncations")]
+    if not np.isin(ends, (0.0, 1.0)).all():
+        raise InputError("demonstrations: terminations and truncations are 0 or 1")
+    observations, following = (field(name, spec.observation_size) for name in ("observations", "next_observations"))
+    return pack(Transition(observations, np.clip(actions, -1, 1), field("rewards", 1)[:, 0], following, *ends))
