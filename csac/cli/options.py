@@ -299,7 +299,7 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
     defaults: dict[str, Any] = {"algorithm": name, "preset": preset}
     learner = kind(**(hyperparameters(preset, name, task) if preset else {}))
     if source:
-        kept = ("steps", "environments", "evaluation_interval", "evaluation_episodes", "evaluation_seed")
+        kept = ("steps", "environments", "hindsight", "evaluation_interval", "evaluation_episodes", "evaluation_seed")
         defaults |= {item: getattr(source.config, item) for item in kept}
         defaults |= {"seeds": len(source.seeds), "first_seed": source.seeds[0]}
         defaults["environment_arguments"] = source.config.environment_arguments

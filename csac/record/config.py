@@ -58,6 +58,8 @@ class RunConfig:
     """Keyword arguments for the environment."""
     perturbations: tuple[str, ...] = ()
     """Changes of the task in mid-training, such as friction=1.5@300000."""
+    hindsight: int = 0
+    """Copies of each transition with goals that its episode reached later (HER); for tasks with goals."""
     demonstrations: dict[str, Any] = field(default_factory=dict)
     """What the replay begins with: where it came from, how many transitions, and their file's checksum."""
     events: tuple[str, ...] = ()
@@ -69,7 +71,7 @@ class RunConfig:
     @property
     def extra_transitions(self) -> int:
         """How many transitions the replay is given at most beside those of the steps."""
-        return self.demonstrations.get("transitions", 0)
+        return self.steps * self.hindsight + self.demonstrations.get("transitions", 0)
 
     def __post_init__(self) -> None:
         if self.device == "cuda":
@@ -80,6 +82,8 @@ class RunConfig:
             check_whole(name, getattr(self, name), least, most)
         if self.steps % self.environments:
             raise InputError(f"steps must be a multiple of environments, {self.environments}, not {self.steps:,}")
+        if self.steps + self.extra_transitions > STEPS_LIMIT:
+            raise InputError(f"steps and hindsight make more than {STEPS_LIMIT:,} transitions: give fewer steps")
         for name in ("hyperparameters", "environment_arguments", "demonstrations"):
             object.__setattr__(self, name, as_json(name, getattr(self, name)))
         for name in ("perturbations", "events"):
@@ -96,6 +100,7 @@ _RANGES = (
     ("seed", 0, SEED_LIMIT - 1),
     ("steps", 1, STEPS_LIMIT),
     ("environments", 1, 1_000),
+    ("hindsight", 0, 100),
     ("evaluation_interval", 0, NEVER),
     ("evaluation_episodes", 1, MOST_EPISODES),
     ("evaluation_environments", 0, 10),

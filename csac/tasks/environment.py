@@ -125,6 +125,32 @@ class Environment:
             raise failure_of("step", error) from error
         return self._flatten(observation), scalar(reward), terminated, truncated, info
 
+    @property
+    def has_goals(self) -> bool:
+        """Whether the task can compute the reward of another goal."""
+        return self.raw.has_wrapper_attr("compute_reward")
+
+    def relabel(self, achieved: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return rewards [n] of flat goals [n, goal] that were achieved where others were desired.
+
+        And whether that terminates an episode, [n] bool, where the task has `compute_terminated`; else None. Both are
+        asked for one pair at a time, with an empty info: not every task takes several.
+
+        Raises:
+            EnvironmentFailure: the environment raised, or a reward is not finite.
+        """
+        shape = dict(self._parts)["achieved_goal"]
+        pairs = [(a.reshape(shape), d.reshape(shape)) for a, d in zip(achieved, desired, strict=True)]
+        try:
+            reward_of, terminated = self.raw.get_wrapper_attr("compute_reward"), None
+            rewards = [reward_of(*pair, {}) for pair in pairs]
+            if self.raw.has_wrapper_attr("compute_terminated"):
+                ends = self.raw.get_wrapper_attr("compute_terminated")
+                terminated = np.array([bool(ends(*pair, {})) for pair in pairs], bool)
+        except BaseException as error:
+            raise failure_of("compute_reward", error) from error
+        return np.array([scalar(reward) for reward in rewards], np.float32), terminated
+
     def snapshot(self) -> Snapshot | None:
         """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell.
 

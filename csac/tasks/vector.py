@@ -155,6 +155,16 @@ class SeedEnvironments:
             self.alive[failure.seed_index] = False
         return Steps(next_observation, reward, terminated, truncated, self._observation, episodes, failures)
 
+    def relabel(
+        self, place: Place, achieved: np.ndarray, desired: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None] | None:
+        """Return what `Environment.relabel` does; None where it fails, which the next `step` reports."""
+        try:
+            return self._at[place].relabel(achieved, desired)
+        except EnvironmentFailure as error:
+            self._fail(place, error)
+            return None
+
     def stop(self, index: int) -> None:
         """Step the seed at this place in the group no more."""
         self.alive[index] = False

@@ -19,6 +19,7 @@ from csac.tasks.preflight import json_arguments, limit_warning, seed_warning, tr
 from csac.tasks.registry import check_events, events_of, import_module_of
 from csac.tasks.trust import refuse_untrusted, remember
 from csac.training.demonstrations import Demonstrations, is_told
+from csac.training.hindsight import check_goals
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ class TrainOptions(TypedDict, total=False):
     environment_arguments: dict[str, Any] | None
     perturbations: str | Perturbation | Iterable[str | Perturbation] | None
     events: Sequence[str] | None
+    hindsight: int
     demonstrations: Given | None
 
 
@@ -105,6 +107,8 @@ def make_configs(
             )
             for seed in seeds
         ]
+        if configs[0].hindsight:
+            check_goals(algorithm, environment)
         changes = perturbations_of(configs[0].perturbations)
         refuse_late(changes, configs[0].steps, planned=source is not None and asked is None)
         for item in changes:

@@ -17,6 +17,7 @@ from csac.tasks.workers import choose_processes
 from csac.training.checkpoint import Writer
 from csac.training.demonstrations import files_of, rows_of
 from csac.training.evaluations import Evaluations, is_finite
+from csac.training.hindsight import Hindsight
 from csac.training.learner import Learner
 from csac.training.notifier import Notifier
 from csac.training.resume import ResumePoint
@@ -69,6 +70,8 @@ class Loop:
             self.learner = Learner(
                 program.algorithm, self.environments.spec, seeds, self.steps, self.config.extra_transitions
             )
+            copies = self.config.hindsight
+            self.hindsight = Hindsight(copies, self.environments, self.learner) if copies else None
             self._perturbations = perturbations_of(self.config.perturbations)
             self._changes = dict(by_step(self._perturbations))
             self._begin(points)
@@ -161,6 +164,8 @@ class Loop:
                 environment.values["exact"] = False
             if not self.environments.restore(index, environment):
                 restarted.append(index)
+            elif self.hindsight:
+                self.hindsight.restore(index, saved.part("hindsight"))
             fills.append(self._replay_loader(index, point))
         self.learner.restore(learnt, fills)
         self._observations = self.environments.observations
@@ -202,6 +207,8 @@ class Loop:
             row = {"seed": self.runs[episode.seed_index].seed, "step": self.step}
             row |= {"return": episode.episode_return, "length": episode.length, **episode.events}
             self.recorders[episode.seed_index].add("episodes", [row])
+        if self.hindsight:
+            self.hindsight.after_step(self._observations, self._actions, outcome, self.step)
         self._actions = self.learner.step(self._observations, self._actions, outcome, self.step)
         self._observations = outcome.observation
         flat = self._actions.ravel()
@@ -254,7 +261,8 @@ class Loop:
             self.save()
 
     def _snapshot(self, index: int) -> Snapshot:
-        saved = Snapshot.joined({"learner": self.learner.save(index), "environment": self.environments.save(index)})
+        parts = {"learner": self.learner.save(index), "environment": self.environments.save(index)}
+        saved = Snapshot.joined(parts | ({"hindsight": self.hindsight.save(index)} if self.hindsight else {}))
         saved.arrays["actions"] = self._actions[index]
         if self.evaluations.broken_off == self.step:
             saved.values["evaluation_owed"] = True

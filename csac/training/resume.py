@@ -237,6 +237,8 @@ class Source(NamedTuple):
         found = [] if before.events == wanted.events else [f"its events are {list(before.events)}"]
         if before.environments != wanted.environments:
             found.append(f"each of its seeds has environments={before.environments}")
+        if before.hindsight != wanted.hindsight:
+            found.append(f"its hindsight is {before.hindsight}")
         old, new = before.hyperparameters, wanted.hyperparameters
         others = [name for name in _LEARNT_WITH if name in old and old[name] != new.get(name)]
         found += [f"its networks have learnt with {name} {old[name]}" for name in others]

@@ -100,7 +100,7 @@ def train(
         **options: what a run computes, as `csac.record.config.RunConfig` explains it: `steps`, `device`,
             `environments`, `evaluation_interval`, `evaluation_episodes`, `evaluation_environments`,
             `evaluation_seed`, `checkpoint_interval`, `keep_checkpoints`, `environment_arguments`, `perturbations`,
-            `events`; and `demonstrations`, what the replay begins with (`docs/learning-options.md`).
+            `events`, `hindsight`; and `demonstrations`, what the replay begins with (`docs/learning-options.md`).
 
     Raises:
         InputError: a mistake in the arguments; nothing has been written then.
