@@ -40,7 +40,9 @@ class Demonstrations(NamedTuple):
     def read(cls, given: Given, algorithm: Algorithm, parts: ContractParts) -> Demonstrations:
         """Read transitions for a task with these parts. Raises InputError for what is none of such a task's."""
         if (most := getattr(algorithm, "replay_size", None)) is None:
-            raise InputError(f"demonstrations are for algorithms with a replay, and {algorithm.name} has none")
+            raise InputError(
+                f"demonstrations are for algorithms with a replay, and {type(algorithm).__name__} has none"
+            )
         contract = Contract(None, "", "relu", "tanh", *parts)
         rows = _rows(*_arrays(given, contract), contract)
         if len(rows) > most:

@@ -108,7 +108,7 @@ def places_of(parts: Parts) -> tuple[slice, slice]:
 def check_goals(algorithm: Algorithm, environment: Environment) -> None:
     """Raise InputError where an algorithm or a task has no use for hindsight. The task makes a step."""
     if not hasattr(algorithm, "replay_size"):
-        raise InputError(f"hindsight is for algorithms with a replay, and {algorithm.name} has none")
+        raise InputError(f"hindsight is for algorithms with a replay, and {type(algorithm).__name__} has none")
     if getattr(algorithm, "n_steps", 1) > 1:
         raise InputError("hindsight gives the replay single steps: n_steps must be 1")
     achieved, desired = places_of(environment.contract_parts.observation_parts)
