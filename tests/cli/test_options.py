@@ -34,6 +34,8 @@ TRAINED = {
     "environment_arguments": {},
     "perturbations": None,
     "events": None,
+    "hindsight": 0,
+    "demonstrations": None,
     "directory": None,
     "resume": False,
     "start_from": None,
@@ -49,7 +51,7 @@ def test_train_passes_its_options_on(train_call):
         "Hopper-v4 --steps 1e5 --seeds 3 --first-seed 7 --directory some/where --device gpu --seeds-per-process 2 "
         "--evaluation-interval 1_000 --evaluation-episodes 4 --evaluation-processes 3 "
         "--evaluation-environments 2 --events 'fell, slid' "
-        "--environments 4 --environment-processes 2 "
+        "--environments 4 --environment-processes 2 --hindsight 4 --demonstrations seen.npz "
         "--checkpoint-interval 5e3 --keep-checkpoints 0 --resume --wandb --from a@5 "
         "--warmup-steps 2e3 --actor-hidden-sizes 8 9 "
         "--perturb friction=1.5@5e4 --perturb=action-noise=0.1 "
@@ -82,6 +84,8 @@ def test_train_passes_its_options_on(train_call):
         "seeds_per_process": 2,
         "evaluation_processes": 3,
         "environments": 4,
+        "hindsight": 4,
+        "demonstrations": "seen.npz",
         "environment_processes": 2,
         "wandb": True,
     }
