@@ -28,7 +28,8 @@ from csac.types import Spec
 
 ROOT = Path(__file__).parents[2]
 PAGES = "".join((ROOT / "docs" / f"{page}.md").read_text() for page in ("adding-an-algorithm", "learning-options"))
-MODULES = dict(re.findall(r"^```python\n# (\w+)\.py\n(.*?)^```$", PAGES, re.DOTALL | re.MULTILINE))
+EXAMPLES = {name: (ROOT / "examples" / f"{name}.py").read_text() for name in ("reinforce", "residual")}
+MODULES = {**dict(re.findall(r"^```python\n# (\w+)\.py\n(.*?)^```$", PAGES, re.DOTALL | re.MULTILINE)), **EXAMPLES}
 OPTIONS = shlex.split(
     "--actor-hidden-sizes 8 8 --critic-hidden-sizes 8 8 --batch-size 8 --warmup-steps 40 --replay-size 150 "
     "--effort-weight 0.5 --steps 200 --evaluation-interval 100 --evaluation-episodes 2"
@@ -53,7 +54,7 @@ class Melting:
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """The pages' modules in a folder, where Python looks, each with a line that tells of its import."""
+    """The modules of pages and examples in a folder, where Python looks, each with a line that tells of its import."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     folder, marker = tmp_path / "modules", tmp_path / "imported"
     folder.mkdir()
