@@ -11,7 +11,9 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = Any  # a JAX array while learning, a NumPy array in what leaves
 Metrics: TypeAlias = dict[str, Any]  # name -> scalar JAX array
-Activation: TypeAlias = Literal["relu", "tanh", "elu", "silu", "gelu"]  # gelu: with tanh, as in its paper
+# gelu: with tanh, as in its paper. A new one goes into algorithms/networks.py, and where policies leave:
+# deploy/policy.py, deploy/onnx.py and both of deploy/templates/policy.*.
+Activation: TypeAlias = Literal["relu", "tanh", "elu", "silu", "gelu"]
 
 LAYER_NORM_EPSILON = 1e-5  # added to variances, as by PyTorch
 

@@ -57,11 +57,11 @@ class CSAC(TwinCritics):
     relative_entropy_form: Literal["explicit", "actor_only"] = "explicit"
     """Whether the relative entropy is in the critic's target and in the actor's loss, or in the actor's loss alone."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Bound on log-densities and log-ratios of an action in the critic's target, in nats; 0 is no bound."""
+    """Bound on log π and on the relative entropy of an action in the critic's target, in nats; 0 is no bound."""
     target_entropy: float | None = None
     """Entropy that `auto` aims at, in nats; by default minus the number of action dimensions."""
     target_relative_entropy: Annotated[float, POSITIVE] = 0.01
-    """Relative entropy per refresh that `auto` aims at, in nats per action dimension; with a short lag, use less."""
+    """Relative entropy per refresh that `auto` aims at, in nats per action dimension; less for `average`."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of weights that are `auto`."""
 
@@ -131,7 +131,7 @@ class CSAC(TwinCritics):
     def soft_value_terms(
         self, observation: Observation, noise: Action, *, actor: MLP, reference: MLP, critics: Critics
     ) -> tuple[Scalar, Scalar, Scalar]:
-        """Return min Q, log π and log(π/π̃) or its mean, the KL, at ã(s, ξ): the terms of the bracket in Eq. Q_CSAC."""
+        """Return min Q, log π and D at ã(s, ξ), of the bracket in Eq. Q_CSAC; D is log(π/π̃) or its mean, the KL."""
         policy = policy_at(actor, observation)
         q_value, log_prob = min_q(critics, observation, policy.sample(noise)), policy.log_prob(noise)
         previous = policy_at(reference, observation)
@@ -141,7 +141,7 @@ class CSAC(TwinCritics):
     def critic_target(
         self, transition: Transition, noise: Action, *, actor: MLP, reference: MLP, targets: Critics, weights: Weights
     ) -> Scalar:
-        """Return y = r + γ [min Q - σ log π - τ log(π/π̃)] at s' (Eq. Q_TD_2), and no future after a terminal step."""
+        """Return y = r + γ [min Q - σ log π - τ D] at s' (Eq. Q_TD_2), D as below; no future after an end."""
         sigma, tau = weights
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             transition.next_observation, noise, actor=actor, reference=reference, critics=targets
@@ -154,7 +154,7 @@ class CSAC(TwinCritics):
     def actor_loss(
         self, actor: MLP, observation: Observation, noise: Action, *, reference: MLP, critics: Critics, weights: Weights
     ) -> tuple[Scalar, Metrics]:
-        """Return J(φ) = (τ + σ) log π - τ log π̃ - min Q at ã(s, ξ) (Eq. actor_update_2), and what to log."""
+        """Return J(φ) = σ log π + τ D - min Q at ã(s, ξ), and what to log; `sampled`, it is Eq. actor_update_2."""
         sigma, tau = weights
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             observation, noise, actor=actor, reference=reference, critics=critics
@@ -181,7 +181,7 @@ class CSAC(TwinCritics):
         return Weights(self.entropy_weight, self.relative_entropy_weight)
 
     def update_weights(self, state: State, metrics: Metrics, dimensions: int, step: Count) -> LearntWeights | None:
-        """Return the learnt weights after one step: σ follows the entropy, τ the KL at the end of the last period."""
+        """Return the learnt weights after one step: σ follows the entropy, τ the relative entropy before a refresh."""
         target = adaptation.entropy_target(self.target_entropy, dimensions)
         targets = Weights(target, self.target_relative_entropy * dimensions)
         until_refresh = self.reference_period - step % self.reference_period

@@ -75,6 +75,13 @@ class RunDirectory:
             raise InputError(f"cannot write to {path}: {reason}; choose another directory") from None
         return cls(path, manifests.read(content))
 
+    def rename(self, path: Path) -> None:
+        """Have the run in another directory, new or empty. Raises InputError where there is something in it."""
+        try:
+            os.rename(self.path, path)
+        except OSError:
+            raise InputError(f"{path} is not empty; choose another directory") from None
+
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> RunDirectory:
         """Open a run that exists; where its manifest is lost or damaged, from the copy in its newest checkpoint.

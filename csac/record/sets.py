@@ -141,6 +141,7 @@ def find_sets(directory: str | Path, on_damaged: Callable[[InputError], None] | 
         raise InputError(f"there is no directory {directory}; give one that holds runs")
     found: dict[Path, list[RunDirectory]] = {}
     for folder, below, files in os.walk(directory):
+        below[:] = [name for name in below if not name.startswith(".")]  # where runs are being made
         if MANIFEST in files or ("checkpoint" in below and is_run(folder)):
             below.clear()
             try:

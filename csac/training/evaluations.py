@@ -78,7 +78,7 @@ class Evaluations:
         self._missing_events = {info_name(event) for event in config.events} if not len(runs[0].evaluations) else set()
 
     @property
-    def is_over(self) -> bool:
+    def is_ready(self) -> bool:
         """Whether an evaluation has been made that `finish` has not recorded yet."""
         return bool(self._pending and self._pending[3].is_over)
 
@@ -103,7 +103,7 @@ class Evaluations:
         policies = [self.policy(networks[i], step) for i in indices]
         self._evaluator.perturb(values_at(self._perturbations, task_step))
         self._pending = (step, indices, policies, self.evaluator.begin(policies))
-        if self.is_over:
+        if self.is_ready:
             self.finish()
 
     def finish(self) -> None:

@@ -80,11 +80,11 @@ class Loop:
             self.notifier = Notifier(program.hears, watcher.call, *told, self.learner.metric_names, self._policy)
             self.evaluations = Evaluations(program, *told, self.environments, watcher, self.notifier, stack)
             self._saved_at, self._saved_time = self.step, time.monotonic()
-            self.is_over = False
+            self.has_returned = False
             self._resources = stack.pop_all()
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Train to the last step, until no seed is left, or until a stop is asked for.
+        """Train to the last step, until no seed is left, or until a signal or a callback asks for a stop.
 
         Raises:
             OSError: a run directory can no longer be written.
@@ -111,10 +111,10 @@ class Loop:
                 self.save()
             is_stopping = is_stopping or self.evaluations.wants_stop
         self._finish()
-        self.is_over = True
+        self.has_returned = True
 
     def save(self) -> None:
-        """Write a checkpoint of every run, seeds that have failed included. Raises OSError."""
+        """Write a checkpoint of every run, failed seeds included, unless this step has one. Raises OSError."""
         self.evaluations.finish()
         self._stop_diverged()
         if self.step == self._saved_at or not self.environments.alive.any():
@@ -160,6 +160,7 @@ class Loop:
             self._is_owed = self._is_owed or saved.values.get("evaluation_owed", False)
             learnt.append(saved.part("learner"))
             self._actions[index] = saved.arrays["actions"]
+            # Begun by a run of another task, whose saved episode does not fit here (changes read "task is X, not Y").
             if origin and origin.step == self.step and origin.changed("task "):
                 environment.values["exact"] = False
             if not self.environments.restore(index, environment):
@@ -176,7 +177,7 @@ class Loop:
             self._actions[restarted] = self.learner.next_actions(self._observations, self.step)[restarted]
 
     def _replay_loader(self, index: int, point: ResumePoint) -> Callable[[np.ndarray], None]:
-        """Return what puts a run's transitions into its rows [capacity, width]."""
+        """Return a function that fills rows [capacity, width] with a run's transitions, and goes on with its files."""
         checkpoint, run = point.checkpoint, self.runs[index]
         assert checkpoint
 
@@ -228,7 +229,10 @@ class Loop:
         return due if due > self.evaluations.step and self.environments.is_at_start else None
 
     def _evaluate(self, step: int) -> None:
-        """Begin to evaluate the current policies, on the task as it was in the last step."""
+        """Evaluate the current policies, on the task as it was in the last step, as the evaluation of `step`.
+
+        In the training environment that is the multiple of the interval that was passed, up to an episode ago.
+        """
         self.evaluations.begin(step, self.learner.networks(), self.step - self._stride)
         if not self.config.evaluation_environments:  # the training environment has played them
             self.learner.truncate_last([0], self.step)
@@ -237,7 +241,7 @@ class Loop:
 
     def _write_and_report(self) -> None:
         """Write waiting rows, report progress, save by the clock, wait for the next turn on the cores."""
-        if self.evaluations.is_over:
+        if self.evaluations.is_ready:
             self.evaluations.finish()
         for recorder in self.recorders:
             recorder.flush()

@@ -50,7 +50,7 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
             loop.run(should_stop)
         finally:
             is_short = loop.step < loop.steps or loop.evaluations.broken_off is not None
-            stopped = not loop.is_over or (is_short and should_stop())
+            stopped = not loop.has_returned or (is_short and should_stop())
             for run in runs:
                 if run.manifest.state == "running":
                     run.update_manifest(state="interrupted" if stopped else "finished")

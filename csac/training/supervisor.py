@@ -111,7 +111,7 @@ def _replace(
         watcher.note(f"{_seeds(runs)}: {reason}; restarting from the newest checkpoint")
         return [worker.program]
     for run in runs:
-        if run.manifest.state == "running":
+        if run.manifest.state != "failed" and run.manifest.steps_done < run.config.steps:
             step = run.manifest.steps_done
             run.log(f"stopped at step {step}: {reason}")
             run.update_manifest(state="failed", failure=f"step {step}: {reason}")

@@ -1,11 +1,11 @@
-"""`train`: one call from a task to a set of runs. The command line calls nothing else."""
+"""`train` and `resume`: one call to a set of trained runs; `csac train` and `csac resume` call nothing else."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
 import shutil
-from contextlib import closing, nullcontext, suppress
+from contextlib import ExitStack, closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,6 @@ from csac.processes import core_quota, end_if_unguarded, usable_cores
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
 from csac.record.wandb import import_wandb
-from csac.tasks.perturbations import by_step, perturbations_of
 from csac.tasks.trust import refuse_untrusted
 from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
@@ -27,7 +26,7 @@ from csac.training.resume import Source, as_begun, refuse_differences
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.supervisor import supervise
-from csac.training.watch import Watch
+from csac.training.watch import Watch, draw_curve
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -86,9 +85,10 @@ def train(
         seeds_per_process: seeds that share one program; by default 1 on a CPU, and a few on a GPU. With all of them
             training stays in this process.
         evaluation_processes: processes in which a program evaluates while it trains on; 0 evaluates in between, and so
-            does None where no core is to spare, or in a script without a guard. The numbers are the same.
+            does None where no core is to spare, where a callback hears evaluations (`stop_when`), or in a
+            script without a guard. The numbers are the same.
         environment_processes: processes of a program that share its environments, at most as many (`environments`); 0
-            steps them here, None chooses by what a step costs, and 0 without a guard. The numbers are the same.
+            steps them here, None chooses by what a step costs; without a guard it is 0. The numbers are the same.
         tensorboard: whether to write TensorBoard files.
         wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to.
         progress: whether to show progress, as the command line does.
@@ -103,7 +103,7 @@ def train(
             `events`, `hindsight`; and `demonstrations`, what the replay begins with (`docs/learning-options.md`).
 
     Raises:
-        InputError: a mistake in the arguments; nothing has been written then.
+        InputError: a mistake in the arguments, or a run that cannot go on; new runs that have not begun are removed.
         Interrupted: on SIGINT or SIGTERM, after everything was saved.
         StorageFailure: a run directory can no longer be written; it is as sound as if the run had been killed.
         CallbackFailure: one of your own functions raised, after everything was saved.
@@ -172,6 +172,7 @@ def resume(
             call `train` with it and `resume=True` then.
         Interrupted, StorageFailure, CallbackFailure: as `train`.
     """
+    end_if_unguarded()
     runs = TrainedRuns.open(directory)
     config = runs.config
     if config.task_is_callable:
@@ -222,8 +223,15 @@ def _extend(runs: RunSet, steps: int, has_schedule: bool) -> None:
     wanted = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
     for run, config in zip(runs.runs, wanted, strict=True):
         refuse_differences(run, config, has_schedule)
-    for run, config in zip(runs.runs, wanted, strict=True):
-        with run.locked():
+    _change(runs.runs, wanted)
+
+
+def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
+    """Give each run its configuration. Raises InputError, before any is changed, where one is in use."""
+    with ExitStack() as locks:
+        for run in runs:
+            locks.enter_context(run.locked())
+        for run, config in zip(runs, configs, strict=True):
             run.update_manifest(config=config)
 
 
@@ -257,18 +265,30 @@ def _create(
     source: Source | None,
     demonstrations: Demonstrations | None,
 ) -> TrainedRuns:
-    """Create the run of each configuration, or give the existing one its larger number of steps. Raises InputError."""
-    for config in configs:
-        if config.seed not in existing:
+    """Create the run of each configuration; an existing one takes over what may differ where it goes on, such as steps.
+
+    New runs are made aside and named together: who is killed before leaves none of them, not some or a half of one.
+
+    Raises:
+        InputError: an existing run is in use, or a directory cannot be written.
+    """
+    changed = [config for config in configs if config.seed in existing and config != existing[config.seed].config]
+    _change([existing[config.seed] for config in changed], changed)
+    new = [config for config in configs if config.seed not in existing]
+    aside = {config.seed: place / f".seed-{config.seed}.{os.getpid()}" for config in new}
+    try:
+        for config in new:
             manifest = make_manifest(config, next(group for group in groups if config.seed in group))
-            run = RunDirectory.create(run_path(place, config.seed), source.begun(manifest) if source else manifest)
+            run = RunDirectory.create(aside[config.seed], source.begun(manifest) if source else manifest)
             if source:
                 source.copy_to(run)
             if demonstrations:
                 demonstrations.write(run)
-        elif config != existing[config.seed].config:
-            with existing[config.seed].locked():
-                existing[config.seed].update_manifest(config=config)
+        for seed, path in aside.items():
+            RunDirectory.open(path).rename(run_path(place, seed))
+    finally:
+        for path in aside.values():
+            shutil.rmtree(path, ignore_errors=True)
     return TrainedRuns(place, [RunDirectory.open(run_path(place, config.seed)) for config in configs])
 
 
@@ -289,7 +309,7 @@ def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[s
             begin_with(programs[0].threads)
             train_program(programs[0], watch, should_stop)
         elif programs:
-            turns = len(usable_cores()) // programs[0].threads if runs.config.device == "cpu" else None
+            turns = max(1, _cores() // programs[0].threads) if runs.config.device == "cpu" else None
             supervise(programs, lambda _: watch, should_stop, _workers(), turns)
         runs = TrainedRuns(runs.path, [RunDirectory.open(run.path) for run in runs.runs])
         draw_curve(RunSet.open(runs.path), watch.note)
@@ -303,22 +323,11 @@ def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[s
 
 
 def _workers() -> int:
-    return PROCESSES_PER_CORE * len(usable_cores()[: core_quota()])
+    return PROCESSES_PER_CORE * _cores()
 
 
-def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:
-    """Draw the evaluations of a set into its `curve.png`; a picture that cannot be drawn is no failure of the runs."""
-    rows = runs.sound_evaluations if len(runs.sound_evaluations) else runs.evaluations
-    if not len(rows):
-        return
-    from csac.record.plots import learning_curve  # matplotlib is slow to import
-
-    changes = by_step(perturbations_of(runs.config.perturbations))
-    marks = [(step, text) for step, text in changes if step <= rows["step"].max()]
-    try:
-        learning_curve([(runs.config.title, rows)], runs.curve, title=runs.config.task, marks=marks)
-    except Exception as error:
-        note(f"note: the curve could not be drawn ({type(error).__name__}: {' '.join(str(error).split())})")
+def _cores() -> int:
+    return len(usable_cores()[: core_quota()])
 
 
 def _warmup_note(algorithm: Algorithm, config: RunConfig) -> list[str]:

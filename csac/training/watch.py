@@ -1,4 +1,4 @@
-"""Who is told what happens in training, in the process that called `train`: the reporter and the callbacks."""
+"""Who is told what happens in training, in the process that called `train`: the reporter, the callbacks, the curve."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import warnings
 from typing import TYPE_CHECKING
 
 from csac.checks import check_flag
+from csac.tasks.perturbations import by_step, perturbations_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from csac.console.progress import Reporter
     from csac.record.run import RunDirectory
+    from csac.record.sets import RunSet
     from csac.training.callbacks import Answer, Callbacks, Event
 
 
@@ -65,3 +67,18 @@ class Watch:
         if manifest.state not in ("finished", "failed") or manifest.steps_done < run.config.steps:
             return self.callbacks.still_stop(run)
         return manifest.state == "finished"
+
+
+def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:
+    """Draw the evaluations of a set into its `curve.png`; a picture that cannot be drawn is no failure of the runs."""
+    rows = runs.sound_evaluations if len(runs.sound_evaluations) else runs.evaluations
+    if not len(rows):
+        return
+    from csac.record.plots import learning_curve  # matplotlib is slow to import
+
+    changes = by_step(perturbations_of(runs.config.perturbations))
+    marks = [(step, text) for step, text in changes if step <= rows["step"].max()]
+    try:
+        learning_curve([(runs.config.title, rows)], runs.curve, title=runs.config.task, marks=marks)
+    except Exception as error:
+        note(f"note: the curve could not be drawn ({type(error).__name__}: {' '.join(str(error).split())})")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import shutil
+from typing import Any
 
 import pytest
 from resuming import run
 
 from csac import InputError
+from csac.record.sets import find_sets
+from csac.training.resume import Source
 
 
 def test_a_fork_that_has_begun_needs_its_source_no_more(tmp_path):
@@ -29,3 +32,19 @@ def test_what_lies_beside_the_seeds_is_in_the_way_of_new_runs_alone(tmp_path):
     (tmp_path / "other" / "play.mp4").touch()
     with pytest.raises(InputError, match="other is not empty"):
         run(tmp_path / "other", steps=50, resume=True)
+
+
+def test_a_fork_that_is_killed_while_it_is_made_leaves_no_half_of_one(tmp_path, monkeypatch):
+    run(tmp_path / "source", steps=60)
+    line: dict[str, Any] = {"start_from": tmp_path / "source", "steps": 90, "resume": True}
+    with monkeypatch.context() as patched:
+        patched.setattr(Source, "copy_to", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "fork", **line)
+    assert not any((tmp_path / "fork").glob("seed-*"))
+    assert find_sets(tmp_path / "fork") == []
+    assert run(tmp_path / "fork", **line).steps_done == 90
+
+
+def interrupted(*_):
+    raise KeyboardInterrupt
