@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from resuming import run
 
-from csac import InputError
-from csac.record.sets import find_sets
+from csac import InputError, resume
+from csac.record.sets import RunSet, find_sets
 from csac.training.resume import Source
 
 
@@ -48,3 +48,13 @@ def test_a_fork_that_is_killed_while_it_is_made_leaves_no_half_of_one(tmp_path, 
 
 def interrupted(*_):
     raise KeyboardInterrupt
+
+
+def test_a_run_that_is_in_use_changes_none_of_its_set(tmp_path):
+    runs = run(tmp_path / "set", steps=50, seeds=2, seeds_per_process=2)
+    with runs.runs[1].locked():
+        with pytest.raises(InputError, match="seed-1"):
+            resume(tmp_path / "set", steps=60)
+        with pytest.raises(InputError, match="seed-1"):
+            run(tmp_path / "set", steps=60, seeds=2, resume=True)
+    assert [one.config.steps for one in RunSet.open(tmp_path / "set").runs] == [50, 50]
