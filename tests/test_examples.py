@@ -79,7 +79,8 @@ VARIABLE = re.compile(r"^(TASK|DIR|OTHER|FILE|FIRST|NAME|RUN)\b|\$|\.\.\.|^on$")
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_python_compiles_and_commands_parse(page):
+def test_python_compiles_and_commands_parse(page, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "examples")
     for language, block in re.findall(r"^```(\w*)\n(.*?)^```$", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE):
         if language == "python":
             compile(block, page, "exec")

@@ -58,6 +58,7 @@ def test_any_number_of_rows_is_written_over_the_oldest_wherever_they_begin():
     assert sorted(set(drawn.reward.tolist())) == [10, 11, 12, 13, 14]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
@@ -83,6 +84,7 @@ def test_they_come_first_in_the_replay_and_survive_a_crash(tmp_path, settings):
     assert all(one.manifest.history[-1].exact for one in again.runs)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_before_its_first_checkpoint_still_has_them(tmp_path):
     given: dict[str, Any] = {"task": EXACT, "steps": 100, "evaluation_interval": 50, "demonstrations": arrays(size=4)}
     whole = run(tmp_path / "whole", **given)
@@ -111,6 +113,7 @@ def test_what_is_learnt_depends_on_them_and_the_manifest_tells_of_them(tmp_path)
         run(tmp_path / "b", resume=True, demonstrations=arrays(29), **given)
 
 
+@pytest.mark.slow
 def test_the_replay_of_a_run_is_taken_and_a_fork_keeps_what_its_run_began_with(tmp_path):
     first = run(tmp_path / "first", SAC(**SMALL), 100, task=IdEncoded)
     replay = csac.load_checkpoint(first).replay()
@@ -189,6 +192,7 @@ def test_a_bad_file_is_one_line_on_the_command_line(tmp_path, monkeypatch, capsy
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_the_example_of_the_documentation_runs(tmp_path, capsys):
     example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "demonstrations.py"))
     example["main"](tmp_path / "run", 40, 1)

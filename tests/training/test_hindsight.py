@@ -159,6 +159,7 @@ def test_a_replay_has_each_step_once_and_its_copies_when_its_episode_ends(tmp_pa
         assert 0.3 < reached.mean() < 0.9  # two goals in three are of the same or a later step
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"environments": 4}], ids=["one", "four"])
 def test_a_crash_in_mid_episode_changes_no_byte(tmp_path, settings):
     given: dict[str, Any] = {"algorithm": SAC(**SMALL), "task": Walk, "steps": 320, "hindsight": 3, **settings}
@@ -175,6 +176,7 @@ def test_a_crash_in_mid_episode_changes_no_byte(tmp_path, settings):
         run(tmp_path / "fork", start_from=whole.path, **given | {"hindsight": 0, "steps": 400})
 
 
+@pytest.mark.slow
 def test_an_episode_that_restarts_is_left_out(tmp_path):
     class Forgetful(Walk):
         get_snapshot = None  # pyright: ignore[reportAssignmentType]

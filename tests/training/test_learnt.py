@@ -73,6 +73,7 @@ def test_q_values_are_what_the_critics_of_the_state_say(sac):
         np.testing.assert_array_equal(left.bias, layer.bias)
 
 
+@pytest.mark.slow
 def test_critics_that_are_normalised_over_batches_are_asked_by_the_replay(tmp_path):
     learnt = csac.load_checkpoint(run(tmp_path / "set", ADAPTIVE, 100, task=IdEncoded))
     replay, state = learnt.replay(), learnt.state
@@ -89,6 +90,7 @@ def test_critics_that_are_normalised_over_batches_are_asked_by_the_replay(tmp_pa
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_pairs_of_sd3_have_a_critic_each_and_ppo_has_none(tmp_path):
     learnt = csac.load_checkpoint(run(tmp_path / "sd3", SD3(noise_samples=2, **SMALL), 60, task=IdEncoded))
     assert learnt.q_values(np.zeros((5, 4)), np.zeros((5, 1))).shape == (5, 2)

@@ -78,6 +78,7 @@ def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "csac", *words], cwd=folder, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(MODULES))
 def test_one_is_trained_killed_resumed_evaluated_and_exported(tmp_path, own, name):
     algorithm = getattr(own, name)
@@ -107,6 +108,7 @@ def test_its_loss_is_that_of_sac_and_what_the_action_costs(own):
     assert float(difference) == pytest.approx(float(effort), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_seeds_train_in_processes_and_from_the_command_line(tmp_path, own):
     seeds = ["--seeds", "2", "--directory", str(tmp_path / "typed")]
     done = command(own.folder, "train", "Hopper-v4", "--algorithm", "calm:CalmSAC", *OPTIONS, *seeds)
