@@ -84,7 +84,7 @@ class SeedEnvironments:
         self._workers: Workers | None = None
         if processes:
             shares = [len(share) for share in np.array_split(self._places, processes)]
-            self._workers = Workers(task, environment_arguments, shares, seeds[0])
+            self._workers = Workers(task, environment_arguments, shares, seeds[0], events)
         self.environments: list[Any] = (
             self._workers.environments
             if self._workers

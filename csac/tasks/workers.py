@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
 from functools import partial
 from multiprocessing.connection import Connection
@@ -14,7 +14,7 @@ import numpy as np
 
 from csac.processes import Child, die_with_parent, end, outlive_termination
 from csac.tasks.environment import Environment
-from csac.tasks.events import numbers_in
+from csac.tasks.events import info_name, numbers_in
 from csac.tasks.failures import EnvironmentFailure
 from csac.tasks.preflight import seed_globals
 from csac.tasks.registry import Task
@@ -28,15 +28,24 @@ STEPS_TRIED = 10
 class Workers:
     """Processes with so many environments each, and an `Environment` here for each of those.
 
+    Of a step's `info` only the numbers that `events` are of come back.
+
     Raises:
         InputError: as `Environment`, or where a script without a guard starts processes.
     """
 
-    def __init__(self, task: Task, environment_arguments: dict[str, Any] | None, numbers: list[int], seed: int) -> None:
+    def __init__(
+        self,
+        task: Task,
+        environment_arguments: dict[str, Any] | None,
+        numbers: list[int],
+        seed: int,
+        events: Sequence[str] = (),
+    ) -> None:
         self._workers: list[Worker] = []
         try:
             for index, number in enumerate(numbers):
-                self._workers.append(Worker(task, environment_arguments, number, seed + index))
+                self._workers.append(Worker(task, environment_arguments, number, seed + index, events))
             facts = [worker.answer() for worker in self._workers]
         except BaseException:
             self.close()
@@ -89,8 +98,15 @@ class RemoteEnvironment:
 class Worker(Child):
     """The parent's end of a process that steps environments."""
 
-    def __init__(self, task: Task, environment_arguments: dict[str, Any] | None, number: int, seed: int) -> None:
-        super().__init__(_serve, task, environment_arguments, number, seed, daemon=False)
+    def __init__(
+        self,
+        task: Task,
+        environment_arguments: dict[str, Any] | None,
+        number: int,
+        seed: int,
+        events: Sequence[str],
+    ) -> None:
+        super().__init__(_serve, task, environment_arguments, number, seed, events, daemon=False)
 
     def answer(self) -> Any:
         """Return the next answer, or raise what was raised there; EnvironmentFailure where the process is gone."""
@@ -104,13 +120,19 @@ class Worker(Child):
 
 
 def _serve(
-    connection: Connection, task: Task, environment_arguments: dict[str, Any] | None, number: int, seed: int
+    connection: Connection,
+    task: Task,
+    environment_arguments: dict[str, Any] | None,
+    number: int,
+    seed: int,
+    events: Sequence[str],
 ) -> None:
     """Do what environments are asked, until there is no more or the parent is gone."""
     die_with_parent()
     outlive_termination()
     seed_globals(seed)
     environments: list[Environment] = []
+    names = {info_name(event) for event in events}
     with ExitStack() as stack, suppress(EOFError, OSError):
 
         def make() -> tuple[Any, ...]:
@@ -119,18 +141,19 @@ def _serve(
                 stack.callback(environments[-1].close)
             return environments[0].spec, environments[0].contract_parts, environments[0].task_name
 
-        connection.send(_outcome(make))
+        connection.send(_outcome(names, make))
         while asked := connection.recv():
             place, method, arguments = asked
-            connection.send(_outcome(getattr(environments[place], method), *arguments))
+            connection.send(_outcome(names, getattr(environments[place], method), *arguments))
 
 
-def _outcome(function: Any, *arguments: Any) -> tuple[Any, Exception | None, str]:
+def _outcome(names: set[str], function: Any, *arguments: Any) -> tuple[Any, Exception | None, str]:
     """Return what a call returns, or raises, with the traceback of its cause."""
     try:
         result = function(*arguments)
         if function.__name__ == "step_environment_scale":
-            result = (*result[:-1], numbers_in(result[-1]))  # its info may hold what cannot be sent
+            told = {name: result[-1][name] for name in names & result[-1].keys()}
+            result = (*result[:-1], numbers_in(told))  # its info may hold what cannot be sent
         return result, None, ""
     except Exception as error:
         return None, error, "".join(traceback.format_exception(error)) if error.__cause__ else ""
