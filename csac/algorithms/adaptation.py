@@ -70,9 +70,9 @@ def adapt_weight(
     return LearntWeight(log_weight, state)
 
 
-def entropy_target(given: float | None, dimensions: int) -> float:
-    """Return the entropy to aim at, in nats: what is given, or SAC's minus the number of action dimensions."""
-    return -float(dimensions) if given is None else given
+def entropy_target(given: float | None, per_dimension: float, dimensions: int) -> float:
+    """Return the entropy to aim at, in nats: what is given, or so much for each action dimension (SAC: -1)."""
+    return per_dimension * dimensions if given is None else given
 
 
 def make_weights(given: Weights, optimiser: optax.GradientTransformation) -> LearntWeights | None:

@@ -59,7 +59,9 @@ class CSAC(TwinCritics):
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on log π and on the relative entropy of an action in the critic's target, in nats; 0 is no bound."""
     target_entropy: float | None = None
-    """Entropy that `auto` aims at, in nats; by default minus the number of action dimensions."""
+    """Entropy that `auto` aims at, in nats; None is `target_entropy_per_dimension`."""
+    target_entropy_per_dimension: float = -1.0
+    """Entropy that `auto` aims at, in nats per action dimension."""
     target_relative_entropy: Annotated[float, POSITIVE] = 0.01
     """Relative entropy per refresh that `auto` aims at, in nats per action dimension; less for `average`."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
@@ -103,7 +105,7 @@ class CSAC(TwinCritics):
         state = state._replace(reference=reference, observation_statistics=statistics)
         # Lines 16 to 19: a' ~ π(·|s'), then y(s, a, s'), then a step down Σᵢ [Qᵢ(s, a) - y]²
         critic_target = partial(self.critic_target, actor=state.actor, reference=reference, weights=weights)
-        adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
+        adam, next_action = self.critic_optimiser(), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
         # Line 21: a step down J(φ)
         given = (folded_critics, batch.observation, actor_noise, step)
@@ -182,7 +184,7 @@ class CSAC(TwinCritics):
 
     def update_weights(self, state: State, metrics: Metrics, dimensions: int, step: Count) -> LearntWeights | None:
         """Return the learnt weights after one step: σ follows the entropy, τ the relative entropy before a refresh."""
-        target = adaptation.entropy_target(self.target_entropy, dimensions)
+        target = adaptation.entropy_target(self.target_entropy, self.target_entropy_per_dimension, dimensions)
         targets = Weights(target, self.target_relative_entropy * dimensions)
         until_refresh = self.reference_period - step % self.reference_period
         is_last = self.reference_policy == "average" or until_refresh <= self.policy_delay

@@ -12,13 +12,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from csac.algorithms.shapes import Count, Key
+from csac.algorithms.statistics import ReturnScale
 from csac.types import Transition
 
 if TYPE_CHECKING:
     from csac.types import Spec
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["rows"], meta_fields=["n_steps", "discount"])
+@partial(jax.tree_util.register_dataclass, data_fields=["rows", "returns"], meta_fields=["n_steps", "discount"])
 @dataclass(frozen=True)
 class Replay:
     """A ring of transitions, each packed into one row, so that a step is one write and a batch is one gather.
@@ -30,12 +31,23 @@ class Replay:
     rows: Float[Array, "capacity 2*observation+action+3"]
     n_steps: int = 1
     discount: float = 1.0
+    returns: ReturnScale | None = None  # what rewards are divided by when they are drawn
 
     @classmethod
-    def create(cls, capacity: int, spec: Spec, together: int = 1, *, n_steps: int = 1, discount: float = 1.0) -> Replay:
+    def create(
+        cls,
+        capacity: int,
+        spec: Spec,
+        together: int = 1,
+        *,
+        n_steps: int = 1,
+        discount: float = 1.0,
+        scale_rewards: bool = False,
+    ) -> Replay:
         """Return an empty ring for rows that are added `together` at a time; it holds a multiple of these."""
         capacity = -(-capacity // together) * together
-        return cls(jnp.zeros((capacity, row_width(spec)), jnp.float32), n_steps, discount)
+        returns = ReturnScale.create(spec.environments) if scale_rewards else None
+        return cls(jnp.zeros((capacity, row_width(spec)), jnp.float32), n_steps, discount, returns)
 
     def add(self, rows: Float[Array, "n width"], count: Count) -> Replay:
         """Return the ring with packed rows [n, width] written over the oldest; `count` rows were added before them.
@@ -52,10 +64,18 @@ class Replay:
         places = jnp.where(is_written, (count + places) % capacity, capacity)  # what lies beyond is dropped
         return replace(self, rows=self.rows.at[places].set(rows, mode="drop"))
 
+    def measure(self, rows: Float[Array, "n width"], spec: Spec) -> Replay:
+        """Return the ring that has seen the rewards of these packed rows of the newest steps, in order."""
+        if self.returns is None:
+            return self
+        steps = jax.vmap(unpack, in_axes=(0, None))(rows, spec)
+        return replace(self, returns=self.returns.absorb(steps, self.discount))
+
     def draw(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
         """Return a batch drawn uniformly with replacement from the `count` rows added, or the newest `capacity`."""
         indices = jax.random.randint(key, (batch_size,), 0, jnp.minimum(count, self.rows.shape[0]))
-        return self.at(indices, count, spec)
+        batch = self.at(indices, count, spec)
+        return batch if self.returns is None else batch._replace(reward=batch.reward / self.returns.statistics.std)
 
     def at(self, indices: Int[Array, " batch"], count: Count, spec: Spec) -> Transition:
         """Return the transitions that begin in these rows, none of which goes on beyond the newest of `count` rows."""
@@ -95,6 +115,10 @@ class Rollout(NamedTuple):
     def create(cls, steps: int, spec: Spec) -> Rollout:
         """Return a rollout yet to be made."""
         return cls(jnp.zeros((steps, row_width(spec)), jnp.float32))
+
+    def measure(self, rows: Float[Array, "n width"], spec: Spec) -> Rollout:
+        """Return the rollout as it is."""
+        return self
 
     def add(self, rows: Float[Array, "n width"], count: Count) -> Rollout:
         """Return the rollout that consists of these packed rows [steps, width]."""

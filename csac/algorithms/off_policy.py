@@ -35,6 +35,7 @@ from csac.algorithms.networks import (
     make_mlp,
     make_optimiser,
     plain_layers,
+    unit_columns,
 )
 from csac.algorithms.shapes import Action, Count, Key, Scalar
 from csac.algorithms.statistics import Statistics, normaliser_of
@@ -56,6 +57,8 @@ class OffPolicy(Architecture):
     """Soft update rate of the target networks (rho of CSAC's paper, tau of the others')."""
     n_steps: Annotated[int, COUNT] = 1
     """Environment steps whose rewards a critic's target sums before it counts on the critics."""
+    normalise_rewards: bool = False
+    """Whether rewards are divided, when they are drawn, by the running standard deviation of the discounted return."""
     actor_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the actor."""
     critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
@@ -116,6 +119,7 @@ class OffPolicy(Architecture):
         """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
         together = self.cadence.side_by_side(spec.environments).update_interval
         returns: dict[str, Any] = {"n_steps": self.n_steps, "discount": self.discount}
+        returns["scale_rewards"] = self.normalise_rewards
         return Replay.create(min(self.replay_size, steps), spec, together, **returns)
 
     def discount_after(self, transition: Transition) -> Scalar:
@@ -147,6 +151,8 @@ class TwinCritics(OffPolicy):
     """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
     """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
+    critic_unit_weights: bool = False
+    """Whether each column of the critics' hidden weights has unit length after every update (XQC, SimbaV2)."""
     policy_delay: Annotated[int, COUNT] = 1
     """Critic updates per update of the actor and of learnt weights (TD3's d)."""
 
@@ -154,6 +160,11 @@ class TwinCritics(OffPolicy):
         super().__post_init__()
         if self.critic_normalisation == "batch" and self.batch_size == 1:
             raise InputError("critic_normalisation batch needs a batch_size of at least 2")
+
+    def critic_optimiser(self, planned: int = 1) -> optax.GradientTransformation:
+        """Return what moves the critics: the networks' Adam, and unit weights where these are asked for."""
+        adam = self.optimiser(self.critic_learning_rate, planned)
+        return optax.chain(adam, unit_columns()) if self.critic_unit_weights else adam
 
     def first_networks(self, key: Key, spec: Spec, steps: int, actor_outputs: int) -> dict[str, Any]:
         """Return the fields of a first state that the three share: random networks, targets that are copies."""
@@ -170,7 +181,7 @@ class TwinCritics(OffPolicy):
             "critics": critics,
             "target_critics": copy_tree(critics) if self.critic_normalisation == "none" else None,
             "actor_optimiser": init_optimiser(actor_adam, actor),
-            "critic_optimiser": init_optimiser(self.optimiser(self.critic_learning_rate, planned), critics),
+            "critic_optimiser": init_optimiser(self.critic_optimiser(planned), critics),
             "observation_statistics": Statistics.create((spec.observation_size,))
             if self.normalise_observations
             else None,

@@ -42,7 +42,9 @@ class SAC(TwinCritics):
     initial_entropy_weight: Annotated[float, POSITIVE] = 1.0
     """What a weight of `auto` begins with."""
     target_entropy: float | None = None
-    """Entropy that `auto` aims at, in nats; by default minus the number of action dimensions."""
+    """Entropy that `auto` aims at, in nats; None is `target_entropy_per_dimension`."""
+    target_entropy_per_dimension: float = -1.0
+    """Entropy that `auto` aims at, in nats per action dimension."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of a weight of `auto`."""
 
@@ -75,7 +77,7 @@ class SAC(TwinCritics):
         temperature = jnp.exp(state.temperature.log_weight)
 
         critic_target = partial(self.critic_target, actor=state.actor, temperature=temperature)
-        adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
+        adam, next_action = self.critic_optimiser(), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
 
         given = (folded_critics, batch.observation, actor_noise)
@@ -92,7 +94,7 @@ class SAC(TwinCritics):
         adam = self.optimiser(self.actor_learning_rate)
         actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)
         if self.entropy_weight == "auto":
-            target = entropy_target(self.target_entropy, noise.shape[-1])
+            target = entropy_target(self.target_entropy, self.target_entropy_per_dimension, noise.shape[-1])
             adam = make_optimiser(self.weight_learning_rate)
             temperature = adapt_weight(temperature, metrics["entropy"], adam, target)
         return state._replace(actor=actor, actor_optimiser=optimiser, temperature=temperature), metrics

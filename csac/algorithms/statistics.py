@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from csac.algorithms.returns import discounted_returns
 from csac.algorithms.shapes import Observation, Scalar
 from csac.types import Normaliser, Transition
 
@@ -40,6 +41,24 @@ class Statistics(NamedTuple):
         within = shares[0] * self.variance + shares[1] * jnp.var(differences, axis=0)
         variance = within + shares[0] * shares[1] * shift**2
         return Statistics(count, self.mean + shares[1] * shift, variance, jnp.sqrt(variance + EPSILON))
+
+
+class ReturnScale(NamedTuple):
+    """Statistics of the discounted return so far in each episode, R_t = r_t + γ R_{t-1}: the scale of rewards."""
+
+    statistics: Statistics  # []
+    running: Float[Array, " environment"]  # R of the newest step of each environment
+
+    @classmethod
+    def create(cls, environments: int) -> ReturnScale:
+        """Return the scale of nothing, 1."""
+        return cls(Statistics.create(()), jnp.zeros(environments))
+
+    def absorb(self, steps: Transition, discount: float) -> ReturnScale:
+        """Return the scale after these steps [time * environment] as well, in order."""
+        in_time = jax.tree.map(lambda leaf: leaf.reshape(-1, *self.running.shape, *leaf.shape[1:]), steps)
+        returns, running = discounted_returns(self.running, in_time, discount)
+        return ReturnScale(self.statistics.absorb(returns.ravel()), running)
 
 
 def normalise(statistics: Statistics | None, observation: Observation, limit: float = LIMIT) -> Observation:

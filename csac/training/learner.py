@@ -149,8 +149,10 @@ class Learner:
 
     def save(self, index: int) -> Snapshot:
         """Return what the seed at this place needs to go on, but for its memory."""
-        own = self._of_seed(self._carry._replace(memory=None), index)  # a GPU's would be copied to the host
-        arrays = {name: np.array(leaf) for name, leaf in by_name(_lasting(own)).items()}
+        lasting = _lasting(self._carry)  # without the rows: a GPU's would be copied to the host
+        own = self._axis.of(jax.tree.map(np.asarray, lasting), index)
+        own["state"] = self._one.packing.unpack(own["state"])
+        arrays = {name: np.array(leaf) for name, leaf in by_name(own).items()}
         values = {"updates_summed": self._updates_summed, "metrics": list(self._one.metrics)}
         return Snapshot({**arrays, "waiting": self._waiting[index].copy()}, values)
 
@@ -168,16 +170,17 @@ class Learner:
         for seed in saved:
             if problem := incompatibility(self.algorithm, self.spec, self._steps, seed):
                 raise InputError(f"the checkpoint does not fit: {problem}: go on with the csac that wrote it")
-        memory = self._carry.memory
+        memory, lasting = self._carry.memory, _lasting(self._carry._replace(state=self._one.state))
         rows, kind = np.zeros(memory.rows.shape, memory.rows.dtype), jax.tree.structure(memory)
         memory = None  # a replay may fill half of what memory there is: never three at a time
         self._carry = self._carry._replace(memory=memory)
         for index, fill in enumerate(memories):
             fill(self._axis.of(rows, index))
-        memory = jax.tree.unflatten(kind, [jax.device_put(rows, may_alias=False)])  # what is aliased cannot be donated
-        lasting = _lasting(self._carry._replace(state=self._one.state))
         leaves = [jnp.array(self._axis.stack([seed.arrays[name] for seed in saved])) for name in by_name(lasting)]
-        taken = Carry(memory=memory, **jax.tree.unflatten(jax.tree.structure(lasting), leaves))
+        own = jax.tree.unflatten(jax.tree.structure(lasting), leaves)
+        device_rows = jax.device_put(rows, may_alias=False)  # what is aliased cannot be donated
+        memory = jax.tree.unflatten(kind, [device_rows, *jax.tree.leaves(own.pop("returns"))])
+        taken = Carry(memory=memory, **own)
         self._updates_summed = int(saved[0].values["updates_summed"])
         # With other options an algorithm may tell of other metrics: then their means begin anew.
         tells, sums = list(self._one.metrics), jnp.zeros_like(self._carry.sums)
@@ -214,7 +217,8 @@ class Learner:
 def incompatibility(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str | None:
     """Say what keeps an algorithm from going on from what `Learner.save` returned, or return None."""
     state = jax.eval_shape(lambda key: algorithm.init(key, spec, steps), KEY_DATA)
-    for name, leaf in by_name({"state": state}).items():
+    memory = jax.eval_shape(lambda: algorithm.memory(spec, steps))
+    for name, leaf in by_name({"state": state, "returns": getattr(memory, "returns", None)}).items():
         given = saved.arrays.get(name)
         if given is None or given.shape != leaf.shape or given.dtype != leaf.dtype:
             found = "no such array" if given is None else f"{given.dtype} {given.shape}"
@@ -230,5 +234,6 @@ def incompatibility(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapsho
 
 
 def _lasting(carry: Carry) -> dict[str, Any]:
-    """Return what a checkpoint has of a carry; memories are saved apart."""
-    return {"state": carry.state, "sums": carry.sums, "key": carry.key, "extra": carry.extra}
+    """Return what a checkpoint has of a carry; the rows of memories are saved apart."""
+    returns = getattr(carry.memory, "returns", None)
+    return {"state": carry.state, "sums": carry.sums, "key": carry.key, "extra": carry.extra, "returns": returns}

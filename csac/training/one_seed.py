@@ -113,13 +113,12 @@ class OneSeed:
         memory = carry.memory.extend(rows, number, step + carry.extra)
         return carry._replace(memory=memory, extra=carry.extra + number)
 
-    @staticmethod
-    def _remember(carry: Carry, rows: jax.Array, step: jax.Array) -> Carry:
+    def _remember(self, carry: Carry, rows: jax.Array, step: jax.Array) -> Carry:
         """Add the packed transitions [n, width] of the steps up to this one."""
-        count = step - len(rows)
+        memory, count = carry.memory.measure(rows, self.spec), step - len(rows)
         if carry.extra is None:
-            return carry._replace(memory=carry.memory.add(rows, count))
-        return carry._replace(memory=carry.memory.extend(rows, len(rows), count + carry.extra))
+            return carry._replace(memory=memory.add(rows, count))
+        return carry._replace(memory=memory.extend(rows, len(rows), count + carry.extra))
 
     def _first_metrics(self, state: Any, memory: Any, key_data: jax.Array) -> dict[str, jax.Array]:
         key = jax.random.wrap_key_data(key_data)
