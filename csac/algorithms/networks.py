@@ -146,7 +146,10 @@ def unit_columns() -> optax.GradientTransformation:
 
     def unit(network: MLP) -> MLP:
         *hidden, last = network.layers
-        layers = (layer._replace(weight=layer.weight / jnp.linalg.norm(layer.weight, axis=0)) for layer in hidden)
+        layers = (
+            layer._replace(weight=layer.weight / jnp.linalg.norm(layer.weight, axis=0, keepdims=True))
+            for layer in hidden
+        )
         return MLP((*layers, last), network.activation)
 
     def update(steps: Any, parameters: Any = None) -> Any:

@@ -1,0 +1,54 @@
+"""What brings rewards and the critics' weights to a common scale, by hand."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from equations import batch_of, transition
+
+from csac.algorithms.adaptation import entropy_target
+from csac.algorithms.memory import Replay, pack
+from csac.algorithms.networks import make_mlp, unit_columns
+from csac.algorithms.statistics import ReturnScale
+from csac.types import Spec
+
+END = {"terminated": 1.0}
+
+
+def test_rewards_are_divided_by_the_spread_of_the_returns_of_each_environment():
+    # Two environments, one step of each after the other, discount 1/2. The first earns 2, then 3: its returns are 2 and
+    # 3 + 2/2 = 4. The second earns 4, ends, and earns 2: its returns are 4 and 2. Mean 3, variance 1.
+    spec, steps = Spec(1, 1, 2), [(2.0, {}), (4.0, END), (3.0, {}), (2.0, {})]
+    ring = Replay.create(4, spec, 2, discount=0.5, scale_rewards=True)
+    for turn in (0, 2):
+        rows = pack(batch_of(*(transition(reward=reward, **ended) for reward, ended in steps[turn : turn + 2])))
+        ring = ring.measure(jnp.asarray(rows), spec).add(jnp.asarray(rows), jnp.int32(turn))
+    assert ring.returns is not None
+    np.testing.assert_allclose([ring.returns.statistics.mean, ring.returns.statistics.variance], [3.0, 1.0])
+    np.testing.assert_allclose(ring.returns.running, [4.0, 2.0])
+    scaled = ring.returns._replace(statistics=ring.returns.statistics._replace(std=jnp.float32(4.0)))
+    drawn = Replay(ring.rows, returns=scaled).draw(jax.random.key(0), jnp.int32(4), 64, spec)
+    assert set(np.asarray(drawn.reward).tolist()) == {0.5, 0.75, 1.0}
+
+
+def test_a_scale_that_has_seen_nothing_is_1():
+    assert ReturnScale.create(1).statistics.std == 1.0
+
+
+def test_hidden_columns_have_unit_length_after_a_step_and_the_last_layer_is_free():
+    networks = make_mlp(jax.random.key(0), 3, (5, 4), 1), make_mlp(jax.random.key(1), 3, (5, 4), 1)
+    optimiser = optax.chain(optax.sgd(0.1), unit_columns())
+    steps, _ = optimiser.update(jax.tree.map(jnp.ones_like, networks), optimiser.init(networks), networks)
+    for before, after in zip(networks, optax.apply_updates(networks, steps), strict=True):
+        for old, new in zip(before.layers[:-1], after.layers[:-1], strict=True):
+            moved = old.weight - 0.1
+            np.testing.assert_allclose(new.weight, moved / np.linalg.norm(moved, axis=0), rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(new.bias, old.bias - 0.1, rtol=1e-6)
+        np.testing.assert_allclose(after.layers[-1].weight, before.layers[-1].weight - 0.1, rtol=1e-5, atol=1e-6)
+
+
+def test_the_entropy_to_aim_at_counts_action_dimensions_unless_it_is_given():
+    assert entropy_target(None, -0.5, 6) == -3.0
+    assert entropy_target(-2.0, -0.5, 6) == -2.0
