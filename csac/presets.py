@@ -39,6 +39,7 @@ _PAPER_COMMON: Mapping[str, Any] = MappingProxyType(
         "update_interval": 1,
         "max_gradient_norm": 0.0,
         "n_steps": 1,
+        "normalise_rewards": False,
         "learning_rate_schedule": "constant",
         "exploration_noise": "white",
         "activation": "relu",
@@ -116,6 +117,7 @@ _FASTER_CRITICS: Mapping[str, Any] = MappingProxyType(
     {
         **_PAPER_COMMON,
         "critic_normalisation": "batch",
+        "critic_unit_weights": False,
         "normalise_observations": True,
         "critic_learning_rate": 1e-3,
         "actor_learning_rate": 1e-3,
@@ -123,6 +125,7 @@ _FASTER_CRITICS: Mapping[str, Any] = MappingProxyType(
         "adam_momentum": 0.5,
         "entropy_weight": "auto",
         "target_entropy": None,
+        "target_entropy_per_dimension": -1.0,
         "weight_learning_rate": 3e-4,
     }
 )

@@ -43,8 +43,10 @@ def test_hidden_columns_have_unit_length_after_a_step_and_the_last_layer_is_free
     steps, _ = optimiser.update(jax.tree.map(jnp.ones_like, networks), optimiser.init(networks), networks)
     for before, after in zip(networks, optax.apply_updates(networks, steps), strict=True):
         for old, new in zip(before.layers[:-1], after.layers[:-1], strict=True):
-            moved = old.weight - 0.1
-            np.testing.assert_allclose(new.weight, moved / np.linalg.norm(moved, axis=0), rtol=1e-5, atol=1e-6)
+            moved = np.asarray(old.weight) - 0.1
+            np.testing.assert_allclose(
+                new.weight, moved / np.linalg.norm(moved, axis=0, keepdims=True), rtol=1e-5, atol=1e-6
+            )
             np.testing.assert_allclose(new.bias, old.bias - 0.1, rtol=1e-6)
         np.testing.assert_allclose(after.layers[-1].weight, before.layers[-1].weight - 0.1, rtol=1e-5, atol=1e-6)
 
