@@ -59,12 +59,14 @@ class Reporter:
         self._live: Live | None = None
         self._seeds: dict[int, _Seed] = {}
         self._steps = self._shown = 0  # steps of a run; the newest evaluation that a line has told of
+        self._warmup = 0.0  # steps before the first update, which say nothing of how long the others take
         self._began = self._spoke = clock()
 
     def start(self, runs: RunSet, notes: Sequence[str] = ()) -> None:
         """Say what is trained and where it goes, and where each seed goes on."""
         config = runs.config
         self._steps, self._seeds = config.steps, {run.seed: _Seed(run) for run in runs.runs}
+        self._warmup = config.hyperparameters.get("warmup_steps", 0)
         self._shown = self._passed()
         self._began = self._spoke = self._clock()
         title = Text.assemble((f"{config.algorithm} on {config.task}", "bold"))
@@ -80,6 +82,8 @@ class Reporter:
         """Note how far some seeds are."""
         for seed, step in steps.items():
             self._seeds[seed].step = max(step, self._seeds[seed].step) if step > self._seeds[seed].begin else step
+        if self._is_warming():
+            self._speed = Speed(self._clock)
         self._speed.add(sum(one.step for one in self._seeds.values()))
         if not self._live and self._clock() - self._spoke >= SECONDS_OF_SILENCE:
             self._print(Text(f"step {self._range()} of {self._steps:,}{self._pace()}{self._news()}"))
@@ -140,6 +144,9 @@ class Reporter:
         newest = [max(one.returns, default=0) for one in self._living().values()]
         return min(newest, default=0)
 
+    def _is_warming(self) -> bool:
+        return any(one.step < min(self._warmup, self._steps) for one in self._living().values())
+
     def _range(self) -> str:
         steps = [one.step for one in (self._living() or self._seeds).values()]
         return f"{min(steps):,}" + (f" to {max(steps):,}" if max(steps) > min(steps) else "")
@@ -160,6 +167,8 @@ class Reporter:
         left = sum(self._steps - one.step for one in living)
         if living and not left:
             return ", finishing"
+        if self._is_warming():
+            return f", {self._warmup:,} random steps before learning"
         speed = self._speed.per_second()
         unit = "steps/s" if len(self._seeds) == 1 else "seed-steps/s"
         return f", {speed:,.0f} {unit}, {duration(left / speed)} left" if speed else ""

@@ -50,6 +50,7 @@ class Learnt:
         shapes = jax.eval_shape(lambda key: self.algorithm.init(key, spec, steps), KEY_DATA)
         leaves = [learner.arrays[f"state.{name}"] for name in by_name(shapes)]
         self.state: Any = jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+        self._reward_scale = learner.arrays.get("returns.statistics.std", np.float32(1.0))
 
     def replay(self) -> dict[str, np.ndarray]:
         """Return the transitions in the memory, from the oldest on, as arrays.
@@ -69,7 +70,7 @@ class Learnt:
         }
 
     def q_values(self, observations: Any, actions: np.ndarray) -> np.ndarray:
-        """Return each critic's Q(s, a), [critic] or for batches [n, critic].
+        """Return each critic's Q(s, a), [critic] or for batches [n, critic], in the task's own rewards.
 
         Observations are the task's own, actions on the environment's scale.
 
@@ -85,6 +86,7 @@ class Learnt:
             return [q_value(critic, normalise(statistics, observation), action) for critic in critics]
 
         values = np.stack(jax.vmap(of_one)(jax.numpy.asarray(flat), jax.numpy.asarray(inner, np.float32)), axis=-1)
+        values = values * self._reward_scale
         return values if self._contract.flatten(observations).ndim == 2 else values[0]
 
     def _critics(self) -> tuple[list[Any], Any]:

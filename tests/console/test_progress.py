@@ -70,6 +70,20 @@ def test_until_the_first_step_of_its_own_a_run_compiles(plain, terminal, clock, 
     assert lines(plain)[-1] == "step 500 to 520 of 1,000"
 
 
+def test_the_quick_steps_of_the_warm_up_say_nothing_of_the_time_left(plain, clock, watch):
+    reporter = watch(plain, hyperparameters={"warmup_steps": 300})
+    for step in (100, 250):
+        clock.now += 1
+        reporter.progress({0: step, 1: step})
+    reporter.evaluated(250, {0: 1.0, 1: 1.0})
+    assert lines(plain)[-1].endswith(", 300 random steps before learning")
+    for step in (300, 400):
+        clock.now += 10
+        reporter.progress({0: step, 1: step})
+    reporter.evaluated(400, {0: 1.0, 1: 1.0})
+    assert lines(plain)[-1].endswith(", 15 seed-steps/s, 1 min 20 s left")
+
+
 def test_nothing_is_left_at_the_last_step(plain, terminal, clock, watch):
     for console in (plain, terminal):
         reporter = watch(console, steps=3000)
