@@ -158,7 +158,6 @@ class Tune(_Training):
     """The first seed; the others are numbered from it. Report results on other seeds."""
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/tune/TASK/ALGORITHM)")] = None
     """The directory of the search: new, empty, or of the same search."""
-    environments: Suppress[int] = 1
     perturbations: Suppress[tuple[str, ...]] = ()
     events: Suppress[tuple[str, ...]] = ()
 

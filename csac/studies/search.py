@@ -125,7 +125,7 @@ class Search:
     space: Space
 
     def __post_init__(self) -> None:
-        first = self.algorithm.cadence.first_update
+        first = self.algorithm.cadence.side_by_side(self.config.environments).first_update
         if self.config.steps < first:
             raise InputError(f"no updates: steps ({self.config.steps:,}) < {first:,}, where the first one comes")
 

@@ -83,7 +83,8 @@ class StudyRun(NamedTuple):
     def name(self) -> str:
         """What the run is called in messages."""
         one = self.config
-        return ", ".join([f"{self.method.label} on {one.task}", *one.perturbations, f"seed {one.seed}"])
+        several = [f"{one.environments} environments"] * (one.environments > 1)
+        return ", ".join([f"{self.method.label} on {one.task}", *one.perturbations, *several, f"seed {one.seed}"])
 
     def open(self, directory: Path) -> RunDirectory | None:
         """Return the run if it has begun. Raises InputError where what is there has another configuration."""
@@ -115,6 +116,8 @@ class Study:
     steps: int = 1_000_000
     steps_on: dict[str, int] = field(default_factory=dict)
     """Tasks on which it is another number of steps."""
+    environments: int = 1
+    """Environments that each seed steps side by side."""
     evaluation_interval: int = 5_000
     evaluation_episodes: int = 10
     conditions: tuple[tuple[str, ...], ...] = ((),)
@@ -156,7 +159,9 @@ class Study:
     def steps_for(self, task: str) -> int:
         """Return the steps of a run on this task, shortened."""
         steps = self.steps_on.get(task, self.steps)
-        return steps if self.scale == 1 else max(1, round(steps * self.scale))
+        if self.scale == 1:
+            return steps
+        return max(1, round(steps * self.scale / self.environments)) * self.environments
 
     def runs(self) -> list[StudyRun]:
         """Return every run, seed by seed, so that an unfinished study compares all methods on fewer seeds.
@@ -192,6 +197,7 @@ class Study:
             hyperparameters=dataclasses.asdict(algorithm),  # pyright: ignore[reportArgumentType]
             seed=seed,
             steps=steps,
+            environments=self.environments,
             device=self.device,
             evaluation_interval=interval,
             evaluation_episodes=self.evaluation_episodes,

@@ -74,6 +74,17 @@ def test_more_steps_later_go_on(tmp_path, supervised):
     assert RunDirectory.open(tmp_path / run.folder).config.steps == 2_000
 
 
+def test_a_study_of_several_environments_records_and_shows_them(tmp_path, supervised, capsys):
+    path = tmp_path / "several.toml"
+    path.write_text(f"environments = 4\n{TINY}")
+    words = [str(path), "--scale", "0.33", "--directory", str(tmp_path / "runs")]
+    assert main(["study", "run", *words]) == 0
+    config = RunDirectory.open(supervised[0][0][0].directories[0]).config
+    assert (config.environments, config.steps) == (4, 328)
+    assert main(["study", "show", *words]) == 0
+    assert "sac on Pendulum-v1, 4 environments, seed 0" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("change", [{"evaluation_interval": 300}, {"steps": 500}])
 def test_runs_of_another_study_are_refused(tmp_path, supervised, change):
     (run, *_) = tiny_study(tmp_path).runs()

@@ -154,6 +154,13 @@ def test_trials_begin_with_what_is_given_and_the_best_is_told(tmp_path, trained,
     assert len(others) == 3
 
 
+def test_trials_may_have_several_environments(tmp_path, trained, capsys):
+    words = ["--algorithm", "sac", "--environments", "2", "--trials", "1", "--directory", str(tmp_path / "tune")]
+    assert main(["tune", "Pendulum-v1", *WORDS, *words]) == 0
+    assert [options["environments"] for _, _, options in trained.found] == [2]
+    assert "--environments 2" in capsys.readouterr().out.splitlines()[-1]
+
+
 def test_the_same_search_suggests_the_same_and_goes_on(tmp_path, trained):
     tune(search(), tmp_path / "whole", 4, None, make_console())
     whole = [algorithm.discount for algorithm, _, _ in trained.found]
