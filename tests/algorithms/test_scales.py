@@ -10,7 +10,7 @@ from equations import batch_of, transition
 
 from csac.algorithms.adaptation import entropy_target
 from csac.algorithms.memory import Replay, pack
-from csac.algorithms.networks import make_mlp, unit_columns
+from csac.algorithms.networks import gradient_step, init_optimiser, make_mlp, unit_columns
 from csac.algorithms.statistics import ReturnScale
 from csac.types import Spec
 
@@ -40,12 +40,16 @@ def test_a_scale_that_has_seen_nothing_is_1():
 def test_hidden_columns_have_unit_length_after_a_step_and_the_last_layer_is_free():
     networks = make_mlp(jax.random.key(0), 3, (5, 4), 1), make_mlp(jax.random.key(1), 3, (5, 4), 1)
     optimiser = optax.chain(optax.sgd(0.1), unit_columns())
-    steps, _ = optimiser.update(jax.tree.map(jnp.ones_like, networks), optimiser.init(networks), networks)
-    for before, after in zip(networks, optax.apply_updates(networks, steps), strict=True):
+
+    def sum_of_all(networks, _):  # its gradient is 1 everywhere
+        return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(networks)), {}
+
+    moved, _, _ = gradient_step(optimiser, sum_of_all, networks, init_optimiser(optimiser, networks), jnp.zeros(1))
+    for before, after in zip(networks, moved, strict=True):
         for old, new in zip(before.layers[:-1], after.layers[:-1], strict=True):
-            moved = np.asarray(old.weight) - 0.1
+            stepped = np.asarray(old.weight) - 0.1
             np.testing.assert_allclose(
-                new.weight, moved / np.linalg.norm(moved, axis=0, keepdims=True), rtol=1e-5, atol=1e-6
+                new.weight, stepped / np.linalg.norm(stepped, axis=0, keepdims=True), rtol=1e-5, atol=1e-6
             )
             np.testing.assert_allclose(new.bias, old.bias - 0.1, rtol=1e-6)
         np.testing.assert_allclose(after.layers[-1].weight, before.layers[-1].weight - 0.1, rtol=1e-5, atol=1e-6)
