@@ -76,7 +76,6 @@ def provenance(runs: RunSet, run: RunDirectory, policy: Policy, which: Which) ->
         "perturbations": list(config.perturbations),
         "algorithm": config.algorithm,
         "hyperparameters": config.hyperparameters,
-        "preset": manifest.preset,
         "seed": run.seed,
         "checkpoint": which,
         "steps": steps,
