@@ -78,9 +78,6 @@ class Contract:
         """Return `observation` as float32 [observation], or a batch of them as [n, observation].
 
         Takes what the environment gives (an array, or a dict of arrays), a batch of it, or what is flat already.
-
-        Raises:
-            InputError: keys or shapes that the task does not have.
         """
         if isinstance(observation, dict):
             return self._flatten_dict(observation)

@@ -53,9 +53,6 @@ class Evaluator:
         episode_limit: steps after which an episode is broken off; None for `LONGEST_EPISODE`.
         environments: how many to step side by side, ten at most; no number depends on it.
         lent: the one to play in instead, which stays open.
-
-    Raises:
-        InputError: episodes or seeds that there cannot be.
     """
 
     def __init__(
@@ -85,8 +82,7 @@ class Evaluator:
     def perturb(self, values: Mapping[str, float]) -> None:
         """Change the task from the next batch on, as `Environment.perturb`; what the task cannot be, a batch refuses.
 
-        Raises:
-            InputError: environments that are there already refuse it; then so does each batch, until it is changed.
+        Raises InputError where environments that are there refuse it; then so does each batch, until it is changed.
         """
         self.perturbed = dict(values)
         try:

@@ -37,9 +37,6 @@ class EvaluationPool:
         evaluator: what each process works with, perturbed as it is when an evaluation begins.
         processes: how many, at least one.
         cores: the processors that they may use; None for those that this process may use when it starts them.
-
-    Raises:
-        InputError: fewer than one process, or a task that cannot be sent to another process.
     """
 
     def __init__(self, evaluator: Evaluator, processes: int, cores: Sequence[int] | None = None) -> None:
