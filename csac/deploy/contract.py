@@ -109,15 +109,6 @@ class Contract:
         }
 
     @staticmethod
-    def load(path: str | Path) -> Contract:
-        """Read a contract.
-
-        Raises:
-            InputError: no such file, or one that is not a contract of this schema.
-        """
-        return Contract.of_fields(read_json(Path(path)), path)
-
-    @staticmethod
     def of_fields(fields: Any, path: str | Path) -> Contract:
         """Return the contract with these `fields`. Raises InputError, which names `path`, if they are invalid."""
         try:
