@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -168,13 +167,3 @@ def hyperparameters(preset: str, algorithm: str, task: str) -> dict[str, Any]:
     if algorithm not in algorithms:
         raise InputError(f"the preset {preset!r} has no {algorithm!r}: it has {' and '.join(algorithms)}")
     return {**algorithms[algorithm], **_TASKS.get(preset, {}).get((algorithm, task.rpartition(":")[2]), {})}
-
-
-def matching_preset(algorithm: Any, task: str, values: Mapping[str, Any]) -> str | None:
-    """Return the preset that gives an algorithm just these hyperparameters, the others as by default, or None."""
-    for preset, algorithms in _ALGORITHMS.items():
-        if algorithm.name in algorithms:
-            preset_values = hyperparameters(preset, algorithm.name, task)
-            if dataclasses.asdict(algorithm(**preset_values)) == values:
-                return preset
-    return None

@@ -189,8 +189,7 @@ class Child:
     def cause_of_death(self) -> str:
         """Wait until a process that speaks no more is gone; return how it ended, as the end of a sentence.
 
-        Raises:
-            InputError: it imported the user's script, which has no guard.
+        Raises InputError if it imported the user's script, which has no guard.
         """
         self.process.join(SECONDS_TO_END)
         code = self.process.exitcode

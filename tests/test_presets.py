@@ -165,17 +165,6 @@ def test_strong_is_of_csac_and_sac_alone():
         presets.hyperparameters("strong", "td3", "Ant-v4")
 
 
-def test_a_run_is_of_the_preset_that_all_its_hyperparameters_follow():
-    csac = ALGORITHMS["csac"]
-    values = dataclasses.asdict(csac(**presets.hyperparameters("paper", "csac", "Ant-v4")))
-    assert presets.matching_preset(csac, "Ant-v4", values) == "paper"
-    strong = dataclasses.asdict(csac(**presets.hyperparameters("strong", "csac", "Ant-v4")))
-    assert presets.matching_preset(csac, "Ant-v4", strong) == "strong"
-    assert presets.matching_preset(csac, "PyFlyt/QuadX-Waypoints-v1", values) is None  # the paper's tau is another
-    assert presets.matching_preset(csac, "Ant-v4", {**values, "reference_policy": "average"}) is None
-    assert presets.matching_preset(csac, "Ant-v4", {**values, "critic_normalisation": "batch"}) is None
-
-
 def test_a_task_that_is_no_text_is_refused():
     given: Any = None
     with pytest.raises(InputError, match=r"task is a Gymnasium id such as 'Hopper-v4', not None"):

@@ -36,9 +36,6 @@ def parse(
     """Return the parsed words; print the help and raise HelpShown where it is asked for.
 
     `elsewhere(option)` says where an option belongs that this command does not have, or nothing.
-
-    Raises:
-        InputError: tyro's complaint in one line.
     """
     rules: Any = {"prog": program, "args": words, "registry": _numbers(), "config": (DisallowNone,)}
     if {"-h", "--help"} & {*words}:
@@ -69,9 +66,6 @@ def chosen_algorithm(words: list[str], begun_with: str | None) -> tuple[str, Any
     """Return the name and the class of the algorithm: the words', else that of the runs to begin with, else CSAC.
 
     A class from elsewhere is imported where the words name it, never because a run's manifest does.
-
-    Raises:
-        InputError: there is none of that name, or nobody here has named its module.
     """
     from csac.algorithms import ALGORITHMS
 

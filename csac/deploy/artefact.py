@@ -44,11 +44,7 @@ class Artefact:
         self.fields, self.contract, self.guards, self.runner = fields, contract, guards, runner
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action, float32 [action], on the environment's scale, for a flat observation [observation].
-
-        Raises:
-            InputError: an observation of another shape.
-        """
+        """Return the action, float32 [action], on the environment's scale, for a flat observation [observation]."""
         observation = np.ascontiguousarray(observation, np.float32)
         if observation.shape != (size := (self.contract.spec.observation_size,)):
             raise InputError(f"the observation has shape {observation.shape}; the artefact takes {size}")
@@ -71,11 +67,7 @@ class Artefact:
 
 
 def write_artefact(folder: Path, policy: Policy, format: Format, guards: Guards, facts: Mapping[str, Any]) -> None:
-    """Write an artefact into an empty folder. `facts` are further fields of its contract.
-
-    Raises:
-        InputError: a package that the format needs is not installed.
-    """
+    """Write an artefact into an empty folder. `facts` are further fields of its contract."""
     fields = {
         **policy.contract.fields(),
         "observation_size": policy.contract.spec.observation_size,
@@ -99,8 +91,7 @@ def open_artefact(path: str | Path, optimise: bool = False) -> Artefact:
 
     Only csac's own code is run: a loader or a header that differs from what this csac writes is refused.
 
-    Raises:
-        InputError: no artefact there, a damaged or a foreign one, or nothing here to run it with.
+    Raises InputError for a damaged or foreign artefact, and where nothing here can run it.
     """
     check_path("the folder of an artefact", path)
     path = Path(path)

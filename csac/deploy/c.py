@@ -122,11 +122,7 @@ def compile_c(*arguments: str | Path, program: str = "cc") -> None:
 
 
 class Library:
-    """Runs a header, compiled into a shared library.
-
-    Raises:
-        InputError: the header is not what csac writes for the policy, or it cannot be compiled.
-    """
+    """Runs a header, compiled into a shared library."""
 
     def __init__(self, path: Path, policy: Policy, guards: Guards, control_rate: float | None, optimise: bool) -> None:
         text = header(policy, guards, control_rate)

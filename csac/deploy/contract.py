@@ -78,9 +78,6 @@ class Contract:
         """Return `observation` as float32 [observation], or a batch of them as [n, observation].
 
         Takes what the environment gives (an array, or a dict of arrays), a batch of it, or what is flat already.
-
-        Raises:
-            InputError: keys or shapes that the task does not have.
         """
         if isinstance(observation, dict):
             return self._flatten_dict(observation)
@@ -110,15 +107,6 @@ class Contract:
             "action_low": self.action_low.tolist(),
             "action_high": self.action_high.tolist(),
         }
-
-    @staticmethod
-    def load(path: str | Path) -> Contract:
-        """Read a contract.
-
-        Raises:
-            InputError: no such file, or one that is not a contract of this schema.
-        """
-        return Contract.of_fields(read_json(Path(path)), path)
 
     @staticmethod
     def of_fields(fields: Any, path: str | Path) -> Contract:

@@ -30,11 +30,7 @@ _KNOWN = {CONTRACT, POLICY, CARD, CURVE, "__pycache__", *FILES.values()}
 
 @contextmanager
 def placed(place: Path) -> Iterator[Path]:
-    """Yield a new folder that replaces `place` at the end, or is removed if something is raised.
-
-    Raises:
-        InputError: the place cannot be written, or holds something else than an artefact.
-    """
+    """Yield a new folder that replaces `place` at the end, or is removed if something is raised."""
     try:
         _check_place(place)
         place = Path(os.path.realpath(place))  # a link stays one
@@ -76,7 +72,6 @@ def provenance(runs: RunSet, run: RunDirectory, policy: Policy, which: Which) ->
         "perturbations": list(config.perturbations),
         "algorithm": config.algorithm,
         "hyperparameters": config.hyperparameters,
-        "preset": manifest.preset,
         "seed": run.seed,
         "checkpoint": which,
         "steps": steps,

@@ -71,9 +71,6 @@ def make_guards(contract: Contract, fallback: str | None = None, rate_limit: flo
         fallback: `zero`, `middle` of the bounds, `last` action, or numbers with commas between them, one per action.
         rate_limit: how much an action may change in a step, as a share of its range. It needs a fallback, because NaN
             cannot be limited: `last` by default.
-
-    Raises:
-        InputError: numbers that do not fit the actions.
     """
     low, high, half = contract.action_low, contract.action_high, contract.bounds.half
     change = None

@@ -47,9 +47,6 @@ def measure(
         calls: at least 1.
         rate: Hz; by default the control rate of the task, or 100 if it is not known.
         seconds: 0 leaves the second measurement out.
-
-    Raises:
-        InputError: arguments out of their range.
     """
     rate = float((artefact.fields["control_rate_hz"] or USUAL_RATE) if rate is None else rate)
     paced = rate * seconds

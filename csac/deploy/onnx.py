@@ -31,9 +31,6 @@ def model(policy: Policy, guards: Guards, fields: dict[str, Any]) -> bytes:
     Inputs: `observation` [n, observation]; `state` [n, action + 1] if the guards remember the action before: zeros at
     first and after a reset, then what `next_state` gave. Outputs: `action` [n, action] on the environment's scale, and
     `next_state`.
-
-    Raises:
-        InputError: the package onnx, or onnxruntime, is not installed.
     """
     for package in ("onnx", "onnxruntime"):  # the one writes the graph, the other runs it to verify it
         if importlib.util.find_spec(package) is None:
@@ -66,11 +63,7 @@ def _missing(package: str) -> InputError:
 
 
 class Session:
-    """Runs a graph by ONNX Runtime, in one thread: a controller shares its processor.
-
-    Raises:
-        InputError: the package onnxruntime is not installed.
-    """
+    """Runs a graph by ONNX Runtime, in one thread: a controller shares its processor."""
 
     def __init__(self, path: Path, policy: Policy, guards: Guards) -> None:
         try:

@@ -157,14 +157,14 @@ class Policy:
         return safetensors.numpy.save(to_tensors(self.network.parameters), metadata)
 
     @staticmethod
-    def load(path: str | Path, contract: str | Path | None = None, seed: int = 0) -> Policy:
-        """Read a policy's file and its contract, by default `contract.json` beside it.
+    def load(path: str | Path) -> Policy:
+        """Read a policy's file and `contract.json` beside it.
 
         Raises:
             InputError: a file that is missing or damaged, or a policy that the contract does not belong to.
         """
         path = Path(path)
-        place = Path(contract or path.with_name(CONTRACT))
+        place = path.with_name(CONTRACT)
         agreement = Contract.of_fields(fields := read_json(place), place)
         check_checksum(path, fields)
         try:
@@ -173,7 +173,7 @@ class Policy:
                 step = (file.metadata() or {}).get("step")
             kinds = agreement.activation, agreement.head, agreement.critic_activation
             network = PolicyNetwork(from_tensors(tensors), *kinds)
-            return Policy(network, agreement, seed, None if step is None else int(step))
+            return Policy(network, agreement, step=None if step is None else int(step))
         except (safetensors.SafetensorError, ValueError) as error:  # InputError is a ValueError
             raise InputError(f"{path} is not a policy of {place.name} ({error}): restore both from a copy") from error
 

@@ -29,9 +29,8 @@ class Comparison(NamedTuple):
 def compare_actions(artefact: Artefact, policy: Policy, recorded: np.ndarray | None = None) -> Comparison:
     """Run an artefact beside its policy and guards, on observations `recorded` in episodes and on random ones.
 
-    Raises:
-        InputError: it computes other actions: a difference above 1e-5 of the action's range, and above ten times what
-            float32 itself does to the policy on such observations.
+    Raises InputError for other actions: a difference above 1e-5 of the action's range, and above ten times what float32
+    itself does to the policy on such observations.
     """
     generator, contract = np.random.default_rng(0), policy.contract
     observations = _observations(policy, recorded, generator)

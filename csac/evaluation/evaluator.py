@@ -41,8 +41,7 @@ class Evaluator:
     Episodes run side by side in batches of one fixed shape, so that an episode's numbers depend neither on when the
     others end nor on how many there are. The environments are made at the first batch and kept, but for tasks whose
     resets do not forget what was before: they are made anew for each batch. `info_names` are the names of all numbers
-    that the last steps of episodes have held in `info` so far, `perturbed` what `perturb` was last given. `watch`,
-    where there is one, is called with each step's observations [running episode, observation].
+    that the last steps of episodes have held in `info` so far, `perturbed` what `perturb` was last given.
 
     Args:
         task: as `Environment`'s.
@@ -50,12 +49,8 @@ class Evaluator:
         episodes: how many.
         first_seed: what episode 0 is reset with.
         events: what to keep of each episode's `info` (`csac.tasks.events`).
-        episode_limit: steps after which an episode is broken off; None for `LONGEST_EPISODE`.
         environments: how many to step side by side, ten at most; no number depends on it.
         lent: the one to play in instead, which stays open.
-
-    Raises:
-        InputError: episodes or seeds that there cannot be.
     """
 
     def __init__(
@@ -65,14 +60,11 @@ class Evaluator:
         episodes: int = 10,
         first_seed: int = EVALUATION_SEED,
         events: Sequence[str] = (),
-        episode_limit: int | None = None,
         environments: int = EPISODES_AT_ONCE,
         lent: Environment | None = None,
     ) -> None:
         check_whole("episodes", episodes, 1, _SEED_LIMIT)
         check_whole("first_seed", first_seed, 0, _SEED_LIMIT - episodes)
-        self.episode_limit = LONGEST_EPISODE if episode_limit is None else episode_limit
-        check_whole("episode_limit", self.episode_limit, 1, _SEED_LIMIT)
         self._task, self._environment_arguments = task, environment_arguments
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
         self._lent, self._at_once = lent, min(environments, EPISODES_AT_ONCE, episodes)
@@ -80,13 +72,11 @@ class Evaluator:
         self._ignores_seed: bool | None = None  # None before the first batch
         self.info_names: set[str] = set()
         self.perturbed: dict[str, float] = {}
-        self.watch: Callable[[np.ndarray], object] | None = None
 
     def perturb(self, values: Mapping[str, float]) -> None:
         """Change the task from the next batch on, as `Environment.perturb`; what the task cannot be, a batch refuses.
 
-        Raises:
-            InputError: environments that are there already refuse it; then so does each batch, until it is changed.
+        Raises InputError where environments that are there refuse it; then so does each batch, until it is changed.
         """
         self.perturbed = dict(values)
         try:
@@ -135,7 +125,7 @@ class Evaluator:
         check_contract(policy, self._environments[0])
         numbers = range(first, min(first + self._at_once, self.episodes))
         episodes = [
-            Playing(environment, number, self._first_seed + number, self.episode_limit, self._events)
+            Playing(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
             for environment, number in zip(self._environments, numbers, strict=False)
         ]
         try:
@@ -175,7 +165,7 @@ class Evaluator:
         """
         self._make_environments(1)
         environment = self._environments[0]
-        episode = Playing(environment, number, self._first_seed + number, self.episode_limit, self._events)
+        episode = Playing(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
         episode.start()
         state, start = None, np.ones(1, bool)
         while not episode.ended:
@@ -225,8 +215,6 @@ class Evaluator:
         while running:
             if should_stop and should_stop():
                 raise EvaluationStopped
-            if self.watch:
-                self.watch(observations[[row for row, _ in running]])
             if noise is not None:
                 for row, episode in running:
                     episode.generator.standard_normal(dtype=np.float32, out=noise[row])

@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from csac.evaluation.pending import EvaluationStopped, Pending
-from csac.processes import Child, core_quota, die_with_parent, end, move_to, outlive_termination, usable_cores
+from csac.processes import Child, core_quota, die_with_parent, end, outlive_termination, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -36,13 +36,9 @@ class EvaluationPool:
     Args:
         evaluator: what each process works with, perturbed as it is when an evaluation begins.
         processes: how many, at least one.
-        cores: the processors that they may use; None for those that this process may use when it starts them.
-
-    Raises:
-        InputError: fewer than one process, or a task that cannot be sent to another process.
     """
 
-    def __init__(self, evaluator: Evaluator, processes: int, cores: Sequence[int] | None = None) -> None:
+    def __init__(self, evaluator: Evaluator, processes: int) -> None:
         if processes < 1:
             raise InputError(f"{processes} processes: use at least one")
         try:
@@ -51,7 +47,7 @@ class EvaluationPool:
             raise InputError(
                 f"the task cannot be sent to another process: make it a module's function ({error})"
             ) from None
-        self._evaluator, self._processes, self._cores = evaluator, processes, cores
+        self._evaluator, self._processes = evaluator, processes
         self._workers: list[_Worker] = []
 
     @property
@@ -87,7 +83,7 @@ class EvaluationPool:
             self._workers.remove(worker)
         while len(self._workers) < processes:
             self._evaluator.close()  # no process is sent open environments
-            self._workers.append(_Worker(self._evaluator, self._cores))
+            self._workers.append(_Worker(self._evaluator))
 
 
 class _PendingInPool(Pending):
@@ -150,16 +146,14 @@ class _PendingInPool(Pending):
 class _Worker(Child):
     """The parent's end of one process, which is told what to evaluate, or None to end."""
 
-    def __init__(self, evaluator: Evaluator, cores: Sequence[int] | None) -> None:
-        super().__init__(_work, evaluator, cores, daemon=False)
+    def __init__(self, evaluator: Evaluator) -> None:
+        super().__init__(_work, evaluator, daemon=False)
 
 
-def _work(connection: Connection, evaluator: Evaluator, cores: Sequence[int] | None) -> None:
+def _work(connection: Connection, evaluator: Evaluator) -> None:
     """Run the batches that are asked for, until there are no more or the parent is gone."""
     die_with_parent()
     outlive_termination()
-    if cores:
-        move_to(cores)
     try:
         while work := connection.recv():
             connection.send((evaluator.answer(*work), evaluator.info_names))

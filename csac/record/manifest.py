@@ -62,8 +62,6 @@ class Manifest:
     """A run's manifest."""
 
     config: RunConfig
-    preset: str | None = None
-    """The preset that all hyperparameters follow, if one does."""
     program: tuple[int, ...] = ()
     """The seeds that share the run's program; its last bits depend on their number."""
     machine: Machine = Machine()

@@ -120,11 +120,7 @@ def read_arms(
     until: int | None = None,
     on_damaged: Callable[[InputError], None] | None = None,
 ) -> list[Arm]:
-    """Return the arms of the runs at and below these paths: those of a label, or else those alike but for their seeds.
-
-    Raises:
-        InputError: there is no run, or two runs of one label and task have the same seed.
-    """
+    """Return the arms of the runs at and below these paths: those of a label, or those alike but for their seeds."""
     groups: dict[tuple[Any, ...], Arm] = {}
     seen: set[Path] = set()
     plain = [("", path) for path in paths]

@@ -46,11 +46,7 @@ class How(NamedTuple):
 
 
 def run_study(runs: Sequence[StudyRun], directory: Path, how: How, console: Console) -> int | None:
-    """Train what is not over yet; return the signal that stopped it, if one did. Every run is saved then.
-
-    Raises:
-        InputError: a task that cannot be made, or a run that is there with another configuration.
-    """
+    """Train what is not over yet; return the signal that stopped it, if one did. Every run is saved then."""
     directory = directory.absolute()
     waiting = {directory / run.folder: run for run in runs if not run.is_over(directory)}
     for path in [path for path in waiting if is_run(path) and RunDirectory.open(path).state == "running"]:

@@ -88,11 +88,7 @@ _WORKS: Mapping[str, Callable[[Any], bool]] = {
 
 
 def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: Sequence[str] = ()) -> Space:
-    """Return what is searched: what works and is not `given`, or what is `wanted` of it. `auto` is learnt.
-
-    Raises:
-        InputError: something is wanted that is not searched, is given or does nothing here; or nothing is left.
-    """
+    """Return what is searched: what works and is not `given`, or what is `wanted` of it. `auto` is learnt."""
     values: dict[str, Any] = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
     family = getattr(algorithm, "name", type(algorithm).__name__)  # one's own is searched as what it derives from
     space = {name: one for name, one in SPACES.get(family, {}).items() if name in values}

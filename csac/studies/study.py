@@ -140,11 +140,7 @@ class Study:
         check_events(self.events)
 
     def narrowed(self, tasks: Sequence[str] = (), methods: Sequence[str] = (), seeds: int | None = None) -> Study:
-        """Return the study on some of its tasks, with some of its methods or algorithms, with other seeds.
-
-        Raises:
-            InputError: the study has no such task or method.
-        """
+        """Return the study on some of its tasks, with some of its methods or algorithms, with other seeds."""
         names = dict.fromkeys(name for one in self.methods for name in (one.label, one.algorithm))
         _refuse_unknown(tasks, self.tasks, f"{self.name} has no task")
         _refuse_unknown(methods, names, f"{self.name} has no method")
@@ -164,11 +160,7 @@ class Study:
         return max(1, round(steps * self.scale / self.environments)) * self.environments
 
     def runs(self) -> list[StudyRun]:
-        """Return every run, seed by seed, so that an unfinished study compares all methods on fewer seeds.
-
-        Raises:
-            InputError: a hyperparameter, a number or a perturbation that there cannot be; two runs in one folder.
-        """
+        """Return every run, seed by seed, so that an unfinished study compares all methods on fewer seeds."""
         seeds = labels(self.seeds, self.first_seed)
         parts = itertools.product(self.tasks, self.conditions, self.methods)
         firsts = [self._run(task, condition, method, seeds[0]) for task, condition, method in parts]
@@ -225,11 +217,7 @@ def named() -> list[str]:
 
 
 def find(name: str) -> Study:
-    """Return the study that a TOML file describes, or the one of csac's that has this name.
-
-    Raises:
-        InputError: there is neither, or what it holds is not understood.
-    """
+    """Return the study that a TOML file describes, or the one of csac's that has this name."""
     if name in named():
         return read_study(NAMED / f"{name}.toml")
     if not name.endswith(".toml") and not Path(name).is_file():

@@ -31,9 +31,6 @@ class Environment:
         task: a Gymnasium id, `module:Id` (the module is imported first), or a callable that makes an environment.
         environment_arguments: keyword arguments for the environment.
         render_mode: Gymnasium's; None where nothing is drawn.
-
-    Raises:
-        InputError: no such task, arguments that it refuses, or observations or actions that csac cannot learn.
     """
 
     def __init__(
@@ -64,8 +61,7 @@ class Environment:
     def perturb(self, values: Mapping[str, float]) -> None:
         """Change the task from its next step on, for good: a value for each of `perturbations.KINDS`, 1 or 0 for none.
 
-        Raises:
-            InputError: the task has no such physics.
+        Raises InputError where the task has no such physics.
         """
         physics = {kind: values[kind] for kind in PHYSICS if kind in values}
         noise = {kind: values[kind] for kind in NOISES if kind in values}

@@ -49,9 +49,6 @@ class Perturbation:
     `value` is a factor on the task's own physics (`friction`, `gravity`, `mass`, `gain`), never on an earlier
     perturbation's, or a standard deviation: of `observation_noise` in units of the observation, of `action_noise` in
     those of an action in [-1, 1].
-
-    Raises:
-        InputError: no such kind, or a value or step that it cannot have.
     """
 
     kind: str
@@ -93,11 +90,7 @@ def unlike_training(trained: Iterable[str | Perturbation]) -> list[str]:
 
 
 def perturbations_of(given: str | Perturbation | Iterable[str | Perturbation]) -> tuple[Perturbation, ...]:
-    """Return perturbations, written out or not, in the order of their steps.
-
-    Raises:
-        InputError: one is not what it should be, or two of one kind have the same step.
-    """
+    """Return perturbations, written out or not, in the order of their steps."""
     several = [given] if isinstance(given, str | Perturbation) or not isinstance(given, Iterable) else given
     parsed = [Perturbation.parse(item) if isinstance(item, str) else item for item in several]
     if not all(isinstance(item, Perturbation) for item in parsed):
@@ -127,10 +120,8 @@ def values_at(perturbations: Iterable[Perturbation], step: int) -> dict[str, flo
 def continued(before: Sequence[Perturbation], given: Sequence[Perturbation], begin: int) -> tuple[Perturbation, ...]:
     """Return the perturbations of a run that goes on at step `begin` from one that had those of `before`.
 
-    What happened before that step stays; what comes from it on is as `given`.
-
-    Raises:
-        InputError: a given one lies before `begin` and was not there.
+    What happened before that step stays; what comes from it on is as `given`. Raises InputError for a given one
+    before it that was not there.
     """
     past = [item for item in before if item.step < begin]
     for item in given:
@@ -186,9 +177,6 @@ class Physics:
     """The model of a MuJoCo task, scaled. Factors are on what the model was when this object was made.
 
     A reset leaves it scaled where it only renews the state, as those of Gymnasium's tasks do; `undone` finds out.
-
-    Raises:
-        InputError: not a MuJoCo task.
     """
 
     def __init__(self, environment: gymnasium.Env, task_name: str) -> None:
@@ -205,8 +193,7 @@ class Physics:
     def set(self, factors: Mapping[str, float]) -> None:
         """Scale the model from the next step on; a kind that is not named has the factor 1.
 
-        Raises:
-            InputError: the actuators have a gain that is not proportional to their parameters.
+        Raises InputError for actuators with a gain that is not proportional to their parameters.
         """
         wanted = {**dict.fromkeys(PHYSICS, 1.0), **factors}
         changed = {kind: factor for kind, factor in wanted.items() if factor != self._factors[kind]}

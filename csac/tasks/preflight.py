@@ -45,10 +45,8 @@ def _as_json(value: Any, name: str) -> Any:
 def try_task(environment: Environment, arguments: Mapping[str, Any] | None = None) -> None:
     """Reset a task and make one step, so that one of another API, or an argument of a wrong type, is told at once.
 
-    Any other failure is left to the run, whose log has the traceback.
-
-    Raises:
-        InputError: a TypeError or ValueError came of it.
+    Any other failure is left to the run, whose log has the traceback. Raises InputError for a TypeError or
+    ValueError.
     """
     try:
         environment.reset(0)

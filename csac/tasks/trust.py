@@ -40,9 +40,6 @@ def refuse_untrusted(task: object, run: str | Path, trust_task: bool = False) ->
     """Refuse to import the module of the task that a run names, unless it was named before, or is with `trust_task`.
 
     What this process has imported already is not asked about.
-
-    Raises:
-        InputError: nobody has named the module, or it is not found.
     """
     check_flag("trust_task", trust_task)
     module = module_of(task)

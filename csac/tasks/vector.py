@@ -65,9 +65,6 @@ class SeedEnvironments:
         environments: how many each seed has.
         processes: how many share the environments; 0 steps them here. What they compute is the same.
         events: what to keep of an episode's `info`.
-
-    Raises:
-        InputError: as `Environment`.
     """
 
     def __init__(

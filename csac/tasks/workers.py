@@ -29,9 +29,6 @@ class Workers:
     """Processes with so many environments each, and an `Environment` here for each of those.
 
     Of a step's `info` only the numbers that `events` are of come back.
-
-    Raises:
-        InputError: as `Environment`, or where a script without a guard starts processes.
     """
 
     def __init__(

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 from csac.algorithms import ALGORITHMS
 from csac.checks import check_whole, did_you_mean
 from csac.evaluation.evaluator import LONGEST_EPISODE
-from csac.presets import matching_preset
 from csac.record.config import SEED_LIMIT, RunConfig
 from csac.record.manifest import Manifest
 from csac.synonyms import called_in_python
@@ -126,9 +125,7 @@ def labels(seeds: int, first_seed: int) -> list[int]:
 
 def make_manifest(config: RunConfig, program: Sequence[int]) -> Manifest:
     """Return the manifest of a new run that shares its program with these seeds."""
-    known = ALGORITHMS.get(config.algorithm)
-    preset = matching_preset(known, config.task, config.hyperparameters) if known else None
-    return Manifest(config=config, preset=preset, program=tuple(program))
+    return Manifest(config=config, program=tuple(program))
 
 
 def name_of(algorithm: Algorithm) -> str:

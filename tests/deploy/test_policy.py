@@ -19,7 +19,7 @@ from manifests import make_set
 from policies import DICT_PARTS, contract, random_layers, random_network, random_policy
 
 from csac.deploy import contract as contracts
-from csac.deploy.contract import Contract, sha256_of, write_with_checksum
+from csac.deploy.contract import Contract, read_json, sha256_of, write_with_checksum
 from csac.deploy.policy import Policy
 from csac.record.files import write_atomically
 from csac.types import Activation, InputError, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
@@ -335,7 +335,7 @@ def test_a_contract_that_is_not_of_the_schema_is_refused(tmp_path, change):
     fields = json.loads(path.read_text())
     path.write_text(json.dumps(fields | change))
     with pytest.raises(InputError, match="not a policy contract"):
-        Contract.load(path)
+        Contract.of_fields(read_json(path), path)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "{}", "\xff", "[" * 100_000, '{"a":' * 100_000, "1" * 5000])
@@ -343,12 +343,13 @@ def test_what_is_no_contract_at_all_is_refused(tmp_path, text):
     path = tmp_path / "contract.json"
     path.write_bytes(text.encode("latin1"))
     with pytest.raises(InputError, match=r"contract\.json is not"):
-        Contract.load(path)
+        Contract.of_fields(read_json(path), path)
 
 
 def test_a_contract_without_a_named_task_is_kept(tmp_path):
     random_policy(replace(contract(), task=None)).save(tmp_path)
-    assert Contract.load(tmp_path / "contract.json").task is None
+    path = tmp_path / "contract.json"
+    assert Contract.of_fields(read_json(path), path).task is None
 
 
 def test_a_policy_needs_numpy_and_safetensors_and_nothing_else(tmp_path):

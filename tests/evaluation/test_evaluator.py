@@ -451,9 +451,7 @@ def test_reports_use_other_episodes_than_training():
     assert FRESH_EVALUATION_SEED - EVALUATION_SEED >= 1_000_000
 
 
-def test_an_episode_that_never_ends_is_broken_off():
-    evaluator = Evaluator(lambda: probes.Endless(length=10**9), episodes=2, episode_limit=30)
+def test_an_episode_that_never_ends_is_broken_off(monkeypatch):
+    monkeypatch.setattr("csac.evaluation.evaluator.LONGEST_EPISODE", 30)
+    evaluator = Evaluator(lambda: probes.Endless(length=10**9), episodes=2)
     assert [episode.length for episode in evaluator.run(policy_for(probes.Endless))] == [30, 30]
-    assert Evaluator(Lottery).episode_limit == 100_000
-    with pytest.raises(InputError, match="episode_limit"):
-        Evaluator(Lottery, episode_limit=0)
