@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from csac.checks import check_path
-from csac.deploy import c, numpy, onnx
-from csac.deploy.contract import CONTRACT, Contract, check_checksum, read_json, write_with_checksum
+from csac.deploy import c, onnx
+from csac.deploy.contract import CONTRACT, Contract, check_checksum, read_file, read_json, write_with_checksum
 from csac.deploy.guards import Guards
 from csac.deploy.policy import POLICY, Policy
+from csac.deploy.templates import FOLDER
+from csac.deploy.templates.policy import Policy as Loader
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 Format = Literal["numpy", "onnx", "c"]
 
+_LOADER = FOLDER / "policy.py"  # runs every policy with NumPy alone, copied beside its safetensors
 FILES: dict[str, str] = {"numpy": "policy.py", "onnx": "policy.onnx", "c": "policy.h"}
 
 
@@ -39,7 +42,7 @@ class Artefact:
         fields: dict[str, Any],
         contract: Contract,
         guards: Guards,
-        runner: numpy.Loader | onnx.Session | c.Library,
+        runner: Loader | onnx.Session | c.Library,
     ) -> None:
         self.fields, self.contract, self.guards, self.runner = fields, contract, guards, runner
 
@@ -77,7 +80,7 @@ def write_artefact(folder: Path, policy: Policy, format: Format, guards: Guards,
     }
     match format:
         case "numpy":
-            content = numpy.loader()
+            content = _LOADER.read_bytes()
         case "onnx":
             content = onnx.model(policy, guards, fields)
         case "c":
@@ -109,7 +112,11 @@ def open_artefact(path: str | Path, optimise: bool = False) -> Artefact:
     policy = Policy.load(folder / POLICY)
     match fields["format"]:
         case "numpy":
-            runner = numpy.open_loader(folder / name)
+            if read_file(folder / name) != _LOADER.read_bytes():
+                raise InputError(
+                    f"{folder / name} is not the loader of this csac, which runs no other code: export it again"
+                )
+            runner = Loader(folder)
         case "onnx":
             runner = onnx.Session(folder / name, policy, guards)
         case _:

@@ -22,10 +22,9 @@ from csac.cli import main
 from csac.deploy import verify
 from csac.deploy.artefact import open_artefact
 from csac.deploy.choosing import load
-from csac.deploy.export import provenance
 from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import evaluate
-from csac.evaluation.export import check_returns, control_rate, export_run
+from csac.evaluation.export import check_returns, control_rate, export_run, provenance
 from csac.record.sets import RunSet
 from csac.training.train import train
 from csac.types import InputError
