@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from multiprocessing.connection import wait
 from typing import TYPE_CHECKING
 
 from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure
@@ -11,10 +13,13 @@ if TYPE_CHECKING:
 
     from csac.deploy.policy import Policy
     from csac.evaluation.evaluator import Evaluator
+    from csac.evaluation.pool import Worker
 
     # A policy, the number of a batch's first episode, whether deterministic, how the task is perturbed.
     Work = tuple[Policy, int, bool, dict[str, float]]
     OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
+
+_SECONDS_BETWEEN_STOPS = 1.0
 
 Batch = tuple[int, int]  # which policy, number of the first episode
 Result = list[EvaluationEpisode] | EvaluationFailure
@@ -25,34 +30,72 @@ class EvaluationStopped(Exception):
 
 
 class Pending:
-    """An evaluation of several policies that was begun; this one runs when its results are asked for.
+    """An evaluation of several policies that was begun.
 
-    `notes` are lines on what happened to it that changes none of its numbers.
+    `workers` have a batch each, in order, and get the next whenever somebody waits here or asks whether it is over.
+    What a process that dies leaves undone runs in this process when the results are asked for: everything without
+    workers. `notes` are lines on what happened that changes no number.
     """
 
     def __init__(
-        self, evaluator: Evaluator, policies: Sequence[Policy], deterministic: bool, on_progress: OnProgress | None
+        self,
+        evaluator: Evaluator,
+        policies: Sequence[Policy],
+        deterministic: bool,
+        on_progress: OnProgress | None,
+        workers: Sequence[Worker] = (),
     ) -> None:
         self.notes: list[str] = []
         self._evaluator, self._policies, self._deterministic = evaluator, policies, deterministic
         self._perturbed, self._on_progress = dict(evaluator.perturbed), on_progress
         self._answers: dict[Batch, Result] = {}
+        self._idle, self._waiting = list(workers), deque(evaluator.batches(len(policies)))
+        self._busy: dict[Worker, Batch] = {}
+        self._hand_out()
 
     @property
     def is_over(self) -> bool:
         """Whether the results need not be waited for. Does not wait."""
-        return True
+        self._receive(0.0)
+        return not self._busy
 
     def results(self, should_stop: Callable[[], bool] | None = None) -> list[Result]:
         """Return each policy's episodes in order, or its first failure, which does not end the others. Waits.
 
         Raises:
-            EvaluationStopped: `should_stop` said so; it is asked before each step.
+            EvaluationStopped: `should_stop` said so; it is asked every second, and before each step here.
         """
+        while self._busy:
+            if should_stop and should_stop():
+                raise EvaluationStopped
+            self._receive(_SECONDS_BETWEEN_STOPS if should_stop else None)
         for batch in self._evaluator.batches(len(self._policies)):
             if batch not in self._answers and not self._is_spared(batch):
                 self._take(batch, self._evaluator.answer(*self._work(batch), should_stop))
         return [self._result(index) for index in range(len(self._policies))]
+
+    def _receive(self, seconds: float | None) -> None:
+        """Take the answers that come within so many seconds, or the next one, and hand out what waits."""
+        ready = wait([worker.connection for worker in self._busy], seconds) if self._busy else []
+        for worker in [worker for worker in self._busy if worker.connection in ready]:
+            batch = self._busy.pop(worker)
+            try:
+                answer, info_names = worker.connection.recv()
+            except (EOFError, OSError):
+                self.notes.append(f"evaluation: {worker.cause_of_death()}; its episodes are run by this one instead")
+                continue
+            self._evaluator.info_names |= info_names
+            self._take(batch, answer)
+            self._idle.append(worker)
+        self._hand_out()
+
+    def _hand_out(self) -> None:
+        while self._waiting and self._idle:
+            batch = self._waiting.popleft()
+            if not self._is_spared(batch):
+                worker = self._idle.pop()
+                worker.tell(self._work(batch))
+                self._busy[worker] = batch
 
     def _take(self, batch: Batch, answer: Result) -> None:
         self._answers[batch] = answer

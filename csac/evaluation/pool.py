@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import pickle
-from collections import deque
-from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
-from csac.evaluation.pending import EvaluationStopped, Pending
+from csac.evaluation.pending import Pending
 from csac.processes import Child, core_quota, die_with_parent, end, outlive_termination, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
+    from multiprocessing.connection import Connection
 
     from csac.deploy.policy import Policy
     from csac.evaluation.evaluator import Evaluator
-    from csac.evaluation.pending import Batch, OnProgress, Result
+    from csac.evaluation.pending import OnProgress
 
 _BATCHES_THAT_PAY = 2  # for each process: it takes as long to start as a short batch takes
-_SECONDS_BETWEEN_STOPS = 1.0
 
 
 def choose_processes(evaluator: Evaluator, policies: int) -> int:
@@ -48,7 +46,7 @@ class EvaluationPool:
                 f"the task cannot be sent to another process: make it a module's function ({error})"
             ) from None
         self._evaluator, self._processes = evaluator, processes
-        self._workers: list[_Worker] = []
+        self._workers: list[Worker] = []
 
     @property
     def info_names(self) -> set[str]:
@@ -64,7 +62,7 @@ class EvaluationPool:
     ) -> Pending:
         """Begin to evaluate policies and return. The evaluation before must be over; after a stop, close the pool."""
         self._start(min(self._processes, len(self._evaluator.batches(len(policies)))))
-        return _PendingInPool(list(self._workers), self._evaluator, policies, deterministic, on_progress)
+        return Pending(self._evaluator, policies, deterministic, on_progress, self._workers)
 
     def close(self) -> None:
         """End the processes, which close their environments; another evaluation starts new ones.
@@ -83,67 +81,10 @@ class EvaluationPool:
             self._workers.remove(worker)
         while len(self._workers) < processes:
             self._evaluator.close()  # no process is sent open environments
-            self._workers.append(_Worker(self._evaluator))
+            self._workers.append(Worker(self._evaluator))
 
 
-class _PendingInPool(Pending):
-    """An evaluation that is on its way in the processes of a pool.
-
-    They have a batch each, in order, and are given the next whenever somebody waits here or asks whether it is over.
-    What a process that dies takes along is made in this process, when the results are asked for.
-    """
-
-    def __init__(
-        self,
-        workers: Sequence[_Worker],
-        evaluator: Evaluator,
-        policies: Sequence[Policy],
-        deterministic: bool,
-        on_progress: OnProgress | None,
-    ) -> None:
-        super().__init__(evaluator, policies, deterministic, on_progress)
-        self._idle = list(workers)
-        self._waiting = deque(evaluator.batches(len(policies)))
-        self._busy: dict[_Worker, Batch] = {}
-        self._hand_out()
-
-    @property
-    def is_over(self) -> bool:
-        self._receive(0.0)
-        return not self._busy
-
-    def results(self, should_stop: Callable[[], bool] | None = None) -> list[Result]:
-        while self._busy:
-            if should_stop and should_stop():
-                raise EvaluationStopped
-            self._receive(_SECONDS_BETWEEN_STOPS if should_stop else None)
-        return super().results(should_stop)
-
-    def _receive(self, seconds: float | None) -> None:
-        """Take the answers that come within so many seconds, or the next one, and hand out what waits."""
-        ready = wait([worker.connection for worker in self._busy], seconds) if self._busy else []
-        for worker in [worker for worker in self._busy if worker.connection in ready]:
-            batch = self._busy.pop(worker)
-            try:
-                answer, info_names = worker.connection.recv()
-            except (EOFError, OSError):
-                self.notes.append(f"evaluation: {worker.cause_of_death()}; its episodes are run by this one instead")
-                continue
-            self._evaluator.info_names |= info_names
-            self._take(batch, answer)
-            self._idle.append(worker)
-        self._hand_out()
-
-    def _hand_out(self) -> None:
-        while self._waiting and self._idle:
-            batch = self._waiting.popleft()
-            if not self._is_spared(batch):
-                worker = self._idle.pop()
-                worker.tell(self._work(batch))
-                self._busy[worker] = batch
-
-
-class _Worker(Child):
+class Worker(Child):
     """The parent's end of one process, which is told what to evaluate, or None to end."""
 
     def __init__(self, evaluator: Evaluator) -> None:
