@@ -1,4 +1,4 @@
-"""What is looked at once, before a run begins: its arguments, the task's seeds and its wrappers."""
+"""What is looked at once, before a run begins: the task's API, its seeds and its wrappers."""
 
 from __future__ import annotations
 
@@ -18,28 +18,6 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from csac.tasks.environment import Environment
     from csac.tasks.registry import Task
-
-
-def json_arguments(arguments: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return keyword arguments for an environment as JSON keeps them: tuples become lists, NumPy's numbers Python's.
-
-    Raises:
-        InputError: JSON would change one of them, and a resumed run would have another task.
-    """
-    if not isinstance(arguments, Mapping | None):
-        raise InputError(f"environment_arguments are keyword arguments such as {{'g': 9.0}}, not {arguments!r:.40}")
-    return _as_json(dict(arguments or {}), "environment_arguments")
-
-
-def _as_json(value: Any, name: str) -> Any:
-    value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, list | tuple):
-        return [_as_json(item, f"{name}[{index}]") for index, item in enumerate(value)]
-    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
-        return {key: _as_json(item, f"{name}[{key!r}]") for key, item in value.items()}
-    if isinstance(value, str | int | float | bool | None):
-        return value
-    raise InputError(f"{name} cannot be kept in a file: JSON has no {type(value).__name__} such as {value!r:.40}")
 
 
 def try_task(environment: Environment, arguments: Mapping[str, Any] | None = None) -> None:

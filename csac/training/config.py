@@ -7,14 +7,14 @@ from contextlib import closing
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from csac.algorithms import ALGORITHMS
-from csac.checks import check_whole, did_you_mean
+from csac.checks import check_arguments, check_whole, did_you_mean
 from csac.evaluation.evaluator import LONGEST_EPISODE
-from csac.record.config import SEED_LIMIT, RunConfig
+from csac.record.config import SEED_LIMIT, RunConfig, as_json
 from csac.record.manifest import Manifest
 from csac.synonyms import called_in_python
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
-from csac.tasks.preflight import json_arguments, limit_warning, seed_warning, try_task, wrapper_warnings
+from csac.tasks.preflight import limit_warning, seed_warning, try_task, wrapper_warnings
 from csac.tasks.registry import check_events, events_of, import_module_of
 from csac.tasks.trust import refuse_untrusted, remember
 from csac.training.demonstrations import Demonstrations, is_told
@@ -67,7 +67,9 @@ def make_configs(
     """
     _refuse_unknown(given, algorithm)
     options: Any = dict(given)
-    arguments = json_arguments(options.pop("environment_arguments", None))
+    arguments = options.pop("environment_arguments", None)
+    check_arguments("environment_arguments", arguments)
+    arguments = as_json("environment_arguments", dict(arguments or {}))
     asked, events = options.pop("perturbations", None), options.pop("events", None)
     if events is not None:
         check_events(events)

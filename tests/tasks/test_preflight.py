@@ -1,11 +1,8 @@
-"""What is looked at once before a run begins: arguments that JSON keeps, the API, seeds, wrappers."""
+"""What is looked at once before a run begins: the API, seeds, wrappers."""
 
 from __future__ import annotations
 
-import json
 import random
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -15,7 +12,6 @@ import pytest
 
 from csac.tasks.environment import Environment
 from csac.tasks.preflight import (
-    json_arguments,
     limit_warning,
     seed_globals,
     seed_warning,
@@ -23,41 +19,6 @@ from csac.tasks.preflight import (
     wrapper_warnings,
 )
 from csac.types import InputError
-
-
-@dataclass
-class Options:
-    size: int = 3
-
-
-@pytest.mark.parametrize(
-    ("given", "kept"),
-    [
-        (None, {}),
-        ({"size": (3, 4), "depth": [1, {"a": None}]}, {"size": [3, 4], "depth": [1, {"a": None}]}),
-        ({"g": np.float64(9.5), "n": np.int64(3), "on": np.bool_(True)}, {"g": 9.5, "n": 3, "on": True}),
-    ],
-)
-def test_arguments_are_what_json_keeps(given, kept):
-    arguments = json_arguments(given)
-    assert arguments == kept == json.loads(json.dumps(arguments))
-    assert not any(isinstance(value, np.generic) for value in arguments.values())
-
-
-@pytest.mark.parametrize(
-    ("given", "name"),
-    [
-        ({"levels": {1: 2.0}}, "levels"),
-        ({"mean": np.zeros(2)}, "mean"),
-        ({"file": Path("here")}, "file"),
-        ({"options": [Options()]}, r"options'\]\[0\]"),
-        (["g"], "environment_arguments"),
-    ],
-)
-def test_arguments_that_json_would_change_are_refused(given: Any, name):
-    with pytest.raises(InputError, match=name) as refusal:
-        json_arguments(given)
-    assert "\n" not in str(refusal.value)
 
 
 class Seedless(probes.Endless):
