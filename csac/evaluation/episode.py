@@ -57,7 +57,7 @@ class Playing:
         self.environment, self.number, self._seed, self._limit = environment, number, seed, limit
         self.generator = noise_generator(seed)
         self.ended = False
-        self._return, self._length = 0.0, 0
+        self._return, self.length = 0.0, 0
         self.last_info: dict[str, Any] = {}
         self._events = EpisodeEvents(events)
 
@@ -76,21 +76,21 @@ class Playing:
             raise self._failure(error) from error
         self._events.add(self.last_info)
         self._return += reward
-        self._length += 1
-        self.ended = terminated or truncated or self._length >= self._limit
+        self.length += 1
+        self.ended = terminated or truncated or self.length >= self._limit
         return observation
 
     def result(self) -> EvaluationEpisode:
         """Return what there is to say of the episode."""
-        said = self._events.of(self.last_info, self._length)
-        return EvaluationEpisode(self.number, self._return, self._length, _success(self.last_info), said)
+        said = self._events.of(self.last_info, self.length)
+        return EvaluationEpisode(self.number, self._return, self.length, _success(self.last_info), said)
 
     def info_names(self) -> set[str]:
         """Return the names of the numbers in the last step's `info`."""
         return set(numbers_in(self.last_info))
 
     def _failure(self, error: EnvironmentFailure) -> EvaluationFailure:
-        place = f"evaluation episode {self.number}, reset with seed {self._seed}, at step {self._length}"
+        place = f"evaluation episode {self.number}, reset with seed {self._seed}, at step {self.length}"
         return EvaluationFailure(f"{place}: {error}")
 
 

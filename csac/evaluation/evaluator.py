@@ -238,8 +238,8 @@ def evaluate(
     Raises:
         InputError, EvaluationFailure: as `evaluate_episodes`.
     """
-    evaluator = _evaluator(task, environment_arguments, episodes, first_seed, (), perturbations)
-    return np.array([episode.episode_return for episode in _played(evaluator, policy, task, deterministic)])
+    given = policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed
+    return np.array([episode.episode_return for episode in _played(*given)])
 
 
 def evaluate_episodes(
@@ -275,24 +275,18 @@ def evaluate_episodes(
     if events is not None:
         check_events(events)
     events = events_of(task) if events is None else events
-    evaluator = _evaluator(task, environment_arguments, episodes, first_seed, events, perturbations)
-    return _played(evaluator, policy, task, deterministic)
+    return _played(policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed, events)
 
 
-def _evaluator(
-    task: Task,
-    environment_arguments: dict[str, Any] | None,
-    episodes: int,
-    first_seed: int,
-    events: Sequence[str],
+def _played(
+    policy: Any,
+    deterministic: bool,
     perturbations: str | Perturbation | Iterable[str | Perturbation],
-) -> Evaluator:
-    evaluator = Evaluator(task, environment_arguments, episodes, first_seed, events)
+    task: Task,
+    *given: Any,
+) -> list[EvaluationEpisode]:
+    evaluator = Evaluator(task, *given)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
-    return evaluator
-
-
-def _played(evaluator: Evaluator, policy: Any, task: Task, deterministic: bool) -> list[EvaluationEpisode]:
     check_flag("deterministic", deterministic)
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
         raise InputError(f"{policy!r:.60} has no predict: give a policy as csac.load returns it")

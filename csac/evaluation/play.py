@@ -12,7 +12,8 @@ import numpy as np
 
 from csac.checks import check_flag, check_whole
 from csac.deploy.choosing import has_policy, load, load_run
-from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationEpisode, EvaluationFailure, Evaluator, check_contract
+from csac.evaluation.episode import EvaluationFailure, Playing
+from csac.evaluation.evaluator import LONGEST_EPISODE, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.sets import RunSet
 from csac.seeds import FRESH_EVALUATION_SEED
@@ -25,6 +26,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
+    from csac.evaluation.episode import EvaluationEpisode
     from csac.evaluation.pending import OnProgress
     from csac.record.run import Which
     from csac.tasks.perturbations import Perturbation
@@ -102,7 +104,7 @@ def play(
 
     Raises:
         InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
-        EnvironmentFailure: the environment raised, or gave what is not finite.
+        EvaluationFailure: the environment raised, or gave what is not finite.
     """
     run, perturbed = _open(directory, trust_task), values_at(constant_perturbations(perturbations), 0)
     check_whole("episodes", episodes, 1, LONGEST_EPISODE)
@@ -114,20 +116,18 @@ def play(
         environment.perturb(perturbed)
         with _filming(environment, run.config.task, video) as film:
             for number in range(episodes):
-                observation = environment.reset(FRESH_EVALUATION_SEED + number)
-                episode_return, length, ended = 0.0, 0, False
+                episode = Playing(environment, number, FRESH_EVALUATION_SEED + number, longest)
+                observation = episode.start()
                 film.add()
-                while not ended:
+                while not episode.ended:
                     action = policy.contract.to_environment(policy.act(observation[None])[0])
-                    observation, reward, terminated, truncated, _ = environment.step_environment_scale(action)
-                    episode_return, length = episode_return + reward, length + 1
-                    ended = terminated or truncated or length >= longest
+                    observation = episode.step(action)
                     film.add()
                     if on_progress:
-                        on_progress(done + length, done + (episodes - number) * longest)
-                done += length
+                        on_progress(done + episode.length, done + (episodes - number) * longest)
+                done += episode.length
                 film.end_episode()
-                yield EvaluationEpisode(number, episode_return, length, None)
+                yield episode.result()
 
 
 def perturbation_notes(
