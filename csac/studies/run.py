@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import shutil
-import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from csac.console.tables import duration
-from csac.console.waiting import SECONDS_OF_SILENCE, Speed
+from csac.console.waiting import progress_shown
 from csac.processes import core_quota, usable_cores
-from csac.record.rendering import number, short
+from csac.record.rendering import number
 from csac.record.run import RunDirectory, is_run
 from csac.record.statistics import last_evaluations
 from csac.tasks.environment import Environment
@@ -54,7 +52,11 @@ def run_study(runs: Sequence[StudyRun], directory: Path, how: How, console: Cons
     if how.cluster is None:  # whose nodes may have what this machine has not
         try_tasks(waiting.values())
     programs = [_program(path, run, how) for path, run in waiting.items()]
-    with stop_requested(lambda text: console.print(text)) as request, closing(Progress(waiting, console)) as progress:
+    with (
+        stop_requested(lambda text: console.print(text)) as request,
+        progress_shown(console, "training", "steps") as show,
+    ):
+        progress = Progress(waiting, console, show)
         if programs and how.cluster:
             how.cluster.run(programs, progress.of, request.is_set)
         elif programs:
@@ -97,20 +99,14 @@ def _program(path: Path, run: StudyRun, how: How) -> Program:
 
 
 class Progress:
-    """Shows how far the runs of a study are: one line that changes on a terminal, and a line for each that ends."""
+    """Tells `show` how many steps the runs of a study have made, and of how many; prints a line for each that ends."""
 
-    def __init__(
-        self, runs: Mapping[Path, StudyRun], console: Console, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self.runs, self.console = runs, console
+    def __init__(self, runs: Mapping[Path, StudyRun], console: Console, show: Callable[[int, int], None]) -> None:
+        self.runs, self.console, self._show = runs, console, show
         self.done = {path: RunDirectory.open(path).manifest.last_checkpoint if is_run(path) else 0 for path in runs}
-        self.total = sum(run.config.steps for run in runs.values())
         self.over: set[Path] = set()
-        self.speed, self._clock, self._spoke = Speed(clock), clock, clock()
-        self.speed.add(sum(self.done.values()))
-        self._status = console.status("starting") if console.is_interactive and runs else None
-        if self._status:
-            self._status.start()
+        self._before = sum(self.done.values())
+        self._total = sum(run.config.steps for run in runs.values()) - self._before
 
     def of(self, program: Program) -> RunProgress:
         """Return who is told about a program."""
@@ -119,15 +115,7 @@ class Progress:
     def advanced(self, path: Path, step: int) -> None:
         """Take how many steps a run has made."""
         self.done[path] = step
-        done = sum(self.done.values())
-        self.speed.add(done)
-        pace = self.speed.per_second()
-        left = f", {duration((self.total - done) / pace)} left" if pace else ""
-        told = f"{len(self.over)} of {len(self.runs)} runs over, {short(done)} of {short(self.total)} steps{left}"
-        if self._status:
-            self._status.update(told)
-        elif self._clock() - self._spoke >= SECONDS_OF_SILENCE:
-            self.say(told)
+        self._show(sum(self.done.values()) - self._before, self._total)
         if step >= self.runs[path].config.steps and path not in self.over:
             self.ended(path, "finished")
 
@@ -141,12 +129,6 @@ class Progress:
     def say(self, text: str) -> None:
         """Show a line."""
         self.console.print(text, soft_wrap=True)
-        self._spoke = self._clock()
-
-    def close(self) -> None:
-        """Give the terminal back as it was."""
-        if self._status:
-            self._status.stop()
 
 
 class RunProgress(NamedTuple):
