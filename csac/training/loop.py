@@ -20,7 +20,7 @@ from csac.training.evaluations import Evaluations, is_finite
 from csac.training.hindsight import Hindsight
 from csac.training.learner import Learner
 from csac.training.notifier import Notifier
-from csac.training.resume import ResumePoint
+from csac.training.resume import ResumePoint, record_inexact
 from csac.types import Snapshot
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ class Loop:
         self.learner.restore(learnt, fills)
         self._observations = self.environments.observations
         for index, reason in self.environments.refused.items():
-            self._note(self.runs[index], f"seed {self.runs[index].seed}: {reason}: its episode restarts")
+            self._note_inexact(self.runs[index], f"seed {self.runs[index].seed}: {reason}: its episode restarts")
         if restarted:
             self.learner.truncate_last(restarted, self.step)
             self._actions[restarted] = self.learner.next_actions(self._observations, self.step)[restarted]
@@ -184,7 +184,7 @@ class Loop:
         def fill(rows: np.ndarray) -> None:
             lost = checkpoint.fill(rows)
             for text in lost:
-                self._note(run, f"warning: {text}")
+                self._note_inexact(run, f"warning: {text}")
             self._writers[index] = Writer(
                 run.checkpoints, self.config.keep_checkpoints, {} if lost else checkpoint.files
             )
@@ -306,6 +306,10 @@ class Loop:
     def _note(self, run: RunDirectory, text: str) -> None:
         run.log(text)
         self.watcher.note(text)
+
+    def _note_inexact(self, run: RunDirectory, text: str) -> None:
+        self._note(run, text)
+        record_inexact(run, text)
 
     def _perturb(self, step: int) -> None:
         """Apply the perturbations in force after `step` steps."""

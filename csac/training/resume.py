@@ -151,7 +151,7 @@ def continuation(manifest: Manifest, now_: Manifest, point: ResumePoint) -> tupl
     restarts = bool(point.step and manifest.restarts_episode)
     if restarts:
         lines.append("note: the episode in progress restarts: its environment cannot be saved")
-    exact = not (changes or restarts or any("transitions are lost" in note for note in point.notes))
+    exact = not (changes or restarts)
     previous = {
         "steps": manifest.config.steps,
         "machine": vars(manifest.machine),
@@ -159,6 +159,14 @@ def continuation(manifest: Manifest, now_: Manifest, point: ResumePoint) -> tupl
         "commit": manifest.commit,
     }
     return Continuation(now(), point.step, exact, tuple(point.notes), now_.command, previous), lines
+
+
+def record_inexact(run: RunDirectory, note: str) -> None:
+    """Record in the manifest why the resume in progress is not exact; a fork's beginning is no resume."""
+    if run.manifest.history:
+        *before, entry = run.manifest.history
+        entry = replace(entry, exact=False, notes=(*entry.notes, note))
+        run.update_manifest(history=(*before, entry))
 
 
 def machine_changes(before: Manifest, current: Manifest) -> list[str]:

@@ -209,6 +209,8 @@ def test_lost_transitions_are_replaced_by_others_with_a_warning(tmp_path, stoppe
     again = run(tmp_path / "run", resume=True).runs[0]
     assert again.manifest.state == "finished"
     assert "transitions are lost" in (again.path / "log.txt").read_text()
+    entry = again.manifest.history[-1]
+    assert (entry.exact, "transitions are lost" in entry.notes[-1]) == (False, True)
 
 
 def test_where_no_checkpoint_is_sound_nothing_is_touched(tmp_path, stopped):
