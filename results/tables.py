@@ -11,7 +11,6 @@ from csac.record.statistics import (
     FEWEST_FOR_BOOTSTRAP,
     FEWEST_FOR_INTERVAL,
     Recovery,
-    dispersion_across,
     drawdown,
     evaluation_matrix,
     improvement_interval,
@@ -223,6 +222,19 @@ def measure(rows: np.ndarray, steps: int, changed_at: int | None = None) -> Meas
         np.array(areas),
         dispersion_across(values),
     )
+
+
+def dispersion_across(returns: np.ndarray) -> float:
+    """Interquartile range over seeds of `returns` [seed, t], averaged over the evaluations that hold every seed.
+
+    How much the outcome depends on the seed; NaN below two seeds. After Chan et al. 2020, "Measuring the Reliability of
+    Reinforcement Learning Algorithms" (dispersion across runs), without its smoothing.
+    """
+    together = returns[:, ~np.isnan(returns).any(axis=0)]
+    if len(returns) < 2 or not together.size:
+        return np.nan
+    low, high = np.quantile(together, [0.25, 0.75], axis=0)
+    return float((high - low).mean())
 
 
 def study_tables(

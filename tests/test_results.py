@@ -46,6 +46,15 @@ def test_the_loss_after_a_change_is_the_area_lost_as_a_share_of_the_return_befor
     assert tables.measure(rows([4, 4, 2, 4, 4]), 50, changed_at=20).loss.tolist() == [5.0]
 
 
+def test_dispersion_across_runs_worked_by_hand():
+    # At 100: quartiles of 0, 1, 2, 3, 4 are 1 and 3, range 2. At 200: of 0, 10, 20, 30, 40 range 20. At 300 one lacks.
+    returns = np.array([[n, 10 * n, n] for n in (0.0, 1.0, 2.0, 3.0, 4.0)])
+    returns[2, 2] = np.nan
+    assert tables.dispersion_across(returns) == pytest.approx((2 + 20) / 2)
+    assert np.isnan(tables.dispersion_across(returns[:1]))
+    assert np.isnan(tables.dispersion_across(np.full((2, 3), np.nan)))
+
+
 def test_scores_are_shares_of_the_first_arm_and_pairs_of_seeds_are_compared():
     found = {
         "Hopper-v4": {

@@ -162,25 +162,6 @@ def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | Non
     return Table(headings, (returns, *body))
 
 
-def events_table(last: np.ndarray, names: dict[str, bool]) -> Table | None:
-    """Return what the `last` evaluations say beside returns: success and each event, as means per episode.
-
-    One row each: the mean over the seeds and, where there are several, their standard deviation and range. None where
-    the task says nothing. `names` are those of `case_names`, of all evaluations.
-    """
-    found = cases(last, names)
-    several = any(len(case.by_seed) > 1 for case in found)
-    rows = []
-    for case in found:
-        known = [value for value in case.by_seed.values() if not math.isnan(value)]
-        values = [case.over_seeds.mean]
-        if several:
-            values += [case.over_seeds.std, min(known, default=math.nan), max(known, default=math.nan)]
-        rows.append(Row((Cell(case.name), *(numeric(value, f"{value:.3f}") for value in values))))
-    headings = ("per episode, last evaluation", "mean", *["± std", "min", "max"] * several)
-    return Table(headings, tuple(rows)) if rows else None
-
-
 def plus_minus(over: OverSeeds) -> Cell:
     """Return `mean ± std`, of one seed its value alone; whole numbers from 20 on, but for a spread below 1."""
     form = _form(over.mean, over.std)

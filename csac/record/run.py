@@ -118,10 +118,6 @@ class RunDirectory:
         """The run's seed."""
         return self.manifest.config.seed
 
-    def read_again(self) -> None:
-        """Take the manifest as it is on disk now. Raises InputError where it is gone or damaged."""
-        self.manifest = RunDirectory.open(self.path).manifest
-
     def update_manifest(self, **changes: Any) -> None:
         """Change fields of the manifest, on disk and in `manifest`."""
         content = manifests.written(dataclasses.replace(self.manifest, **changes))

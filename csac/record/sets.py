@@ -45,8 +45,6 @@ class RunSet:
         below = [folder for folder in path.glob("seed-*") if is_run(folder)]
         runs = sorted(map(RunDirectory.open, below), key=lambda run: run.seed)
         if not runs:
-            if (path / "evaluations.csv").exists() or (path / "policy").exists():
-                raise InputError(f"{path} has no manifest, or is a run of an older csac: use the one that wrote it")
             RunDirectory.open(path)  # which says what is there instead
         return cls(path, runs)
 

@@ -123,19 +123,6 @@ def improvement_interval(
     return _bootstrap_interval([scores, others], probability_of_improvement, repetitions, seed, confidence)
 
 
-def dispersion_across(returns: np.ndarray) -> float:
-    """Interquartile range over seeds of `returns` [seed, t], averaged over the evaluations that hold every seed.
-
-    How much the outcome depends on the seed; NaN below two seeds. After Chan et al. 2020, "Measuring the Reliability of
-    Reinforcement Learning Algorithms" (dispersion across runs), without its smoothing.
-    """
-    together = returns[:, ~np.isnan(returns).any(axis=0)]
-    if len(returns) < 2 or not together.size:
-        return np.nan
-    low, high = np.quantile(together, [0.25, 0.75], axis=0)
-    return float((high - low).mean())
-
-
 def maximum_average_return(rows: np.ndarray) -> tuple[float, int]:
     """Return `(value, step)`: the highest mean over seeds among the evaluation points that hold every seed.
 

@@ -39,6 +39,7 @@ class Learner:
         self._waiting = np.zeros((len(seeds), self._cadence.update_interval, row_width(spec)), np.float32)
         keep_programs()
         self._one = OneSeed(algorithm, spec, steps, most_extra)
+        self.metric_names = self._one.metrics
         self.network = algorithm.policy(self._one.state)  # for all but its parameters
         # It runs once, and less optimised it is compiled in three quarters of the time.
         begin = jax.jit(self._axis.map(self._one.begin), compiler_options={"xla_backend_optimization_level": 1})
@@ -117,11 +118,6 @@ class Learner:
         parameters = jax.tree.map(np.array, self._axis.map(parameters_of)(self._states()))
         return [self.network._replace(parameters=self._axis.of(parameters, i)) for i in range(self._axis.seeds)]
 
-    @property
-    def metric_names(self) -> tuple[str, ...]:
-        """The names of the metrics."""
-        return self._one.metrics
-
     def metrics(self) -> list[dict[str, float]]:
         """Return each seed's metrics, averaged over the updates since `forget_metrics`; none if there were none."""
         if not self._updates_summed:
@@ -142,10 +138,6 @@ class Learner:
     def _of_seed(self, carry: Carry, index: int) -> Carry:
         own = self._axis.of(jax.tree.map(np.asarray, carry), index)
         return own._replace(state=self._one.packing.unpack(own.state))
-
-    def waiting(self, index: int) -> np.ndarray:
-        """Return the transitions [step, width] of the seed at this place that wait for an update, as a view."""
-        return self._waiting[index]
 
     def save(self, index: int) -> Snapshot:
         """Return what the seed at this place needs to go on, but for its memory."""

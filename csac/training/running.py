@@ -35,7 +35,7 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
     with ExitStack() as stack, storage_failures(runs[0].path.parent):
         for run in runs:
             stack.enter_context(run.locked())
-            run.read_again()  # another process may have gone on with it before we had the lock
+            run.manifest = RunDirectory.open(run.path).manifest  # as another process left it before we had the lock
         choose_device(runs[0].config.device)
         seed_globals(runs[0].seed)
         points = roll_back(runs)

@@ -69,13 +69,6 @@ def stop_requested(tell: Callable[[str], None] | None = None) -> Iterator[StopRe
 
 
 @contextmanager
-def signals_noted() -> Iterator[list[int]]:
-    """Yield the signals that have come; runs that are trained within share the request to stop."""
-    with stop_requested() as request:
-        yield request.received
-
-
-@contextmanager
 def leaving_at_once() -> Iterator[None]:
     """Let SIGINT and SIGTERM end this process at once, with their exit code and a line, while nothing is to be saved.
 

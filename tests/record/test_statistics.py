@@ -4,7 +4,6 @@ from scipy import stats
 
 from csac.record.statistics import (
     best_returns,
-    dispersion_across,
     drawdown,
     evaluation_matrix,
     improvement_interval,
@@ -164,15 +163,6 @@ def test_the_interval_of_improvement():
     assert 0.65 < high < 0.8
     assert improvement_interval(np.arange(5.0) + 100, np.arange(5.0)) == (1.0, 1.0)
     assert improvement_interval(np.arange(5.0), np.arange(4.0)) is None
-
-
-def test_dispersion_across_runs_worked_by_hand():
-    # At 100: quartiles of 0, 1, 2, 3, 4 are 1 and 3, range 2. At 200: of 0, 10, 20, 30, 40 range 20. At 300 one lacks.
-    returns = np.array([[n, 10 * n, n] for n in (0.0, 1.0, 2.0, 3.0, 4.0)])
-    returns[2, 2] = np.nan
-    assert dispersion_across(returns) == pytest.approx((2 + 20) / 2)
-    assert np.isnan(dispersion_across(returns[:1]))
-    assert np.isnan(dispersion_across(np.full((2, 3), np.nan)))
 
 
 # What rliable 1.2.0 gives for these scores [seed, task] of two algorithms with six and five seeds.

@@ -9,14 +9,12 @@ from csac.record.report_tables import (
     case_comparison_table,
     case_table,
     comparison_table,
-    events_table,
     recovery_table,
     results_table,
 )
 from csac.record.summaries import (
     case_names,
     cases,
-    last_rows,
     over_seeds,
     perturbation_recoveries,
     recoveries,
@@ -164,10 +162,3 @@ def test_what_nobody_tells_of_is_no_case():
     assert case_table(rows_of([1.0])) is None
     assert case_comparison_table([("a", rows_of([1.0]))]) is None
     assert lines(case_table(rows_of([1.0], crashed=[NAN])))[1:] == [["crashed (mean)", ""]]
-
-
-def test_events_are_those_of_the_last_evaluation_as_cases_in_all():
-    """The last episode of seed 0 does not say that it crashed: in a case that is a no."""
-    rows = rows_of([1.0] * 2, [1.0] * 2, crashed=[1, NAN, 0, 1])
-    table = events_table(last_rows(rows), case_names([rows]))
-    assert lines(table)[1] == ["crashed", "0.500", "0.707", "0.000", "1.000"]

@@ -133,7 +133,7 @@ SETTINGS = [(name, {}) for name in ALGORITHMS] + [
 def test_what_a_seed_carries_is_updated_in_the_buffer_where_it_lies(name, changes):
     # An argument that JAX drops would shift all that follow: a period of 1 never reads the reference that it keeps.
     learner = Learner(ALGORITHMS[name](**changes), SPEC, [0], 5_000)
-    given = jax.eval_shape(lambda: (learner._carry, learner._parcel.pack(1, learner.waiting(0), np.zeros(3))))
+    given = jax.eval_shape(lambda: (learner._carry, learner._parcel.pack(1, learner._waiting[0], np.zeros(3))))
     program = learner._learn.lower(*given).as_text()
     (signature,) = re.findall(r"func.func public @main\((.*)\) ->", program)
     outputs = [int(place) for place in re.findall(r"tf.aliasing_output = (\d+)", signature)]
