@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import threading
@@ -108,23 +107,15 @@ def _handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
             signal.signal(number, former)
 
 
-_CANNOT_WRITE = {
-    getattr(errno, name)
-    for name in (
-        *("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "ENOENT", "EIO", "EFBIG", "EMFILE", "ENFILE", "ESTALE"),
-        *("ETIMEDOUT", "ENOTDIR", "ENOTCONN", "ENODEV", "ENXIO", "EHOSTDOWN"),
-    )
-}
-
-
 @contextmanager
 def storage_failures(path: Path) -> Iterator[None]:
     """Raise StorageFailure where a file below this folder can no longer be written."""
     try:
         yield
     except OSError as error:
-        if error.errno in _CANNOT_WRITE and str(error.filename or path).startswith(str(path)):
-            raise StorageFailure(
-                f"{path} cannot be written: {error.strerror}; once that is mended, it can be resumed"
-            ) from error
-        raise
+        # Of a connection: the parent is gone. Without a reason of the system's: of a library, such as a task's.
+        is_other = isinstance(error, ConnectionError) or not error.strerror
+        if is_other or not str(error.filename or path).startswith(str(path)):
+            raise
+        advice = "once that is mended, it can be resumed"
+        raise StorageFailure(f"{path} cannot be written: {error.strerror}; {advice}") from error
