@@ -10,7 +10,6 @@ import hashlib
 import os
 import platform
 import tempfile
-import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -42,14 +41,15 @@ def keep_programs() -> None:
 
 
 def tidy_programs() -> str | None:
-    """Remove what is broken or too much before a run; return a note where programs cannot be kept."""
+    """Remove all programs before a run where they are too much; return a note where none can be kept."""
     if _is_users_choice():
-        _tell_workers()
         return None
     try:
-        home = _make_home()
-        _remove_broken(home)
-        _remove_oldest(home)
+        programs = list(_make_home().glob("*/*-cache"))
+        with suppress(FileNotFoundError):  # another process removes them too
+            if sum(program.stat().st_size for program in programs) > MOST_BYTES:
+                for program in programs:
+                    program.unlink(missing_ok=True)
     except OSError as error:
         return f"note: compiled programs cannot be kept for the next run ({error})"
     return None
@@ -58,13 +58,6 @@ def tidy_programs() -> str | None:
 def _is_users_choice() -> bool:
     is_enabled, folder = _jax_settings()
     return not is_enabled or (folder is not None and Path(folder).parent != _home())
-
-
-def _tell_workers() -> None:
-    is_enabled, folder = _jax_settings()
-    os.environ["JAX_ENABLE_COMPILATION_CACHE"] = str(int(is_enabled))
-    if folder is not None:
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
 
 
 def _jax_settings() -> tuple[bool, str | None]:
@@ -96,44 +89,3 @@ def _processor() -> str:
         lines = []
     facts = sorted({line for line in lines if line.partition(":")[0].strip() in _PROCESSOR}) or [platform.node()]
     return hashlib.sha256("\n".join([platform.system(), platform.machine(), *facts]).encode()).hexdigest()[:12]
-
-
-def _remove_broken(home: Path) -> None:
-    """Remove what a process that was killed has written in part, among what is new: JAX would never replace it."""
-    mark = home / "checked"
-    since = mark.stat().st_mtime if mark.exists() else 0.0
-    mark.touch()
-    for entry in _entries(home):
-        with suppress(FileNotFoundError):
-            if entry.stat().st_mtime >= since and not _is_whole(entry.read_bytes()):
-                entry.unlink(missing_ok=True)
-
-
-def _is_whole(program: bytes) -> bool:
-    """Whether a program can be unpacked, where JAX has packed it with zlib; with zstd, whether there is anything."""
-    if program[:1] != b"\x78":
-        return bool(program)
-    try:
-        zlib.decompress(program)
-    except zlib.error:
-        return False
-    return True
-
-
-def _remove_oldest(home: Path) -> None:
-    """Remove the programs that were compiled first, until the others are not too much."""
-    sizes = {}
-    for entry in _entries(home):
-        with suppress(FileNotFoundError):
-            facts = entry.stat()
-            sizes[entry] = (facts.st_mtime, facts.st_size)
-    total = sum(size for _, size in sizes.values())
-    for entry in sorted(sizes, key=lambda entry: sizes[entry]):
-        if total <= MOST_BYTES:
-            return
-        entry.unlink(missing_ok=True)
-        total -= sizes[entry][1]
-
-
-def _entries(home: Path) -> list[Path]:
-    return list(home.glob("*/*-cache"))
