@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from csac.record.locks import is_locked
 from csac.record.run import LOCK, StorageFailure
-from csac.training.callbacks import Answer
 from csac.training.signals import stop_requested
 from csac.training.supervisor import record_failure
+from csac.training.watch import Watcher
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from csac.training.callbacks import Event
-    from csac.training.program import Program, Watcher
+    from csac.training.program import Program
 
 RETRIES = 5  # of a run whose node or process was lost
 SECONDS_FOR_LOCK = 300.0  # a node that vanished keeps its locks until the file server's lease ends, a minute or two
@@ -154,7 +153,7 @@ def _wait_until_free(lock: Any) -> None:
         time.sleep(1.0)
 
 
-class _QueueWatcher:
+class _QueueWatcher(Watcher):
     """Sends what happens to a run to the driver."""
 
     def __init__(self, index: int, messages: Any) -> None:
@@ -164,17 +163,11 @@ class _QueueWatcher:
         # Nobody waits until it was heard: Ray would lend the core of who waits to another run.
         self.sent = [*self.sent[-100:], self.messages.actor.put.remote((self.index, name, arguments))]
 
-    def wait_for_turn(self, step: int) -> None:
-        pass
-
     def progress(self, steps: Mapping[int, int]) -> None:
         self._send("progress", dict(steps))
 
     def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
         self._send("evaluated", step, dict(returns))
-
-    def call(self, event: Event) -> Answer:
-        return Answer()
 
     def failed(self, seed: int, step: int, reason: str) -> None:
         self._send("failed", seed, step, reason)

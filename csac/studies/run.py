@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from contextlib import closing
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.console.waiting import progress_shown
@@ -14,11 +15,11 @@ from csac.record.statistics import last_evaluations
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import perturbations_of
 from csac.tasks.trust import remember
-from csac.training.callbacks import Answer
 from csac.training.config import algorithm_of, make_manifest
 from csac.training.program import Program
 from csac.training.signals import stop_requested
 from csac.training.supervisor import supervise
+from csac.training.watch import Watcher
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
     from csac.studies.ray import Cluster
     from csac.studies.study import StudyRun
-    from csac.training.callbacks import Event
 
 
 class How(NamedTuple):
@@ -131,26 +131,17 @@ class Progress:
         self.console.print(text, soft_wrap=True)
 
 
-class RunProgress(NamedTuple):
+@dataclass(frozen=True)
+class RunProgress(Watcher):
     """Takes what happens to one run of a study."""
 
     study: Progress
     path: Path
 
-    def wait_for_turn(self, step: int) -> None:
-        """Nothing to do: the supervisor gives turns."""
-
     def progress(self, steps: Mapping[int, int]) -> None:
         """Take how many steps the run has made."""
         for step in steps.values():
             self.study.advanced(self.path, step)
-
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
-        """Nothing to do: the returns are shown at the end."""
-
-    def call(self, event: Event) -> Answer:
-        """Go on: a study has no callbacks."""
-        return Answer()
 
     def failed(self, seed: int, step: int, reason: str) -> None:
         """Take that the run failed."""

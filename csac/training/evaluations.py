@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from csac.record.run import RunDirectory
     from csac.tasks.vector import SeedEnvironments
     from csac.training.notifier import Notifier
-    from csac.training.program import Program, Watcher
+    from csac.training.program import Program
+    from csac.training.watch import Watcher
     from csac.types import PolicyNetwork
 
 SECONDS_TO_FINISH = 10.0  # that an evaluation has once a stop is asked for

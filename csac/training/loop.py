@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
     from csac.deploy.policy import Policy
     from csac.record.run import RunDirectory
-    from csac.training.program import Program, Watcher
+    from csac.training.program import Program
+    from csac.training.watch import Watcher
 
 METRICS_INTERVAL = 1_000
 CHECK_INTERVAL = 500  # steps between checks of what is due: rows to write, a signal, a diverged seed

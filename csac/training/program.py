@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from csac.record.config import RunConfig
     from csac.record.run import RunDirectory
     from csac.tasks.registry import Task
-    from csac.training.callbacks import Answer, Event
     from csac.types import Algorithm
 
 PROCESSES_PER_GPU = 4  # eight were in each other's way
@@ -43,34 +42,6 @@ class Program(NamedTuple):
     hears: Hears = Hears()
     """What callbacks are told of, which training waits for."""
     command: str | None = None
-
-
-class Watcher(Protocol):
-    """Receives progress, results and notes while a program trains."""
-
-    def wait_for_turn(self, step: int) -> None:
-        """Wait until it is this program's turn to train on, after so many steps."""
-        ...
-
-    def progress(self, steps: Mapping[int, int]) -> None:
-        """Receive how many steps each seed has made."""
-        ...
-
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
-        """Receive the mean return of each seed's evaluation."""
-        ...
-
-    def call(self, event: Event) -> Answer:
-        """Tell the callbacks of an event, and return their answer."""
-        ...
-
-    def failed(self, seed: int, step: int, reason: str) -> None:
-        """Receive that a seed has failed, and why."""
-        ...
-
-    def note(self, text: str) -> None:
-        """Receive a line for the user."""
-        ...
 
 
 def choose_groups(

@@ -20,8 +20,9 @@ from csac.training.stalls import stalls_noted
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from csac.training.program import Program, Watcher
+    from csac.training.program import Program
     from csac.training.resume import ResumePoint
+    from csac.training.watch import Watcher
 
 
 def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], bool]) -> None:

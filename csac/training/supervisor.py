@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from csac.processes import Child, die_with_parent, end, outlive_termination
 from csac.record.run import RunDirectory, StorageFailure
 from csac.training.callbacks import STOPPED
+from csac.training.watch import Watcher
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from csac.training.callbacks import Answer, Event
-    from csac.training.program import Program, Watcher
+    from csac.training.program import Program
 
 SECONDS_TO_CLOSE = 5.0  # that a process has to close its environments
 
@@ -174,7 +175,7 @@ def record_failure(program: Program, watcher: Watcher, error: Exception) -> None
         watcher.failed(run.seed, run.manifest.steps_done, reason)
 
 
-class _RemoteWatcher:
+class _RemoteWatcher(Watcher):
     """Hands what happens to the parent, and hears from it in a thread of its own."""
 
     def __init__(self, connection: Connection) -> None:

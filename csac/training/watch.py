@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from csac.checks import check_flag
 from csac.tasks.perturbations import by_step, perturbations_of
+from csac.training.callbacks import Answer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -14,10 +15,33 @@ if TYPE_CHECKING:
     from csac.console.progress import Reporter
     from csac.record.run import RunDirectory
     from csac.record.sets import RunSet
-    from csac.training.callbacks import Answer, Callbacks, Event
+    from csac.training.callbacks import Callbacks, Event
 
 
-class Watch:
+class Watcher:
+    """Receives progress, results and notes while a program trains; this one does nothing."""
+
+    def wait_for_turn(self, step: int) -> None:
+        """Wait until it is this program's turn to train on, after so many steps."""
+
+    def progress(self, steps: Mapping[int, int]) -> None:
+        """Receive how many steps each seed has made."""
+
+    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
+        """Receive the mean return of each seed's evaluation."""
+
+    def call(self, event: Event) -> Answer:
+        """Tell the callbacks of an event, and return their answer."""
+        return Answer()
+
+    def failed(self, seed: int, step: int, reason: str) -> None:
+        """Receive that a seed has failed, and why."""
+
+    def note(self, text: str) -> None:
+        """Receive a line for the user."""
+
+
+class Watch(Watcher):
     """Tells the caller what happens, with a reporter on the terminal where `progress` is wanted. Raises InputError."""
 
     def __init__(self, reporter: Reporter | None, progress: bool, callbacks: Callbacks) -> None:
@@ -27,9 +51,6 @@ class Watch:
 
             reporter = Reporter()
         self.reporter, self.callbacks = reporter, callbacks
-
-    def wait_for_turn(self, step: int) -> None:
-        """Go on: nobody else trains in this process."""
 
     def progress(self, steps: Mapping[int, int]) -> None:
         """Show how many steps each seed has made."""

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from csac.record.config import RunConfig
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory
-from csac.training.callbacks import Answer
 from csac.training.config import name_of
 from csac.training.loop import Loop
 from csac.training.program import Program
 from csac.training.resume import ResumePoint
+from csac.training.watch import Watcher
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,23 +30,6 @@ class Outcome(NamedTuple):
     memories: list[np.ndarray]  # [steps, width] packed transitions, in the order of the steps
     evaluations: list[np.ndarray]
     failures: list[str]
-
-
-class Silent:
-    """Watches and says nothing."""
-
-    def wait_for_turn(self, step: int) -> None: ...
-
-    def progress(self, steps: Any) -> None: ...
-
-    def evaluated(self, step: int, returns: Any) -> None: ...
-
-    def call(self, event: Any) -> Answer:
-        return Answer()
-
-    def failed(self, seed: int, step: int, reason: str) -> None: ...
-
-    def note(self, text: str) -> None: ...
 
 
 def run(
@@ -78,7 +61,7 @@ def run(
             runs.append(RunDirectory.create(Path(folder, f"seed-{seed}"), Manifest(config=config)))
         paths = tuple(one.path for one in runs)
         program = Program(paths, algorithm, task, 1, environment_processes=environment_processes, tensorboard=False)
-        with closing(Loop(program, runs, [ResumePoint(None, [])] * len(runs), Silent())) as loop:
+        with closing(Loop(program, runs, [ResumePoint(None, [])] * len(runs), Watcher())) as loop:
             loop.run(lambda: False)
             carries = [loop.learner.carry(index) for index in range(len(seeds))]
             states, memories = [carry.state for carry in carries], [carry.memory.rows for carry in carries]

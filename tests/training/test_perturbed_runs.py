@@ -10,7 +10,6 @@ import probes
 import pytest
 from logs import log_lines
 from resuming import LEARNERS, Crash, contents, crash_at, run
-from trainer import Silent
 
 from csac.deploy.choosing import load
 from csac.evaluation.evaluator import Evaluator
@@ -23,6 +22,7 @@ from csac.training.loop import Loop
 from csac.training.program import Program
 from csac.training.resume import ResumePoint
 from csac.training.train import resume
+from csac.training.watch import Watcher
 from csac.types import InputError
 
 
@@ -48,7 +48,7 @@ class Paused:
         )
         self.run = RunDirectory.create(folder, Manifest(config=config))
         program = Program((self.run.path,), LEARNERS[0], task, threads=1, tensorboard=False)
-        self.loop = Loop(program, [self.run], [ResumePoint(None, [])], Silent())
+        self.loop = Loop(program, [self.run], [ResumePoint(None, [])], Watcher())
 
     def advance(self, until: int) -> None:
         while self.loop.step < until:
