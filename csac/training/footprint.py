@@ -33,7 +33,7 @@ def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at
         _bytes_per_seed(programs[0].algorithm, config, spec),
         sum(len(p.directories) for p in programs),
     )
-    evaluating = sum(program.evaluation_processes + (program.environment_processes or 0) for program in programs)
+    evaluating = sum((program.evaluation_processes or 0) + (program.environment_processes or 0) for program in programs)
     per_process = BYTES_PER_GPU_PROCESS if config.device == "gpu" else BYTES_PER_PROCESS
     needed = seeds * per_seed + len(programs) * per_process + evaluating * BYTES_PER_EVALUATION_PROCESS
     available, limit = psutil.virtual_memory().available, memory_left()

@@ -34,7 +34,8 @@ class Program(NamedTuple):
     task: Task
     threads: int
     """Cores that XLA divides its work for."""
-    evaluation_processes: int = 0
+    evaluation_processes: int | None = 0
+    """Of a template, None chooses."""
     environment_processes: int | None = 0
     """How many share the environments; None chooses by what a step costs."""
     tensorboard: bool = True
@@ -68,60 +69,43 @@ def choose_groups(
     return together + [rest[i : i + size] for i in range(0, len(rest), max(size, 1))]
 
 
-class Plan(NamedTuple):
-    """What all programs of a call have in common."""
+def cores_to_use() -> int:
+    """Return how many cores this process may compute on at a time."""
+    return len(usable_cores()[: core_quota()])
 
-    algorithm: Algorithm
-    task: Task
-    evaluation_processes: int | None
-    environment_processes: int | None
-    tensorboard: bool
-    wandb: bool | str
-    command: str | None
-    hears: Hears
 
-    def programs(
-        self, directories: Sequence[Sequence[Path]], existing: Mapping[int, RunDirectory], config: RunConfig
-    ) -> list[Program]:
-        """Return the programs of these directories. Raises InputError for what cannot be sent to a process."""
-        cores = len(usable_cores()[: core_quota()])
-        threads = max(1, cores // len(directories))
-        recorded = [run.manifest.machine.cores for run in existing.values() if run.manifest.process is not None]
-        threads = recorded[0] if recorded and recorded[0] <= cores else threads
-        has_processes = can_be_sent(self.task) and may_be_imported()
-        spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
-        processes = self.evaluation_processes
-        if processes is None:
-            pays = spare > 0 and not self.hears.evaluations and 0 < config.evaluation_interval < config.steps
-            pays = pays and config.evaluation_environments > 0
-            processes = min(batches, max(1, spare // len(directories))) if pays and has_processes else 0
-        check_whole("evaluation_processes", processes, 0, 1_000)
-        if not config.evaluation_environments and max(config.environments, *map(len, directories)) > 1:
-            raise InputError("evaluation_environments=0 is for one environment of one seed: have one seed per process")
-        stepping = self.environment_processes if has_processes else self.environment_processes or 0
-        most = config.environments if config.environments > 1 else 0
-        check_whole("environment_processes", stepping or 0, 0, most)
-        used_by = {"task": processes or stepping or len(directories) > 1, "algorithm": len(directories) > 1}
-        for name in (name for name, is_used in used_by.items() if is_used and not can_be_sent(getattr(self, name))):
-            raise InputError(
-                f"the {name} cannot be sent to another process: define it in a module that can be imported, or train "
-                "with seeds_per_process=seeds, evaluation_processes=0 and environment_processes=0"
-            )
-        return [
-            Program(
-                directories=tuple(group),
-                algorithm=self.algorithm,
-                task=self.task,
-                threads=threads,
-                evaluation_processes=processes,
-                environment_processes=stepping,
-                tensorboard=self.tensorboard,
-                wandb=self.wandb,
-                hears=self.hears,
-                command=self.command,
-            )
-            for group in directories
-        ]
+def programs_of(
+    template: Program, directories: Sequence[Sequence[Path]], existing: Mapping[int, RunDirectory], config: RunConfig
+) -> list[Program]:
+    """Return a program like `template` for each group of directories, which share the cores and processes.
+
+    Raises InputError for what cannot be sent to a process.
+    """
+    cores = cores_to_use()
+    threads = max(1, cores // len(directories))
+    recorded = [run.manifest.machine.cores for run in existing.values() if run.manifest.process is not None]
+    threads = recorded[0] if recorded and recorded[0] <= cores else threads
+    has_processes = can_be_sent(template.task) and may_be_imported()
+    spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
+    processes = template.evaluation_processes
+    if processes is None:
+        pays = spare > 0 and not template.hears.evaluations and 0 < config.evaluation_interval < config.steps
+        pays = pays and config.evaluation_environments > 0
+        processes = min(batches, max(1, spare // len(directories))) if pays and has_processes else 0
+    check_whole("evaluation_processes", processes, 0, 1_000)
+    if not config.evaluation_environments and max(config.environments, *map(len, directories)) > 1:
+        raise InputError("evaluation_environments=0 is for one environment of one seed: have one seed per process")
+    stepping = template.environment_processes if has_processes else template.environment_processes or 0
+    most = config.environments if config.environments > 1 else 0
+    check_whole("environment_processes", stepping or 0, 0, most)
+    used_by = {"task": processes or stepping or len(directories) > 1, "algorithm": len(directories) > 1}
+    for name in (name for name, is_used in used_by.items() if is_used and not can_be_sent(getattr(template, name))):
+        raise InputError(
+            f"the {name} cannot be sent to another process: define it in a module that can be imported, or train "
+            "with seeds_per_process=seeds, evaluation_processes=0 and environment_processes=0"
+        )
+    how = {"threads": threads, "evaluation_processes": processes, "environment_processes": stepping}
+    return [template._replace(directories=tuple(group), **how) for group in directories]
 
 
 def can_be_sent(task: Task | Algorithm) -> bool:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from csac.checks import check_flag, check_path
 from csac.deploy.choosing import TrainedRuns
-from csac.processes import core_quota, end_if_unguarded, usable_cores
+from csac.processes import end_if_unguarded
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
 from csac.record.wandb import import_wandb
@@ -21,7 +21,7 @@ from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs, make_manifest
 from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
-from csac.training.program import Plan, Program, choose_groups
+from csac.training.program import Program, choose_groups, cores_to_use, programs_of
 from csac.training.resume import Source, as_begun, refuse_differences
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
@@ -127,9 +127,11 @@ def train(
     existing = _existing(place, configs, resume, source, algorithm.cadence.has_schedule)
 
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task, algorithm)
-    plan = Plan(
+    template = Program(
+        directories=(),
         algorithm=algorithm,
         task=task,
+        threads=1,
         evaluation_processes=evaluation_processes,
         environment_processes=environment_processes,
         tensorboard=tensorboard,
@@ -137,7 +139,8 @@ def train(
         command=command,
         hears=watch.callbacks.hears,
     )
-    programs = plan.programs([[run_path(place, seed) for seed in group] for group in groups], existing, configs[0])
+    directories = [[run_path(place, seed) for seed in group] for group in groups]
+    programs = programs_of(template, directories, existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
 
     runs = _create(place, configs, groups, existing, source, demonstrations)
@@ -185,9 +188,11 @@ def resume(
         _extend(runs, steps, algorithm.cadence.has_schedule)
     existing = {run.seed: run for run in runs.runs}
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
-    plan = Plan(
+    template = Program(
+        directories=(),
         algorithm=algorithm,
         task=config.task,
+        threads=1,
         evaluation_processes=evaluation_processes,
         environment_processes=environment_processes,
         tensorboard=any(run.tensorboard.exists() for run in runs.runs),
@@ -195,7 +200,7 @@ def resume(
         command=command,
         hears=watch.callbacks.hears,
     )
-    programs = plan.programs([[existing[seed].path for seed in group] for group in groups], existing, config)
+    programs = programs_of(template, [[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
 
 
@@ -309,7 +314,7 @@ def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[s
             begin_with(programs[0].threads)
             train_program(programs[0], watch, should_stop)
         elif programs:
-            turns = max(1, _cores() // programs[0].threads) if runs.config.device == "cpu" else None
+            turns = max(1, cores_to_use() // programs[0].threads) if runs.config.device == "cpu" else None
             supervise(programs, lambda _: watch, should_stop, _workers(), turns)
         runs = TrainedRuns(runs.path, [RunDirectory.open(run.path) for run in runs.runs])
         draw_curve(RunSet.open(runs.path), watch.note)
@@ -323,11 +328,7 @@ def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[s
 
 
 def _workers() -> int:
-    return PROCESSES_PER_CORE * _cores()
-
-
-def _cores() -> int:
-    return len(usable_cores()[: core_quota()])
+    return PROCESSES_PER_CORE * cores_to_use()
 
 
 def _warmup_note(algorithm: Algorithm, config: RunConfig) -> list[str]:
