@@ -66,12 +66,11 @@ def _leaving_at_once() -> Any:
 
 def _trained(training: Callable[..., RunSet], *given: Any, **options: Any) -> int:
     """Train, and return the exit code; where it was stopped, print the line to type next."""
-    from csac.console.progress import Reporter
     from csac.console.tables import program
     from csac.training.signals import Interrupted
 
     try:
-        runs = training(*given, **options, reporter=Reporter())
+        runs = training(*given, **options)
     except Interrupted as stop:
         line = f"; to go on, type: {program()} resume {shlex.quote(str(stop.runs.path))}" if stop.can_resume else ""
         return complain(f"{stop}{line}", 128 + stop.signal_number)

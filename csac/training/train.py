@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
     from typing_extensions import Unpack
 
-    from csac.console.progress import Reporter
     from csac.record.config import RunConfig
     from csac.tasks.registry import Task
     from csac.training.callbacks import Callback
@@ -63,7 +62,6 @@ def train(
     tensorboard: bool = True,
     wandb: bool | str = False,
     progress: bool = True,
-    reporter: Reporter | None = None,
     command: str | None = None,
     callbacks: Sequence[Callback] = (),
     on_evaluation: OnEvaluation | None = None,
@@ -92,7 +90,6 @@ def train(
         tensorboard: whether to write TensorBoard files.
         wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to.
         progress: whether to show progress, as the command line does.
-        reporter: what shows it, instead of the terminal's own.
         command: the command line, for the manifest.
         callbacks: your own code, told how training goes (`csac.training.callbacks`), in this process.
         on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation of a program's seeds.
@@ -111,7 +108,7 @@ def train(
     end_if_unguarded()
     check_algorithm(algorithm)
     _check_arguments(resume, directory, wandb)
-    watch = Watch(reporter, progress, Callbacks(callbacks, on_evaluation, stop_when))
+    watch = Watch(progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(options.get("device", "cpu"))
     place = None if directory is None else Path(os.path.abspath(directory))  # the task may chdir
     wanted = labels(seeds, first_seed)
@@ -159,7 +156,6 @@ def resume(
     environment_processes: int | None = None,
     trust_task: bool = False,
     progress: bool = True,
-    reporter: Reporter | None = None,
     command: str | None = None,
     callbacks: Sequence[Callback] = (),
     on_evaluation: OnEvaluation | None = None,
@@ -181,7 +177,7 @@ def resume(
     if config.task_is_callable:
         raise InputError(f"the task of {runs.path} is a Python function: call csac.train with it and resume=True")
     refuse_untrusted(config.task, runs.path, trust_task)
-    watch = Watch(reporter, progress, Callbacks(callbacks, on_evaluation, stop_when))
+    watch = Watch(progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
     if steps is not None:

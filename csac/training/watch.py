@@ -12,7 +12,6 @@ from csac.training.callbacks import Answer
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from csac.console.progress import Reporter
     from csac.record.run import RunDirectory
     from csac.record.sets import RunSet
     from csac.training.callbacks import Callbacks, Event
@@ -44,13 +43,13 @@ class Watcher:
 class Watch(Watcher):
     """Tells the caller what happens, with a reporter on the terminal where `progress` is wanted. Raises InputError."""
 
-    def __init__(self, reporter: Reporter | None, progress: bool, callbacks: Callbacks) -> None:
+    def __init__(self, progress: bool, callbacks: Callbacks) -> None:
         check_flag("progress", progress)
-        if progress and reporter is None:
+        self.callbacks, self.reporter = callbacks, None
+        if progress:
             from csac.console.progress import Reporter
 
-            reporter = Reporter()
-        self.reporter, self.callbacks = reporter, callbacks
+            self.reporter = Reporter()
 
     def progress(self, steps: Mapping[int, int]) -> None:
         """Show how many steps each seed has made."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import runpy
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,6 @@ from scalars import scalars
 
 from csac.algorithms import SAC
 from csac.cli import main
-from csac.console.progress import Reporter
 from csac.evaluation.evaluator import Evaluator
 from csac.evaluation.play import evaluate_run
 from csac.record.run import RunDirectory
@@ -63,30 +64,15 @@ def test_an_episode_says_what_its_last_info_holds(number):
     assert evaluator.info_names == {"crashed", "stops", "is_success"}
 
 
-class Notes(Reporter):
-    """Shows nothing and remembers what it was told."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.console.quiet = True
-        self.notes: list[str] = []
-
-    def note(self, text: str) -> None:
-        self.notes.append(text)
-
-
 @pytest.fixture(scope="module")
 def cases(tmp_path_factory):
-    """A run with an event that there is and one that there is not: (the run, what its reporter was told)."""
-    reporter = Notes()
-    with pytest.MonkeyPatch.context() as patch:
+    """A run with an event that there is and one that there is not: (the run, the lines that it showed)."""
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as shown:
         patch.syspath_prepend(SUPPORT)
         folder = tmp_path_factory.mktemp("cases")
         names = ["crashed", "stops", "nothing", "stops"]
-        run = train(
-            TINY, "probes:Cases-v0", steps=40, directory=folder / "run", events=names, reporter=reporter, **SHORT
-        )
-    return run, reporter
+        run = train(TINY, "probes:Cases-v0", steps=40, directory=folder / "run", events=names, **SHORT)
+    return run, shown.getvalue().splitlines()
 
 
 def test_events_are_columns_after_success(cases):
@@ -144,8 +130,8 @@ def test_events_of_training_episodes_are_of_the_last_step_or_sums_or_means(tmp_p
 
 
 def test_a_name_that_nobody_says_is_noted_once(cases):
-    run, reporter = cases
-    (note,) = [line for line in reporter.notes if "nothing" in line]
+    run, shown = cases
+    (note,) = [line for line in shown if "called 'nothing'" in line]
     assert (run.runs[0].path / "log.txt").read_text().count(note) == 1
 
 

@@ -59,7 +59,7 @@ def calls_of(monkeypatch, module, name, result=()):
     def called(*given, **named):
         arguments = signature.bind(*given, **named).arguments
         arguments |= arguments.pop("options", {})
-        calls.append({name: value for name, value in arguments.items() if name not in ("reporter", "on_progress")})
+        calls.append({name: value for name, value in arguments.items() if name != "on_progress"})
         return result
 
     monkeypatch.setattr(module, name, called)
