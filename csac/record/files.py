@@ -43,22 +43,6 @@ def check_name(path: Path, aside: Path) -> None:
         raise InputError(f"cannot write {path}: {error.strerror}; choose another place or name") from None
 
 
-def create_atomically(path: Path, data: bytes) -> None:
-    """As `write_atomically`, but raise FileExistsError where the name is taken."""
-    aside = path.with_name(f".{path.name}.{_unique()}.new")
-    try:
-        write_atomically(aside, data)
-        try:
-            os.link(aside, path)
-        except FileExistsError:
-            raise
-        except OSError:  # a file system without links
-            path.touch(exist_ok=False)
-            os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
-
-
 def _unique() -> str:
     """Return what no other writer has: containers on several machines often have the same process number."""
     return secrets.token_hex(4)

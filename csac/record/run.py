@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from csac.checks import check_path
 from csac.record import manifest as manifests
-from csac.record.files import create_atomically, write_atomically
+from csac.record.files import write_atomically
 from csac.record.locks import is_locked, kept_from_children, take
 from csac.record.tables import COLUMNS, append_rows, continues, read_rows, structured
 from csac.types import Failure, InputError
@@ -66,10 +66,7 @@ class RunDirectory:
         content = manifests.written(dataclasses.replace(manifest, created=manifest.created or now()))
         try:
             path.mkdir(parents=True, exist_ok=True)
-            create_atomically(path / MANIFEST, content)  # of two processes, one gets past this line
-        except FileExistsError:
-            _refuse_occupied(path)
-            raise
+            write_atomically(path / MANIFEST, content)
         except OSError as error:
             reason = error.strerror or str(error)
             raise InputError(f"cannot write to {path}: {reason}; choose another directory") from None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from csac.checks import check_flag, check_path
 from csac.deploy.choosing import TrainedRuns
 from csac.processes import end_if_unguarded
+from csac.record.files import name_aside
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
 from csac.record.wandb import import_wandb
@@ -276,7 +277,7 @@ def _create(
     changed = [config for config in configs if config.seed in existing and config != existing[config.seed].config]
     _change([existing[config.seed] for config in changed], changed)
     new = [config for config in configs if config.seed not in existing]
-    aside = {config.seed: place / f".seed-{config.seed}.{os.getpid()}" for config in new}
+    aside = {config.seed: name_aside(run_path(place, config.seed)) for config in new}
     try:
         for config in new:
             manifest = make_manifest(config, next(group for group in groups if config.seed in group))
