@@ -67,14 +67,14 @@ def _header(path: Path, line: bytes) -> list[str]:
     try:
         return next(csv.reader([line.decode()]))
     except (UnicodeDecodeError, csv.Error):
-        raise InputError(f"{path} is not a table of a run: its first line is no header; restore it") from None
+        raise InputError(f"{path} is no table of a run (its first line is no header): restore it") from None
 
 
-def check_new(path: Path, what: str = "table", suffix: str = ".csv") -> None:
+def check_new(path: Path) -> None:
     """Raise InputError where there is a file already or none can be, before anything has been computed for it."""
-    if path.suffix.lower() != suffix:
-        better = path.with_suffix(suffix) if path.name else path / f"{what}{suffix}"
-        raise InputError(f"the {what} is a {suffix} file: name it {better}")
+    if path.suffix.lower() != ".csv":
+        better = path.with_suffix(".csv") if path.name else path / "table.csv"
+        raise InputError(f"the table is a .csv file: name it {better}")
     check_name(path, name_aside(path))
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
@@ -110,28 +110,18 @@ def read_rows(path: str | Path) -> np.ndarray:
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}; give the CSV file of a run") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not a text file; give the CSV file of a run") from None
-    try:
         header, *body = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))) or [[]]
-    except csv.Error as error:
-        raise InputError(f"{path} is not a CSV file ({error}); give one csac wrote") from None
-    if not header and not body:
-        return structured(COLUMNS.get(path.stem, ("seed", "step")), [])
-    is_plain = all(name.isprintable() for name in header)  # it moves no terminal
-    if len(set(header)) < len(header) or not {"seed", "step"} <= set(header) or not is_plain:
-        raise InputError(
-            f"{path} is not a table of a run: its header is {','.join(header)[:100]!r}; give one that csac wrote"
-        )
-    for number, cells in enumerate(body, start=2):
-        if len(cells) != len(header):
-            raise InputError(f"{path}, line {number}: {len(cells)} cells instead of {len(header)}; remove that line")
-    try:
+        if not header and not body:
+            return structured(COLUMNS.get(path.stem, ("seed", "step")), [])
+        is_plain = all(name.isprintable() for name in header)  # it moves no terminal
+        if len(set(header)) < len(header) or not {"seed", "step"} <= set(header) or not is_plain:
+            raise ValueError(f"its header is {','.join(header)[:100]!r}")
+        for number, cells in enumerate(body, start=2):
+            if len(cells) != len(header):
+                raise ValueError(f"line {number} has {len(cells)} cells, not {len(header)}")
         return structured(header, body)
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{path} is damaged ({_short(error)}); remove the line that holds it") from None
+    except (OSError, csv.Error, ValueError, OverflowError) as error:
+        raise InputError(f"{path} is no table of a run ({_short(error)}): restore it") from None
 
 
 def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarray:
@@ -148,7 +138,7 @@ def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarr
 
 def _short(error: Exception) -> str:
     """Return what an error says; a cell may be as long as the file."""
-    return textwrap.shorten(str(error), 100, placeholder=" ...") if len(str(error)) < 10_000 else "a huge cell"
+    return textwrap.shorten(str(error), 150, placeholder=" ...") if len(str(error)) < 10_000 else "a huge cell"
 
 
 def _float(cell: str) -> float:
