@@ -164,8 +164,7 @@ def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | Non
 
 def plus_minus(over: OverSeeds) -> Cell:
     """Return `mean ± std`, of one seed its value alone; whole numbers from 20 on, but for a spread below 1."""
-    form = _form(over.mean, over.std)
-    return numeric(over.mean, f"{over.mean:{form}}" + ("" if math.isnan(over.std) else f" ± {over.std:{form}}"))
+    return _plus_minus(over, _form(over.mean, over.std))
 
 
 def interval(over: OverSeeds) -> Cell:
@@ -200,6 +199,11 @@ def _summary(label: str, *cells: Cell) -> Row:
 
 def _whole(value: int) -> Cell:
     return Cell(f"{value:,}", value)
+
+
+def _plus_minus(over: OverSeeds, form: str) -> Cell:
+    spread = "" if math.isnan(over.std) else f" ± {over.std:{form}}"
+    return numeric(over.mean, f"{over.mean:{form}}{spread}")
 
 
 def _form(value: float, spread: float = math.nan) -> str:
@@ -238,9 +242,7 @@ def _success(rows: np.ndarray, points: int) -> OverSeeds | None:
 
 
 def _share(success: OverSeeds | None) -> Cell:
-    if success is None:
-        return EMPTY
-    return Cell(f"{success.mean:.0%}" + ("" if math.isnan(success.std) else f" ± {success.std:.0%}"), success.mean)
+    return _plus_minus(success, ".0%") if success else EMPTY
 
 
 def _largest(run: RecoverySummary) -> float:
@@ -281,9 +283,7 @@ def _rate(is_case: bool, value: float) -> Cell:
 
 def _mean_return(rows: np.ndarray) -> Cell:
     over = over_seeds(rows["return"][rows["seed"] == seed].mean() for seed in set(rows["seed"].tolist()))
-    form = ".3g" if 0 < abs(over.mean) < SMALL else ",.1f"
-    mean, std = (numeric(value, f"{value:{form}}").text for value in (over.mean, over.std))
-    return numeric(over.mean, f"{mean} ± {std}" if std else mean)
+    return _plus_minus(over, ".3g" if 0 < abs(over.mean) < SMALL else ",.1f")
 
 
 def _rate_over_seeds(case: CaseSummary | None) -> Cell:
