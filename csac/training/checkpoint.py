@@ -237,6 +237,16 @@ def newest_sound(folder: Path, until: int | None = None) -> tuple[Checkpoint | N
     return None, complaints
 
 
+def checkpoint_of(folder: Path, step: int | None) -> Checkpoint:
+    """Return the checkpoint of a step, by default the newest sound one. Raises InputError where there is none."""
+    checkpoint, complaints = newest_sound(folder, step)
+    if checkpoint is None or step not in (None, checkpoint.step):
+        known = ", ".join(map(str, steps_in(folder))) or "none"
+        wanted = "" if step is None else f" of step {step}"
+        raise InputError("; ".join(complaints) or f"{folder.parent} has no checkpoint{wanted}; it has {known}")
+    return checkpoint
+
+
 def shards(files: Mapping[str, Any]) -> list[tuple[int, int, str]]:
     """Return (first, last + 1, name) of each file of transitions, in order."""
     names = (re.fullmatch(rf"{REPLAY}/(\d+)-(\d+)\.safetensors", name) for name in files)

@@ -19,7 +19,7 @@ from csac.deploy.choosing import choose_run, load_run
 from csac.record.config import STEPS_LIMIT
 from csac.record.run import RunDirectory
 from csac.record.sets import RunSet
-from csac.training.checkpoint import Checkpoint, newest_sound
+from csac.training.checkpoint import Checkpoint, checkpoint_of
 from csac.training.config import algorithm_of
 from csac.training.learner import incompatibility
 from csac.training.one_seed import KEY_DATA
@@ -140,7 +140,4 @@ def load_checkpoint(
     run = choose_run(RunSet.open(directory), seed)
     if step is not None:
         check_whole("step", step, 1, STEPS_LIMIT)
-    checkpoint, complaints = newest_sound(run.checkpoints, step)
-    if checkpoint is None or (step is not None and checkpoint.step != step):
-        raise InputError("; ".join(complaints) or f"{run.path} has no checkpoint{f' of step {step}' if step else ''}")
-    return Learnt(run, checkpoint, trust_task)
+    return Learnt(run, checkpoint_of(run.checkpoints, step), trust_task)

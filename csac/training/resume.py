@@ -16,7 +16,16 @@ from csac.record.run import TABLES, RunDirectory, now
 from csac.record.sets import RunSet
 from csac.record.tables import continues
 from csac.tasks.perturbations import continued, perturbations_of
-from csac.training.checkpoint import REPLAY, Checkpoint, Damaged, newest_sound, prune, steps_in, write_folder
+from csac.training.checkpoint import (
+    REPLAY,
+    Checkpoint,
+    Damaged,
+    checkpoint_of,
+    newest_sound,
+    prune,
+    steps_in,
+    write_folder,
+)
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -216,15 +225,7 @@ class Source(NamedTuple):
         found = RunSet.open(name if has_step else where)
         runs = {seed: found.run(seed) for seed in seeds}
         step = int(text) if has_step else min(max(steps_in(run.checkpoints), default=0) for run in runs.values())
-        checkpoints = {}
-        for seed, run in runs.items():
-            checkpoint, complaints = newest_sound(run.checkpoints, step)
-            if checkpoint is None or checkpoint.step != step:
-                known = ", ".join(map(str, steps_in(run.checkpoints))) or "none"
-                raise InputError(
-                    "; ".join(complaints) or f"{run.path} has no checkpoint of step {step}; it has {known}"
-                )
-            checkpoints[seed] = checkpoint
+        checkpoints = {seed: checkpoint_of(run.checkpoints, step) for seed, run in runs.items()}
         return cls(found.path, runs, checkpoints)
 
     @property
