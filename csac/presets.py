@@ -123,6 +123,7 @@ _FASTER_CRITICS: Mapping[str, Any] = MappingProxyType(
         "policy_delay": 3,
         "adam_momentum": 0.5,
         "entropy_weight": "auto",
+        "initial_entropy_weight": 1.0,
         "target_entropy": None,
         "target_entropy_per_dimension": -1.0,
         "weight_learning_rate": 3e-4,
@@ -140,7 +141,7 @@ _STRONG: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "relative_entropy_estimator": "closed_form",
             "target_log_prob_bound": 0.0,
         },
-        "sac": {**_FASTER_CRITICS, "initial_entropy_weight": 1.0},
+        "sac": _FASTER_CRITICS,
     }
 )
 

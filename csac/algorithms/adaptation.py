@@ -29,9 +29,6 @@ class Weights(NamedTuple):
     relative_entropy: Any  # τ
 
 
-FIRST = Weights(1.0, 0.5)  # of those that are learnt: SAC's first temperature, and the paper's τ
-
-
 class LearntWeight(NamedTuple):
     """A weight as its logarithm, so that it stays positive, and its optimiser's state."""
 
@@ -70,17 +67,12 @@ def adapt_weight(
     return LearntWeight(log_weight, state)
 
 
-def entropy_target(given: float | None, per_dimension: float, dimensions: int) -> float:
-    """Return the entropy to aim at, in nats: what is given, or so much for each action dimension (SAC: -1)."""
-    return per_dimension * dimensions if given is None else given
-
-
-def make_weights(given: Weights, optimiser: optax.GradientTransformation) -> LearntWeights | None:
+def make_weights(given: Weights, first: Weights, optimiser: optax.GradientTransformation) -> LearntWeights | None:
     """Return what those weights that are `auto` begin with; None where both are given."""
-    entropy = make_weight(FIRST.entropy, optimiser) if given.entropy == "auto" else None
+    entropy = make_weight(first.entropy, optimiser) if given.entropy == "auto" else None
     if given.relative_entropy != "auto":
         return entropy and LearntWeights(entropy)
-    return LearntWeights(entropy, make_weight(FIRST.relative_entropy, optimiser), jnp.zeros(()))
+    return LearntWeights(entropy, make_weight(first.relative_entropy, optimiser), jnp.zeros(()))
 
 
 def current_weights(given: Weights, learnt: LearntWeights | None) -> Weights:

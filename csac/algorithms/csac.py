@@ -18,7 +18,7 @@ from csac.algorithms.critics import Critics, min_q, update_critics
 from csac.algorithms.distributions import action_at, bounded, kl, log_ratio, policy_at
 from csac.algorithms.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE, RATE
 from csac.algorithms.networks import MLP, copy_tree, gradient_step, make_optimiser, polyak
-from csac.algorithms.off_policy import TwinCritics, first_metrics, improve_delayed, policy_network
+from csac.algorithms.off_policy import MaximumEntropy, first_metrics, improve_delayed, policy_network
 from csac.algorithms.shapes import Action, Actions, Count, Key, Observation, Observations, Scalar
 from csac.algorithms.statistics import Statistics, normalise, normalise_batch
 from csac.types import InputError, Metrics, PolicyNetwork, Spec, Transition
@@ -39,7 +39,7 @@ class State(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CSAC(TwinCritics):
+class CSAC(MaximumEntropy):
     """Conservative Soft Actor-Critic; the paper's own Algorithm 1 is the preset `paper`."""
 
     entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.2
@@ -58,14 +58,8 @@ class CSAC(TwinCritics):
     """Whether the relative entropy is in the critic's target and in the actor's loss, or in the actor's loss alone."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on log π and on the relative entropy of an action in the critic's target, in nats; 0 is no bound."""
-    target_entropy: float | None = None
-    """Entropy that `auto` aims at, in nats; None is `target_entropy_per_dimension`."""
-    target_entropy_per_dimension: float = -1.0
-    """Entropy that `auto` aims at, in nats per action dimension."""
     target_relative_entropy: Annotated[float, POSITIVE] = 0.01
     """Relative entropy per refresh that `auto` aims at, in nats per action dimension; less for `average`."""
-    weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
-    """Learning rate of weights that are `auto`."""
 
     name: ClassVar[str] = "csac"
 
@@ -79,10 +73,11 @@ class CSAC(TwinCritics):
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return random networks; targets and reference are copies (Algorithm 1, line 1)."""
         networks, given = self.first_networks(key, spec, steps, 2 * spec.action_size), self.given_weights
+        first = Weights(self.initial_entropy_weight, 0.5)  # of those that are `auto`
         return State(
             **networks,
             reference=copy_tree(networks["actor"]),
-            learnt_weights=adaptation.make_weights(given, make_optimiser(self.weight_learning_rate)),
+            learnt_weights=adaptation.make_weights(given, first, make_optimiser(self.weight_learning_rate)),
             actor_metrics=first_metrics(("actor_loss", "entropy", "relative_entropy"), self.policy_delay),
         )
 
@@ -184,7 +179,7 @@ class CSAC(TwinCritics):
 
     def update_weights(self, state: State, metrics: Metrics, dimensions: int, step: Count) -> LearntWeights | None:
         """Return the learnt weights after one step: σ follows the entropy, τ the relative entropy before a refresh."""
-        target = adaptation.entropy_target(self.target_entropy, self.target_entropy_per_dimension, dimensions)
+        target = self.entropy_target(dimensions)
         targets = Weights(target, self.target_relative_entropy * dimensions)
         until_refresh = self.reference_period - step % self.reference_period
         is_last = self.reference_policy == "average" or until_refresh <= self.policy_delay

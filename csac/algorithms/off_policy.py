@@ -188,6 +188,25 @@ class TwinCritics(OffPolicy):
         }
 
 
+@dataclass(frozen=True)
+class MaximumEntropy(TwinCritics):
+    """What CSAC and SAC share besides: options of a weight of the entropy that is learnt, `auto`."""
+
+    initial_entropy_weight: Annotated[float, POSITIVE] = 1.0
+    """What an entropy weight of `auto` begins with."""
+    target_entropy: float | None = None
+    """Entropy that `auto` aims at, in nats; by default `target_entropy_per_dimension` for each action dimension."""
+    target_entropy_per_dimension: float = -1.0
+    """Entropy that `auto` aims at, in nats per action dimension."""
+    weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
+    """Learning rate of weights that are `auto`."""
+
+    def entropy_target(self, dimensions: int) -> float:
+        """Return the entropy that `auto` aims at, in nats."""
+        given = self.target_entropy
+        return self.target_entropy_per_dimension * dimensions if given is None else given
+
+
 def first_metrics(names: Iterable[str], policy_delay: int) -> Metrics | None:
     """Return the metrics of an actor that waits and has not moved yet, 0 each; None where it moves at every update."""
     return None if policy_delay == 1 else {name: jnp.zeros(()) for name in names}

@@ -9,12 +9,12 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms.adaptation import LearntWeight, adapt_weight, entropy_target, make_weight
+from csac.algorithms.adaptation import LearntWeight, adapt_weight, make_weight
 from csac.algorithms.critics import Critics, min_q, update_critics
 from csac.algorithms.distributions import action_at, policy_at
-from csac.algorithms.hyperparameters import NOT_NEGATIVE, POSITIVE
+from csac.algorithms.hyperparameters import NOT_NEGATIVE
 from csac.algorithms.networks import MLP, gradient_step, make_optimiser, polyak
-from csac.algorithms.off_policy import TwinCritics, first_metrics, improve_delayed, policy_network
+from csac.algorithms.off_policy import MaximumEntropy, first_metrics, improve_delayed, policy_network
 from csac.algorithms.shapes import Action, Actions, Count, Key, Observation, Observations, Scalar
 from csac.algorithms.statistics import Statistics, normalise, normalise_batch
 from csac.types import Metrics, PolicyNetwork, Spec, Transition
@@ -34,19 +34,11 @@ class State(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SAC(TwinCritics):
+class SAC(MaximumEntropy):
     """Soft Actor-Critic."""
 
     entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = "auto"
     """Weight of the entropy (SAC's temperature alpha); `auto` learns it, to keep the entropy at its target."""
-    initial_entropy_weight: Annotated[float, POSITIVE] = 1.0
-    """What a weight of `auto` begins with."""
-    target_entropy: float | None = None
-    """Entropy that `auto` aims at, in nats; None is `target_entropy_per_dimension`."""
-    target_entropy_per_dimension: float = -1.0
-    """Entropy that `auto` aims at, in nats per action dimension."""
-    weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
-    """Learning rate of a weight of `auto`."""
 
     name: ClassVar[str] = "sac"
 
@@ -94,7 +86,7 @@ class SAC(TwinCritics):
         adam = self.optimiser(self.actor_learning_rate)
         actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)
         if self.entropy_weight == "auto":
-            target = entropy_target(self.target_entropy, self.target_entropy_per_dimension, noise.shape[-1])
+            target = self.entropy_target(noise.shape[-1])
             adam = make_optimiser(self.weight_learning_rate)
             temperature = adapt_weight(temperature, metrics["entropy"], adam, target)
         return state._replace(actor=actor, actor_optimiser=optimiser, temperature=temperature), metrics

@@ -8,7 +8,7 @@ import numpy as np
 import optax
 from equations import batch_of, transition
 
-from csac.algorithms.adaptation import entropy_target
+from csac.algorithms import CSAC, SAC
 from csac.algorithms.memory import Replay, pack
 from csac.algorithms.networks import gradient_step, init_optimiser, make_mlp, unit_columns
 from csac.algorithms.statistics import ReturnScale
@@ -56,5 +56,5 @@ def test_hidden_columns_have_unit_length_after_a_step_and_the_last_layer_is_free
 
 
 def test_the_entropy_to_aim_at_counts_action_dimensions_unless_it_is_given():
-    assert entropy_target(None, -0.5, 6) == -3.0
-    assert entropy_target(-2.0, -0.5, 6) == -2.0
+    assert SAC(target_entropy_per_dimension=-0.5).entropy_target(6) == -3.0
+    assert CSAC(target_entropy_per_dimension=-0.5, target_entropy=-2.0).entropy_target(6) == -2.0
