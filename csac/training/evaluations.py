@@ -35,12 +35,7 @@ SECONDS_TO_FINISH = 10.0  # that an evaluation has once a stop is asked for
 class Evaluations:
     """Evaluates the policies of runs that are trained together, one evaluation at a time, and records each.
 
-    Args:
-        program: what is trained and how.
-        runs: the run directories; `recorders` write to them.
-        environments: those that are trained in.
-        watcher, notifier: who is told; the latter may end training.
-        opened: closes what is opened here.
+    The notifier may end training; `opened` closes what is opened here.
     """
 
     def __init__(
