@@ -130,8 +130,8 @@ class Checkpoint(NamedTuple):
 class Writer:
     """Writes the checkpoints of one run, and remembers which transitions are on disk.
 
-    `keep` is how many checkpoints to keep, 0 for all; `known` are the files of the checkpoint that the run goes on from,
-    if their transitions are whole.
+    `keep` is how many checkpoints to keep, 0 for all; `known` are the files of the checkpoint that the run goes on
+    from, if their transitions are whole.
     """
 
     def __init__(self, folder: Path, keep: int, known: Mapping[str, Facts] | None = None) -> None:
