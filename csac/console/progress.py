@@ -17,7 +17,6 @@ from rich.text import Text
 from csac.console.tables import duration, make_console, program, result_tables
 from csac.console.waiting import SECONDS_OF_SILENCE, Speed
 from csac.record.rendering import number, short
-from csac.tasks.registry import can_be_drawn
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -238,7 +237,7 @@ def _next_lines(runs: RunSet, has_curve: bool) -> list[tuple[str, str]]:
         task = config.task if config.task.isidentifier() else "your_task"
         return [*lines, ("test it", f"in Python: evaluate(load({str(runs.path)!r}), {task})")]
     lines.append(("test it", f"{program()} evaluate {directory}"))
-    if can_be_drawn(config.task) and (has_curve or len(runs.runs) == 1):
+    if has_curve or len(runs.runs) == 1:
         film = shlex.quote(str(runs.path / "play.mp4"))
         lines.append(("watch it", f"{program()} play {directory} --video {film}"))
     return [*lines, ("export", f"{program()} export {directory} --format numpy")]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from csac.deploy.policy import noise_generator
-from csac.tasks.events import EpisodeEvents, numbers, numbers_in
+from csac.tasks.events import EpisodeEvents, numbers
 from csac.tasks.failures import EnvironmentFailure
 from csac.types import Failure
 
@@ -84,10 +84,6 @@ class Playing:
         """Return what there is to say of the episode."""
         said = self._events.of(self.last_info, self.length)
         return EvaluationEpisode(self.number, self._return, self.length, _success(self.last_info), said)
-
-    def info_names(self) -> set[str]:
-        """Return the names of the numbers in the last step's `info`."""
-        return set(numbers_in(self.last_info))
 
     def _failure(self, error: EnvironmentFailure) -> EvaluationFailure:
         place = f"evaluation episode {self.number}, reset with seed {self._seed}, at step {self.length}"

@@ -40,8 +40,8 @@ class Evaluator:
 
     Episodes run side by side in batches of one fixed shape, so that an episode's numbers depend neither on when the
     others end nor on how many there are. The environments are made at the first batch and kept, but for tasks whose
-    resets do not forget what was before: they are made anew for each batch. `info_names` are the names of all numbers
-    that the last steps of episodes have held in `info` so far, `perturbed` what `perturb` was last given.
+    resets do not forget what was before: they are made anew for each batch. `perturbed` is what `perturb` was
+    last given.
 
     Args:
         task: as `Environment`'s.
@@ -70,7 +70,6 @@ class Evaluator:
         self._lent, self._at_once = lent, min(environments, EPISODES_AT_ONCE, episodes)
         self._environments = [lent] if lent else []
         self._ignores_seed: bool | None = None  # None before the first batch
-        self.info_names: set[str] = set()
         self.perturbed: dict[str, float] = {}
 
     def perturb(self, values: Mapping[str, float]) -> None:
@@ -134,7 +133,6 @@ class Evaluator:
         except EvaluationFailure:
             self.close()  # what has raised may be broken for good, and the next policy is to fail by itself alone
             raise
-        self.info_names.update(*(episode.info_names() for episode in episodes))
         return [episode.result() for episode in episodes]
 
     def answer(

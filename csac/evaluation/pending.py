@@ -80,11 +80,10 @@ class Pending:
         for worker in [worker for worker in self._busy if worker.connection in ready]:
             batch = self._busy.pop(worker)
             try:
-                answer, info_names = worker.connection.recv()
+                answer = worker.connection.recv()
             except (EOFError, OSError):
                 self.notes.append(f"evaluation: {worker.cause_of_death()}; its episodes are run by this one instead")
                 continue
-            self._evaluator.info_names |= info_names
             self._take(batch, answer)
             self._idle.append(worker)
         self._hand_out()

@@ -29,7 +29,7 @@ class EvaluationPool:
     """Does what `Evaluator` does, batch by batch in processes of their own; the numbers are the same to the last bit.
 
     A batch is what one evaluator steps at a time, so that nothing depends on which process takes it. The processes
-    start at the first evaluation, or at `start`, and wait for the next until `close`. `info_names` are the evaluator's.
+    start at the first evaluation, or at `start`, and wait for the next until `close`.
 
     Args:
         evaluator: what each process works with, perturbed as it is when an evaluation begins.
@@ -47,11 +47,6 @@ class EvaluationPool:
             ) from None
         self._evaluator, self._processes = evaluator, processes
         self._workers: list[Worker] = []
-
-    @property
-    def info_names(self) -> set[str]:
-        """The names of all numbers that the last steps of episodes have held in `info` so far."""
-        return self._evaluator.info_names
 
     def start(self) -> None:
         """Start every process that is not there, so that an evaluation need not wait for it."""
@@ -97,7 +92,7 @@ def _work(connection: Connection, evaluator: Evaluator) -> None:
     outlive_termination()
     try:
         while work := connection.recv():
-            connection.send((evaluator.answer(*work), evaluator.info_names))
+            connection.send(evaluator.answer(*work))
     except (EOFError, OSError):
         return
     finally:

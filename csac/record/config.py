@@ -23,8 +23,7 @@ MOST_EPISODES = 1_000_000
 class RunConfig:
     """Everything that decides what one run computes. Steps are environment steps.
 
-    Raises:
-        InputError: a number outside its range, or values that JSON would change.
+    Raises InputError for a number outside its range, or values that JSON would change.
     """
 
     task: str
@@ -113,8 +112,7 @@ _RANGES = (
 def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
     """Return keyword arguments as JSON gives them back; tuples become lists, NumPy's numbers plain ones.
 
-    Raises:
-        InputError: JSON would change a value, so that a resumed run would be another run.
+    Raises InputError where JSON would change a value, so that a resumed run would be another run.
     """
     plain = _plain(values)
     try:

@@ -22,11 +22,7 @@ _NUMBERS = ("seed", "step", "episode", "return", "length")  # of evaluations, wh
 class Recorder:
     """Writes the rows of one run, a few hundred steps at a time.
 
-    Args:
-        run: the run directory.
-        begin: the step that it goes on from; 0 for its beginning.
-        tensorboard: whether to write TensorBoard files too.
-        wandb: whether to log to W&B too, with TensorBoard's values, or the project to log to.
+    `begin` is the step that it goes on from; `wandb` may name the project to log to, with TensorBoard's values.
     """
 
     def __init__(self, run: RunDirectory, begin: int, tensorboard: bool, wandb: bool | str = False) -> None:

@@ -56,11 +56,7 @@ class RunDirectory:
 
     @classmethod
     def create(cls, path: str | Path, manifest: Manifest) -> RunDirectory:
-        """Start a run in a new or empty directory.
-
-        Raises:
-            InputError: there is something in it, or it cannot be written.
-        """
+        """Start a run in a new or empty directory. Raises InputError where it is none, or cannot be written."""
         path = Path(os.path.abspath(path))
         _refuse_occupied(path)
         content = manifests.written(dataclasses.replace(manifest, created=manifest.created or now()))
@@ -83,8 +79,7 @@ class RunDirectory:
     def open(cls, path: str | os.PathLike[str]) -> RunDirectory:
         """Open a run that exists; where its manifest is lost or damaged, from the copy in its newest checkpoint.
 
-        Raises:
-            InputError: there is no run, or its manifest cannot be used.
+        Raises InputError where there is no run, or its manifest cannot be used.
         """
         check_path("a run directory", path)
         path = Path(os.path.abspath(path))
@@ -193,11 +188,7 @@ class RunDirectory:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from writing to this run. The system gives the lock back if this process dies.
-
-        Raises:
-            InputError: another process holds it, or the file system has none to give.
-        """
+        """Keep other processes from writing to this run while this one lives. Raises InputError where it cannot."""
         for path in [*self.path.iterdir(), *self.checkpoints.glob("*")]:
             if path.is_symlink():  # what it points to would be overwritten
                 raise InputError(f"{path} is a link: replace it by what it points to")

@@ -131,8 +131,7 @@ def as_folder(name: str) -> str:
 def find_sets(directory: str | Path, on_damaged: Callable[[InputError], None] | None = None) -> list[RunSet]:
     """Return every set of runs in `directory` and below, sorted by path; `on_damaged` is told why another is not.
 
-    Raises:
-        InputError: there is no such directory.
+    Raises InputError where there is no such directory.
     """
     directory = Path(directory)
     if not directory.is_dir():

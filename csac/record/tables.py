@@ -84,11 +84,7 @@ def check_new(path: Path) -> None:
 
 
 def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a table as `append_rows` does; the file gets its name once it is whole.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write a table as `append_rows` does; the file gets its name once it is whole. Raises InputError."""
     aside = name_aside(path)
     try:
         append_rows(aside, columns, rows)

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from csac.checks import check_whole
-from csac.console.tables import STATE_STYLES, duration, make_console, program
+from csac.console.tables import Fitted, duration, make_console, program
 from csac.processes import core_quota, usable_cores
-from csac.record.rendering import short
+from csac.record.rendering import Cell, Row, Table, short
 from csac.record.run import RunDirectory, StorageFailure
 from csac.record.wandb import import_wandb
 from csac.studies.study import find, named
@@ -287,14 +287,6 @@ def _pace(run: RunDirectory) -> float | None:
     return seconds_per_step(run)
 
 
-def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    for heading in headings:
-        table.add_column(heading, overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(cell, STATE_STYLES.get(cell, "")) for cell in row))
-    make_console().print(table)
+def _print_table(headings: tuple[str, ...], rows: Sequence[Sequence[str]]) -> None:
+    cells = tuple(Row(tuple(map(Cell, row)), "failed" if "failed" in row else "plain") for row in rows)
+    make_console().print(Fitted(Table(headings, cells)))

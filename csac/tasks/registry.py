@@ -148,17 +148,6 @@ def _packages(environment: gymnasium.Env) -> set[str]:
     return {kind.__module__.partition(".")[0] for kind in type(environment.unwrapped).__mro__}
 
 
-def can_be_drawn(task: str) -> bool:
-    """Whether a video can be made of a task of which this process has made an environment, as far as is known of it."""
-    spec = gymnasium.registry.get(task.rpartition(":")[2])
-    creator: Any = spec.entry_point if spec else None
-    if isinstance(creator, str):
-        module, _, name = creator.partition(":")
-        creator = getattr(sys.modules.get(module), name, None)
-    modes = (getattr(creator, "metadata", None) or {}).get("render_modes")
-    return modes is None or "rgb_array" in modes
-
-
 def events_of(task: object, more: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the names of a task's own events, then `more`, each once."""
     adapter = adapter_of(task)

@@ -215,8 +215,7 @@ class SeedEnvironments:
         """Let the seed at this place go on from `save`; return false where an episode of it had to start anew.
 
         That is so as well where the environment does not take the snapshot, which `refused` then says. A seed whose
-        environment cannot be reset either is reported by the next `step`. Raises KeyError or ValueError where this is
-        not what `save` returns.
+        environment cannot be reset either is reported by the next `step`.
         """
         if self.spec.environments == 1:
             return self._restore((index,), saved, saved.values["exact"])
@@ -226,13 +225,9 @@ class SeedEnvironments:
 
     def _restore(self, place: Place, saved: Snapshot, is_exact: bool) -> bool:
         arrays, values = dict(saved.arrays), saved.values
-        _check_saved(values)
-        observation = arrays.pop("observation")
-        if observation.shape != self._observation[place].shape:
-            raise ValueError(f"an observation has shape {observation.shape}")
         self._begun[place] = values["episodes_begun"]
         self._observation, self._reward = self._observation.copy(), self._reward.copy()
-        self._observation[place], self._reward[place] = observation, values["reward"]
+        self._observation[place], self._reward[place] = arrays.pop("observation"), values["reward"]
         if not values["alive"]:
             self.stop(place[0])
         elif is_exact and self._is_restored(place, Snapshot(arrays, values["environment"])):
@@ -307,13 +302,3 @@ class SeedEnvironments:
         details = "".join(traceback.format_exception(error)) if error.__cause__ else ""
         if all(failure.seed_index != place[0] for failure in self._failures):
             self._failures.append(Failure(place[0], str(error), details))
-
-
-def _check_saved(values: Mapping[str, Any]) -> None:
-    """Raise KeyError or ValueError where values are not of the kinds that `SeedEnvironments.save` gives."""
-    flags, counts = ("alive", "exact"), ("episodes_begun", "episode_length")
-    wrong = [name for name in flags if type(values[name]) is not bool]
-    wrong += [name for name in counts if type(values[name]) is not int or not 0 <= values[name] < 2**53]
-    wrong += [name for name in ("reward", "episode_return") if type(values[name]) is not float]
-    if wrong or not isinstance(values["environment"], dict) or (values["exact"] and not values["episodes_begun"]):
-        raise ValueError(f"{' and '.join(wrong) or 'the environment'} cannot be what was saved")

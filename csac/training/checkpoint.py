@@ -76,11 +76,7 @@ class Checkpoint(NamedTuple):
             raise Damaged(f"{path} is not a checkpoint ({type(error).__name__}: {error})") from error
 
     def read(self, name: str) -> bytes:
-        """Return the content of one of the files; that of a table or best policy from the run where it still has it.
-
-        Raises:
-            Damaged: it is missing, cut off or changed.
-        """
+        """Return one of the files' content; a table's or best policy's from the run if it has it. Raises Damaged."""
         path, facts = self._path(name), self.files[name]
         try:
             content = _read(path)
@@ -103,10 +99,8 @@ class Checkpoint(NamedTuple):
     def fill(self, rows: np.ndarray) -> list[str]:
         """Put the transitions into a ring [capacity, width]; return a line for each file of them that is lost.
 
-        In the place of lost transitions there are copies of others, so that none is drawn that was never made.
-
-        Raises:
-            Damaged: none is left.
+        In the place of lost transitions there are copies of others, so that none is drawn that was never made. Raises
+        Damaged where none is left.
         """
         first, last = self.transitions
         known, lost = np.zeros(last - first, bool), []
@@ -136,10 +130,8 @@ class Checkpoint(NamedTuple):
 class Writer:
     """Writes the checkpoints of one run, and remembers which transitions are on disk.
 
-    Args:
-        folder: the run's `checkpoint/`.
-        keep: how many checkpoints to keep; 0 keeps all.
-        known: the files of the checkpoint that the run goes on from, if their transitions are whole.
+    `keep` is how many checkpoints to keep, 0 for all; `known` are the files of the checkpoint that the run goes on
+    from, if their transitions are whole.
     """
 
     def __init__(self, folder: Path, keep: int, known: Mapping[str, Facts] | None = None) -> None:
@@ -219,8 +211,7 @@ def steps_in(folder: Path) -> list[int]:
 def newest_sound(folder: Path, until: int | None = None) -> tuple[Checkpoint | None, list[str]]:
     """Return the newest checkpoint (of step `until` at most) that can be read, and what is wrong with those after it.
 
-    Raises:
-        InputError: one of those after it cannot be read now, and may be sound.
+    Raises InputError where one of those after it cannot be read now, and may be sound.
     """
     complaints = []
     for step in reversed(steps_in(folder)):

@@ -60,10 +60,8 @@ def make_configs(
 ) -> tuple[list[RunConfig], Demonstrations | None, Spec, list[str]]:
     """Return each seed's configuration, what their replays begin with, the task's sizes, and notes for the user.
 
-    The task is made, stepped and perturbed once.
-
-    Raises:
-        InputError: a mistake in the options, or a task that csac cannot learn.
+    The task is made, stepped and perturbed once. Raises InputError for a mistake in the options, or a task that csac
+    cannot learn.
     """
     _refuse_unknown(given, algorithm)
     options: Any = dict(given)
@@ -139,8 +137,7 @@ def name_of(algorithm: Algorithm) -> str:
 def class_named(name: str) -> Any:
     """Return the algorithm of this name, or the class `module:Class`, whose module it imports: ask `trust` first.
 
-    Raises:
-        InputError: there is none, or nothing can import it.
+    Raises InputError where there is none, or nothing can import it.
     """
     if name in ALGORITHMS:
         return ALGORITHMS[name]
@@ -168,8 +165,8 @@ def class_typed(name: str) -> Any:
 def algorithm_of(config: RunConfig, run: str | Path = "the run", trust_task: bool = False) -> Algorithm:
     """Return the algorithm of a run with its hyperparameters; one from elsewhere if its module is trusted.
 
-    Raises:
-        InputError: this csac does not know them, or nobody here has named the module, which is not imported then.
+    Raises InputError where this csac does not know them, or nobody here has named the module, which is not imported
+    then.
     """
     refuse_untrusted(config.algorithm if config.algorithm not in ALGORITHMS else "", run, trust_task)
     make = class_named(config.algorithm)

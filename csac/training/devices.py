@@ -30,11 +30,8 @@ def choose_device(device: str) -> None:
     A GPU computes as a CPU does, in float32 and the same in every run, unless the user's own XLA_FLAGS or
     JAX_DEFAULT_MATMUL_PRECISION say otherwise. A process takes the GPU's memory as it needs it, so that several share
     one, unless XLA_PYTHON_CLIENT_PREALLOCATE says otherwise. Where this process has looked for devices already it is
-    too late for that and for XLA's flags: a warning says so.
-
-    Raises:
-        InputError: there is no such device, this process has computed on another one, or JAX is set to numbers or keys
-            that csac does not compute with.
+    too late for that and for XLA's flags: a warning says so. Raises InputError where there is no such device, this
+    process has computed on another one, or JAX is set to numbers or keys that csac does not compute with.
     """
     device = "gpu" if device == "cuda" else device
     if device not in PLATFORMS:

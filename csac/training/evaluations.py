@@ -13,7 +13,6 @@ from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
 from csac.evaluation.pending import EvaluationStopped
 from csac.evaluation.pool import EvaluationPool
-from csac.tasks.events import info_name
 from csac.tasks.perturbations import perturbations_of, values_at
 from csac.training.callbacks import mean_return
 
@@ -36,12 +35,7 @@ SECONDS_TO_FINISH = 10.0  # that an evaluation has once a stop is asked for
 class Evaluations:
     """Evaluates the policies of runs that are trained together, one evaluation at a time, and records each.
 
-    Args:
-        program: what is trained and how.
-        runs: the run directories; `recorders` write to them.
-        environments: those that are trained in.
-        watcher, notifier: who is told; the latter may end training.
-        opened: closes what is opened here.
+    The notifier may end training; `opened` closes what is opened here.
     """
 
     def __init__(
@@ -76,7 +70,7 @@ class Evaluations:
         self.broken_off: int | None = None  # the step of that one
         self.should_stop: Callable[[], bool] = lambda: False
         self._stop_at = 0.0  # when, once a stop was asked for
-        self._missing_events = {info_name(event) for event in config.events} if not len(runs[0].evaluations) else set()
+        self._missing_events = [] if len(runs[0].evaluations) else sorted(config.events)
 
     @property
     def is_ready(self) -> bool:
@@ -128,8 +122,8 @@ class Evaluations:
             results[index] = policy, result
         for text in pending.notes:
             self._note(self.runs[0], text)
-        self._warn_of_missing_events()
         if results:
+            self._warn_of_missing_events([episode for _, episodes in results.values() for episode in episodes])
             means = {self.runs[index].seed: mean_return(episodes) for index, (_, episodes) in results.items()}
             self.watcher.evaluated(step, means)
         self.wants_stop = self._notifier.evaluated(step, results) or self.wants_stop
@@ -157,13 +151,12 @@ class Evaluations:
         if any(episode.length >= LONGEST_EPISODE for episode in episodes):
             self._note(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
 
-    def _warn_of_missing_events(self) -> None:
-        """Say which events no evaluation episode has held, after the first evaluation, and what there is instead."""
-        there = self.evaluator.info_names
-        for name in sorted(self._missing_events - there):
-            known = ", ".join(sorted(there)) or "nothing"
-            self._note(self.runs[0], f"note: no episode's last info holds a number called {name!r}; it holds {known}")
-        self._missing_events = set()
+    def _warn_of_missing_events(self, episodes: Sequence[EvaluationEpisode]) -> None:
+        """Say which events no episode of the first evaluation has held."""
+        for name in self._missing_events:
+            if all(episode.events[name] is None for episode in episodes):
+                self._note(self.runs[0], f"note: no episode's last info holds a number called {name!r}")
+        self._missing_events = []
 
     def _note(self, run: RunDirectory, text: str) -> None:
         run.log(text)

@@ -23,11 +23,7 @@ BYTES_PER_EVALUATION_PROCESS = 80 * 2**20  # on MuJoCo, without JAX; PyBullet ta
 
 
 def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at_once: int) -> str:
-    """Return the line that predicts the memory of programs of which `at_once` train at a time.
-
-    Raises:
-        InputError: it is more than there is.
-    """
+    """Return the line that predicts the memory of programs, `at_once` at a time. Raises InputError for too much."""
     programs = programs[:at_once]
     per_seed, seeds = (
         _bytes_per_seed(programs[0].algorithm, config, spec),

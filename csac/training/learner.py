@@ -156,8 +156,7 @@ class Learner:
     def restore(self, saved: Sequence[Snapshot], memories: Sequence[Callable[[np.ndarray], None]]) -> None:
         """Go on from what `save` returned for each seed; `memories` fill each seed's rows [capacity, width].
 
-        Raises:
-            InputError: it is of another algorithm, or of networks of another size.
+        Raises InputError where it is of another algorithm, or of networks of another size.
         """
         for seed in saved:
             if problem := incompatibility(self.algorithm, self.spec, self._steps, seed):

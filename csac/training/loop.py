@@ -42,14 +42,8 @@ class Loop:
     Strict order: all updates due after a step finish before the next action is chosen. Evaluations may run in
     processes beside this one while training goes on; their numbers are the same.
 
-    Args:
-        program: what is trained and how.
-        runs: the run directories, locked by this process.
-        points: where each run goes on, all at one step.
-        watcher: receives progress, results and notes.
-
-    Raises:
-        InputError: a checkpoint does not fit, or the task cannot be made.
+    This process has locked the runs, and all go on at one step. Raises InputError where a checkpoint does not fit, or
+    the task cannot be made.
     """
 
     def __init__(
@@ -87,8 +81,7 @@ class Loop:
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Train to the last step, until no seed is left, or until a signal or a callback asks for a stop.
 
-        Raises:
-            OSError: a run directory can no longer be written.
+        Raises OSError where a run directory can no longer be written.
         """
         is_stopping, self.evaluations.should_stop = False, should_stop
         self.watcher.wait_for_turn(self.step)

@@ -21,12 +21,7 @@ if TYPE_CHECKING:
 class Notifier:
     """Tells the callbacks what happens in the loop.
 
-    Args:
-        hears: what they want to be told of.
-        call: tells them, and returns their answer.
-        runs, recorders: of each seed.
-        metrics: the names of the algorithm's metrics.
-        policy: returns the policy of a seed as it is now.
+    `call` tells them and returns their answer; `policy` returns the policy of a seed as it is now.
     """
 
     def __init__(

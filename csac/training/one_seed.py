@@ -37,10 +37,7 @@ class Carry(NamedTuple):
 class OneSeed:
     """Pure functions of one seed's packed `Carry`. `step` counts environment steps.
 
-    Attributes:
-        state: the shapes of what the algorithm learns.
-        metrics: the names of what an update tells of itself, in the order of the carry's sums.
-        packing: how the state is packed.
+    `state` has the shapes of what the algorithm learns, `metrics` the names of metrics in the carry's order.
     """
 
     def __init__(self, algorithm: Algorithm, spec: Spec, steps: int, most_extra: int = 0) -> None:

@@ -16,11 +16,8 @@ if TYPE_CHECKING:
 class Packing:
     """How the leaves of a tree become buffers: the small floats in one row, then the other leaves in their order.
 
-    Each buffer that enters and leaves a program costs, however little is in it.
-
-    Args:
-        tree: a tree of arrays, or of their shapes, such as those that will be packed.
-        below: how many elements a leaf has that is no longer small.
+    Each buffer that enters and leaves a program costs, however little is in it. A leaf of fewer than `below` elements
+    is small; `tree` may hold shapes instead of arrays.
     """
 
     def __init__(self, tree: Any, below: int) -> None:
@@ -53,9 +50,6 @@ class Parcel:
 
     A GPU is sent each array for itself, and each takes time however small it is. The row is of integers: they reach
     the program as they are, where a float that is the image of a small integer might be taken for zero.
-
-    Args:
-        shapes: those of the arrays.
     """
 
     def __init__(self, *shapes: tuple[int, ...]) -> None:
@@ -81,9 +75,6 @@ class SeedAxis:
     """The axis of seeds: the leading one of all arrays, and left out where a seed is alone.
 
     For an axis of size one XLA transposes the weight gradients, which costs 4-8 % of an update.
-
-    Args:
-        seeds: how many there are.
     """
 
     def __init__(self, seeds: int) -> None:

@@ -76,8 +76,7 @@ def refuse_differences(run: RunDirectory, wanted: RunConfig, has_schedule: bool)
 def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
     """Bring runs that share a program back to their newest common sound checkpoint, or to their beginning.
 
-    Raises:
-        InputError: no checkpoint is sound, or there are results and no checkpoint to go on from.
+    Raises InputError where no checkpoint is sound, or there are results and no checkpoint to go on from.
     """
     for run in runs:
         _remove_unfinished(run)
@@ -215,8 +214,7 @@ class Source(NamedTuple):
     def find(cls, where: str | Path, seeds: Sequence[int]) -> Source:
         """Return the checkpoints at `DIRECTORY` (the newest) or `DIRECTORY@STEP`, of a set or of one run.
 
-        Raises:
-            InputError: no such run, seed or checkpoint, or a damaged one.
+        Raises InputError where there is no such run, seed or checkpoint, or a damaged one.
         """
         name, at, text = str(where).rpartition("@")
         has_step = bool(at) and not os.path.exists(where)

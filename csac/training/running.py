@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], bool]) -> None:
     """Train the runs of a program in this process, from their newest checkpoint or their beginning.
 
-    Raises:
-        InputError: a run is in use, or cannot go on.
-        StorageFailure: as `train`.
+    Raises InputError where a run is in use or cannot go on, StorageFailure as `train`.
     """
     runs = [RunDirectory.open(path) for path in program.directories]
     with ExitStack() as stack, storage_failures(runs[0].path.parent):

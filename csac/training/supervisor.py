@@ -35,14 +35,11 @@ def supervise(
 ) -> None:
     """Run each program in a process of its own, `workers` at a time, until all are over or stopped.
 
-    `watcher_of` returns who is told about a program.
-    A process that dies is replaced once: its runs resume from their newest checkpoint. If it dies again, they fail.
-    With `turns`, so many processes train at a time, a few hundred steps each, and the one furthest behind comes next:
-    five that share two cores at will make four fifths of the steps.
-
-    Raises:
-        InputError: a program's arguments are wrong, such as a checkpoint that does not fit.
-        StorageFailure: a run directory can no longer be written; the other programs are stopped and saved.
+    `watcher_of` returns who is told about a program. A process that dies is replaced once: its runs resume from their
+    newest checkpoint. If it dies again, they fail. With `turns`, so many processes train at a time, a few hundred steps
+    each, and the one furthest behind comes next: five that share two cores at will make four fifths of the steps.
+    Raises InputError where a program's arguments are wrong, such as a checkpoint that does not fit, and StorageFailure
+    where a run directory can no longer be written; the other programs are stopped and saved.
     """
     waiting, running, over = deque(programs), {}, []
     restarted: set[tuple[Path, ...]] = set()

@@ -125,18 +125,8 @@ def train(
     existing = _existing(place, configs, resume, source, algorithm.cadence.has_schedule)
 
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task, algorithm)
-    template = Program(
-        directories=(),
-        algorithm=algorithm,
-        task=task,
-        threads=1,
-        evaluation_processes=evaluation_processes,
-        environment_processes=environment_processes,
-        tensorboard=tensorboard,
-        wandb=wandb,
-        command=command,
-        hears=watch.callbacks.hears,
-    )
+    how = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
+    template = Program((), algorithm, task, 1, *how)
     directories = [[run_path(place, seed) for seed in group] for group in groups]
     programs = programs_of(template, directories, existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
@@ -185,18 +175,10 @@ def resume(
         _extend(runs, steps, algorithm.cadence.has_schedule)
     existing = {run.seed: run for run in runs.runs}
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
-    template = Program(
-        directories=(),
-        algorithm=algorithm,
-        task=config.task,
-        threads=1,
-        evaluation_processes=evaluation_processes,
-        environment_processes=environment_processes,
-        tensorboard=any(run.tensorboard.exists() for run in runs.runs),
-        wandb=any((run.path / "wandb").exists() for run in runs.runs),
-        command=command,
-        hears=watch.callbacks.hears,
-    )
+    tensorboard = any(run.tensorboard.exists() for run in runs.runs)
+    wandb = any((run.path / "wandb").exists() for run in runs.runs)
+    how = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
+    template = Program((), algorithm, config.task, 1, *how)
     programs = programs_of(template, [[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
 

@@ -3,7 +3,6 @@ import pytest
 from shown import lines, make_set
 
 from csac.console.progress import Reporter, sparkline
-from csac.tasks.environment import Environment
 
 
 @pytest.fixture
@@ -148,14 +147,6 @@ def test_the_end_shows_results_and_what_to_type_next(plain, clock, tmp_path):
         f"watch it csac play '{runs.path}' --video '{runs.path}/play.mp4'",
         f"export   csac export '{runs.path}' --format numpy",
     ]
-
-
-@pytest.mark.parametrize(("task", "is_watched"), [("Pendulum-v1", True), ("probes:Endless-v0", False)])
-def test_a_video_is_offered_of_what_draws(plain, tmp_path, task, is_watched):
-    Environment(task).close()
-    Reporter(plain).finish(with_policies(make_set(tmp_path, [[1.0]], task=task)))
-    assert ("watch it" in plain.file.getvalue()) == is_watched
-    assert "test it" in plain.file.getvalue()
 
 
 def test_a_task_of_python_is_tested_in_python(plain, tmp_path):

@@ -85,7 +85,6 @@ def test_workers_are_several_and_stay_and_import_no_jax(pool_of):
     assert processes[0] == processes[1]
     assert os.getpid() not in processes[0]
     assert len(processes[0]) == 2
-    assert {"process", "stops"} <= pool.info_names
 
 
 def begun(how: str, *arguments, **options):
