@@ -10,6 +10,7 @@ import hashlib
 import os
 import platform
 import tempfile
+import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -41,18 +42,38 @@ def keep_programs() -> None:
 
 
 def tidy_programs() -> str | None:
-    """Remove all programs before a run where they are too much; return a note where none can be kept."""
+    """Remove broken programs before a run, and all where they are too much; return a note where none can be kept."""
     if _is_users_choice():
         return None
     try:
-        programs = list(_make_home().glob("*/*-cache"))
+        home = _make_home()
+        programs = list(home.glob("*/*-cache"))
         with suppress(FileNotFoundError):  # another process removes them too
+            _remove_broken(home / "checked", programs)
             if sum(program.stat().st_size for program in programs) > MOST_BYTES:
                 for program in programs:
                     program.unlink(missing_ok=True)
     except OSError as error:
         return f"note: compiled programs cannot be kept for the next run ({error})"
     return None
+
+
+def _remove_broken(mark: Path, programs: list[Path]) -> None:
+    """Remove what a process that was killed has written in part, among what is new: JAX would never replace it."""
+    since = mark.stat().st_mtime if mark.exists() else 0.0
+    mark.touch()
+    for program in programs.copy():
+        if program.stat().st_mtime >= since and not _is_whole(program.read_bytes()):
+            program.unlink(missing_ok=True)
+            programs.remove(program)
+
+
+def _is_whole(program: bytes) -> bool:
+    """Whether a program can be unpacked, where JAX has packed it with zlib; with zstd, whether there is anything."""
+    try:
+        return bool(zlib.decompress(program) if program[:1] == b"\x78" else program)
+    except zlib.error:
+        return False
 
 
 def _is_users_choice() -> bool:

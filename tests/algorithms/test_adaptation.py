@@ -48,7 +48,9 @@ def learn(relative_entropy_at, updates, target=0.02):
         measured = {"relative_entropy": relative_entropy_at(current_weights(GIVEN, learnt).relative_entropy)}
         return adapt_weights(learnt, measured, Weights(0.0, target), True, OPTIMISER), None
 
-    return current_weights(GIVEN, jax.lax.scan(one, make_weights(GIVEN, Weights(1.0, 0.5), OPTIMISER), length=updates)[0])
+    return current_weights(
+        GIVEN, jax.lax.scan(one, make_weights(GIVEN, Weights(1.0, 0.5), OPTIMISER), length=updates)[0]
+    )
 
 
 def test_a_weight_settles_where_its_constraint_is_met():

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,18 @@ def test_without_a_home_nothing_is_kept(tmp_path, choices, monkeypatch):
         "note: compiled programs cannot be kept for the next run (there is no home directory)"
     )
     assert not list(tmp_path.iterdir())
+
+
+def test_broken_programs_are_removed_before_a_run(tmp_path, choices):
+    folder = tmp_path / "csac" / "programs" / "some-2"
+    folder.mkdir(parents=True)
+    whole = zlib.compress(b"program" * 100)
+    for name, content in {"whole": whole, "cut": whole[:-3], "empty": b"", "zstd": b"\x28\xb5\x2f\xfd..."}.items():
+        (folder / f"{name}-cache").write_bytes(content)
+
+    assert compilation.tidy_programs() is None
+
+    assert [entry.name for entry in kept(tmp_path)] == ["whole-cache", "zstd-cache"]
 
 
 @pytest.mark.parametrize(("size", "left"), [(2, []), (3, ["0-cache", "1-cache", "2-cache"])])
