@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from csac.algorithms import ALGORITHMS
 from csac.record.config import differences
 from csac.record.files import write_atomically
 from csac.record.manifest import Continuation, Manifest, Origin
@@ -286,7 +287,11 @@ class Source(NamedTuple):
 
 
 def _fixed(config: RunConfig) -> dict[str, Any]:
-    return {name: value for name, value in asdict(config).items() if name not in _MAY_DIFFER}
+    """Return what may not differ; a hyperparameter that is newer than the run has its default."""
+    fixed = {name: value for name, value in asdict(config).items() if name not in _MAY_DIFFER}
+    if config.algorithm in ALGORITHMS:
+        fixed["hyperparameters"] = asdict(ALGORITHMS[config.algorithm]()) | config.hyperparameters
+    return fixed
 
 
 def _link(source: Path, target: Path) -> bool:

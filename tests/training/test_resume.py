@@ -92,6 +92,15 @@ def test_a_run_or_a_copy_of_it_is_resumed_alone(tmp_path):
     assert contents(RunDirectory.open(tmp_path / "set" / "seed-0")) == before
 
 
+def test_a_run_of_before_there_was_a_hyperparameter_goes_on_with_its_default(tmp_path):
+    one = run(tmp_path / "run", steps=100).runs[0]
+    config = one.config
+    older = {name: value for name, value in config.hyperparameters.items() if name != "normalise_rewards"}
+    with one.locked():
+        one.update_manifest(config=replace(config, hyperparameters=older))
+    assert run(tmp_path / "run", steps=200, resume=True).steps_done == 200
+
+
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
