@@ -118,9 +118,9 @@ class OffPolicy(Architecture):
     def memory(self, spec: Spec, steps: int) -> Replay:
         """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
         together = self.cadence.side_by_side(spec.environments).update_interval
-        returns: dict[str, Any] = {"n_steps": self.n_steps, "discount": self.discount}
-        returns["scale_rewards"] = self.normalise_rewards
-        return Replay.create(min(self.replay_size, steps), spec, together, **returns)
+        capacity, scaled = min(self.replay_size, steps), self.normalise_rewards
+        returns: dict[str, Any] = {"n_steps": self.n_steps, "discount": self.discount, "scale_rewards": scaled}
+        return Replay.create(capacity, spec, together, **returns)
 
     def discount_after(self, transition: Transition) -> Scalar:
         """Return γ (1 - terminated), by which what follows a transition counts; γᵐ for γ where it sums up m steps."""
