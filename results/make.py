@@ -71,7 +71,7 @@ class Page:
         changed: str = "",
     ) -> dict[str, np.ndarray]:
         """Return the evaluations of arms, by the names they are shown with; one of a single task needs no `task`."""
-        shown = arms if isinstance(arms, dict) else {arm.removeprefix("pilot: "): arm for arm in arms}
+        shown = arms if isinstance(arms, dict) else {arm: arm for arm in arms}
         found = {}
         for label, arm in shown.items():
             parts = [rows for key, rows in self.runs.items() if key == (arm, task or key[1], changed)]
