@@ -64,6 +64,11 @@ def kept(home: Path) -> list[Path]:
     return sorted(home.rglob("*-cache"))
 
 
+def learners(home: Path) -> list[Path]:
+    """Return the large ones: whether a small one takes long enough to be kept depends on what else the machine does."""
+    return [program for program in kept(home) if program.stat().st_size > 2**15]
+
+
 @pytest.mark.slow
 def test_programs_are_kept_and_change_no_bit(tmp_path):
     without = learnt(tmp_path / "none", JAX_ENABLE_COMPILATION_CACHE="0")
@@ -156,11 +161,11 @@ def test_the_programs_of_one_worker_serve_the_others(tmp_path, choices):
     settings: dict[str, Any] = {"steps": 100, "evaluation_episodes": 1, "checkpoint_interval": 0, "tensorboard": False}
 
     train(algorithm, "Pendulum-v1", seeds=2, directory=tmp_path / "first", **settings)
-    programs = kept(tmp_path / "csac")
+    programs = learners(tmp_path / "csac")
     train(algorithm, "Pendulum-v1", seeds=2, directory=tmp_path / "second", **settings)
 
     assert programs
-    assert kept(tmp_path / "csac") == programs
+    assert learners(tmp_path / "csac") == programs
     first, second = (tmp_path / name / "seed-0" / "metrics.csv" for name in ("first", "second"))
     assert first.read_bytes() == second.read_bytes()
 
