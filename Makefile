@@ -43,7 +43,7 @@ test: $(SETUP)  ## Run the tests: make test ARGS='-k cli'
 	$(VENV)/bin/pytest --numprocesses logical --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 
 slow: $(SETUP)  ## Run the tests that need longer: learning, fixed-seed digests, kills, clusters
-	$(VENV)/bin/pytest -m slow $(ARGS)
+	$(VENV)/bin/pytest --numprocesses logical --dist loadfile -m slow $(ARGS)
 
 chaos: $(SETUP)  ## Kill runs 100 times and compare what they leave: make chaos ARGS='--kills 25'
 	.venv/bin/python tests/support/chaos.py --out results/reliability $(ARGS)

@@ -116,7 +116,6 @@ _FASTER_CRITICS: Mapping[str, Any] = MappingProxyType(
     {
         **_PAPER_COMMON,
         "critic_normalisation": "batch",
-        "critic_unit_weights": False,
         "normalise_observations": True,
         "critic_learning_rate": 1e-3,
         "actor_learning_rate": 1e-3,

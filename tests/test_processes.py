@@ -74,6 +74,7 @@ def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
     assert not (tmp_path / "run").exists()  # once mended, the script begins there
 
 
+@pytest.mark.slow
 def test_standard_input_trains_its_own_task_in_one_process_and_any_other_in_several(tmp_path):
     """Python calls what it reads there "<stdin>", which no process finds."""
     text = """

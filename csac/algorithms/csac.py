@@ -100,7 +100,7 @@ class CSAC(MaximumEntropy):
         state = state._replace(reference=reference, observation_statistics=statistics)
         # Lines 16 to 19: a' ~ π(·|s'), then y(s, a, s'), then a step down Σᵢ [Qᵢ(s, a) - y]²
         critic_target = partial(self.critic_target, actor=state.actor, reference=reference, weights=weights)
-        adam, next_action = self.critic_optimiser(), partial(action_at, state.actor)
+        adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
         # Line 21: a step down J(φ)
         given = (folded_critics, batch.observation, actor_noise, step)

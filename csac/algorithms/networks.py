@@ -141,25 +141,6 @@ def make_optimiser(
     return adam
 
 
-def unit_columns() -> optax.GradientTransformation:
-    """Return what brings each column of an MLP's hidden weights to unit length after every step of the optimiser."""
-
-    def unit(network: MLP) -> MLP:
-        *hidden, last = network.layers
-        layers = (
-            layer._replace(weight=layer.weight / jnp.linalg.norm(layer.weight, axis=0, keepdims=True))
-            for layer in hidden
-        )
-        return MLP((*layers, last), network.activation)
-
-    def update(steps: Any, parameters: Any = None) -> Any:
-        networks = optax.apply_updates(parameters, steps)
-        goals = jax.tree.map(unit, networks, is_leaf=lambda tree: isinstance(tree, MLP))
-        return jax.tree.map(jnp.subtract, goals, parameters)
-
-    return optax.stateless(update)
-
-
 class Progress(NamedTuple):
     """How many steps an optimiser has made, and how many its schedule is for."""
 

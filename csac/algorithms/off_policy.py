@@ -35,7 +35,6 @@ from csac.algorithms.networks import (
     make_mlp,
     make_optimiser,
     plain_layers,
-    unit_columns,
 )
 from csac.algorithms.shapes import Action, Count, Key, Scalar
 from csac.algorithms.statistics import Statistics, normaliser_of
@@ -151,8 +150,6 @@ class TwinCritics(OffPolicy):
     """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
     """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
-    critic_unit_weights: bool = False
-    """Whether each column of the critics' hidden weights has unit length after every update (XQC, SimbaV2)."""
     policy_delay: Annotated[int, COUNT] = 1
     """Critic updates per update of the actor and of learnt weights (TD3's d)."""
 
@@ -160,11 +157,6 @@ class TwinCritics(OffPolicy):
         super().__post_init__()
         if self.critic_normalisation == "batch" and self.batch_size == 1:
             raise InputError("critic_normalisation batch needs a batch_size of at least 2")
-
-    def critic_optimiser(self, planned: int = 1) -> optax.GradientTransformation:
-        """Return what moves the critics: the networks' Adam, and unit weights where these are asked for."""
-        adam = self.optimiser(self.critic_learning_rate, planned)
-        return optax.chain(adam, unit_columns()) if self.critic_unit_weights else adam
 
     def first_networks(self, key: Key, spec: Spec, steps: int, actor_outputs: int) -> dict[str, Any]:
         """Return the fields of a first state that the three share: random networks, targets that are copies."""
@@ -181,7 +173,7 @@ class TwinCritics(OffPolicy):
             "critics": critics,
             "target_critics": copy_tree(critics) if self.critic_normalisation == "none" else None,
             "actor_optimiser": init_optimiser(actor_adam, actor),
-            "critic_optimiser": init_optimiser(self.critic_optimiser(planned), critics),
+            "critic_optimiser": init_optimiser(self.optimiser(self.critic_learning_rate, planned), critics),
             "observation_statistics": Statistics.create((spec.observation_size,))
             if self.normalise_observations
             else None,

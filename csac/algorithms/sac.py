@@ -69,7 +69,7 @@ class SAC(MaximumEntropy):
         temperature = jnp.exp(state.temperature.log_weight)
 
         critic_target = partial(self.critic_target, actor=state.actor, temperature=temperature)
-        adam, next_action = self.critic_optimiser(), partial(action_at, state.actor)
+        adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
 
         given = (folded_critics, batch.observation, actor_noise)

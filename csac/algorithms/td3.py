@@ -69,7 +69,7 @@ class TD3(TwinCritics):
         noise = jax.random.normal(key, batch.action.shape)
 
         critic_target = partial(self.critic_target, target_actor=state.target_actor)
-        adam, next_action = self.critic_optimiser(), partial(self.smoothed_action, state.target_actor)
+        adam, next_action = self.optimiser(self.critic_learning_rate), partial(self.smoothed_action, state.target_actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, noise, critic_target, next_action)
 
         given = (folded_critics, batch.observation)

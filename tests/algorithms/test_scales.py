@@ -1,16 +1,14 @@
-"""What brings rewards and the critics' weights to a common scale, by hand."""
+"""What brings rewards to a common scale, by hand."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from equations import batch_of, transition
 
 from csac.algorithms import CSAC, SAC
 from csac.algorithms.memory import Replay, pack
-from csac.algorithms.networks import gradient_step, init_optimiser, make_mlp, unit_columns
 from csac.algorithms.statistics import ReturnScale
 from csac.types import Spec
 
@@ -35,24 +33,6 @@ def test_rewards_are_divided_by_the_spread_of_the_returns_of_each_environment():
 
 def test_a_scale_that_has_seen_nothing_is_1():
     assert ReturnScale.create(1).statistics.std == 1.0
-
-
-def test_hidden_columns_have_unit_length_after_a_step_and_the_last_layer_is_free():
-    networks = make_mlp(jax.random.key(0), 3, (5, 4), 1), make_mlp(jax.random.key(1), 3, (5, 4), 1)
-    optimiser = optax.chain(optax.sgd(0.1), unit_columns())
-
-    def sum_of_all(networks, _):  # its gradient is 1 everywhere
-        return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(networks)), {}
-
-    moved, _, _ = gradient_step(optimiser, sum_of_all, networks, init_optimiser(optimiser, networks), jnp.zeros(1))
-    for before, after in zip(networks, moved, strict=True):
-        for old, new in zip(before.layers[:-1], after.layers[:-1], strict=True):
-            stepped = np.asarray(old.weight) - 0.1
-            np.testing.assert_allclose(
-                new.weight, stepped / np.linalg.norm(stepped, axis=0, keepdims=True), rtol=1e-5, atol=1e-6
-            )
-            np.testing.assert_allclose(new.bias, old.bias - 0.1, rtol=1e-6)
-        np.testing.assert_allclose(after.layers[-1].weight, before.layers[-1].weight - 0.1, rtol=1e-5, atol=1e-6)
 
 
 def test_the_entropy_to_aim_at_counts_action_dimensions_unless_it_is_given():

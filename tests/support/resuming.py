@@ -40,7 +40,6 @@ ADAPTIVE = CSAC(
     learning_rate_schedule="cosine",
     n_steps=3,
     normalise_rewards=True,
-    critic_unit_weights=True,
     exploration_noise="pink",
     activation="gelu",
     critic_layer_norm=True,

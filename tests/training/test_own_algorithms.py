@@ -124,6 +124,7 @@ def test_seeds_train_in_processes_and_from_the_command_line(tmp_path, own):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_strangers_algorithm_is_not_imported(tmp_path, own, monkeypatch):
     stopped = run(tmp_path / "run", own.calm, 200).runs[0].path
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another"))
