@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 # What a checkpoint's networks and optimisers are made for.
 _KINDS = ("activation", "layer_norm")
 _LEARNT_WITH = (
-    *("normalise_observations", "learning_rate_schedule"),
+    *("normalise_observations", "normalise_rewards", "learning_rate_schedule"),
     *(f"{network}{kind}" for network in ("", "actor_", "critic_") for kind in _KINDS),
 )
 

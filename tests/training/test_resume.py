@@ -171,6 +171,9 @@ def test_a_run_with_a_learning_rate_schedule_is_neither_extended_nor_forked_with
     constant = replace(scheduled, learning_rate_schedule="constant")
     with pytest.raises(InputError, match=f"learnt with learning_rate_schedule {scheduled.learning_rate_schedule}"):
         run(tmp_path / "fork", constant, steps=256, start_from=tmp_path / "run")
+    otherwise = replace(scheduled, normalise_rewards=not scheduled.normalise_rewards)
+    with pytest.raises(InputError, match="learnt with normalise_rewards"):
+        run(tmp_path / "fork", otherwise, steps=256, start_from=tmp_path / "run")
 
 
 @pytest.fixture
