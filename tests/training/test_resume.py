@@ -231,6 +231,9 @@ def test_where_no_checkpoint_is_sound_nothing_is_touched(tmp_path, stopped):
     before = contents(stopped)
     with pytest.raises(InputError, match="sound"):
         run(tmp_path / "run", resume=True)
+    shutil.rmtree(stopped.checkpoints)
+    with pytest.raises(InputError, match="no checkpoint to go on from"):
+        run(tmp_path / "run", resume=True)
     assert contents(stopped) == before
 
 
