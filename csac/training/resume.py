@@ -97,8 +97,8 @@ def _find(run: RunDirectory, until: int | None) -> ResumePoint:
         raise InputError(f"no checkpoint of {run.path} is sound ({'; '.join(complaints)}): restore one, or train anew")
     if checkpoint is None and run.manifest.forked_from:
         raise InputError(f"{run.path} was stopped before its first checkpoint: repeat its command in a new directory")
-    was_saved = not run.config.checkpoint_interval or (run.manifest.last_checkpoint and until is None)
-    if checkpoint is None and was_saved and any(len(run.rows(table)) for table in TABLES):
+    is_all_there_is = run.manifest.state == "finished" or not run.config.checkpoint_interval
+    if checkpoint is None and is_all_there_is and any(len(run.rows(table)) for table in TABLES):
         raise InputError(f"{run.path} has results and no checkpoint to go on from: train in another directory")
     return ResumePoint(checkpoint, [f"warning: {text}; an earlier checkpoint is used" for text in complaints])
 

@@ -64,6 +64,11 @@ def test_a_finished_run_is_extended_and_equals_a_longer_one(tmp_path):
     whole = run(tmp_path / "whole", steps=500)
     for table in ("evaluations.csv", "episodes.csv"):
         assert contents(longer.runs[0])[table] == contents(whole.runs[0])[table]
+    before = contents(whole.runs[0])
+    shutil.rmtree(whole.runs[0].checkpoints)
+    with pytest.raises(InputError, match="no checkpoint to go on from"):
+        csac.resume(tmp_path / "whole", steps=600)
+    assert contents(whole.runs[0]) == before
 
 
 def test_a_table_that_was_cut_is_read_from_the_checkpoint(tmp_path):
@@ -230,9 +235,6 @@ def test_where_no_checkpoint_is_sound_nothing_is_touched(tmp_path, stopped):
         damage(stopped.checkpoints / f"step_{step}" / "state.safetensors", "cut")
     before = contents(stopped)
     with pytest.raises(InputError, match="sound"):
-        run(tmp_path / "run", resume=True)
-    shutil.rmtree(stopped.checkpoints)
-    with pytest.raises(InputError, match="no checkpoint to go on from"):
         run(tmp_path / "run", resume=True)
     assert contents(stopped) == before
 
