@@ -45,9 +45,14 @@ class LearntWeights(NamedTuple):
 
 
 def make_weight(weight: float, optimiser: optax.GradientTransformation) -> LearntWeight:
-    """Return a weight to begin with. Instead of log 0, which is no number, it has the lowest float, whose exp is 0."""
-    log_weight = jnp.maximum(jnp.log(jnp.float32(weight)), jnp.finfo(jnp.float32).min)
+    """Return a weight to begin with."""
+    log_weight = first_log_weight(weight)
     return LearntWeight(log_weight, init_optimiser(optimiser, log_weight))
+
+
+def first_log_weight(weight: float) -> Scalar:
+    """Return log w. Instead of log 0, which is no number, it has the lowest float, whose exp is 0."""
+    return jnp.maximum(jnp.log(jnp.float32(weight)), jnp.finfo(jnp.float32).min)
 
 
 def weight_loss(log_weight: Scalar, value: Scalar, *, least: float = 0.0) -> tuple[Scalar, Metrics]:

@@ -77,8 +77,7 @@ class OffPolicy(Architecture):
     updates_per_step: Annotated[float, UPDATES] = 1.0
     """Updates per environment step; 0.25 is one after every fourth (rounded to a fraction of at most hundredths)."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps between rounds of updates; 1 is strict order, larger is faster. Rounded up to whole turns of
-    several environments."""
+    """Environment steps between rounds of updates (whole turns of all environments); 1 is strict order."""
     exploration_noise: Noise = "white"
     """How exploration noise goes together over steps: not at all, over all time scales (pink), over some seven (ou)."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms.adaptation import LearntWeight, adapt_weight, make_weight
+from csac.algorithms.adaptation import LearntWeight, adapt_weight, first_log_weight, make_weight
 from csac.algorithms.critics import Critics, min_q, update_critics
 from csac.algorithms.distributions import action_at, policy_at
 from csac.algorithms.hyperparameters import NOT_NEGATIVE
@@ -65,6 +65,9 @@ class SAC(MaximumEntropy):
         """Take one gradient step on the critics, then on the actor and the temperature; move the target critics."""
         statistics, batch = normalise_batch(state.observation_statistics, batch)
         state = state._replace(observation_statistics=statistics)
+        if self.entropy_weight != "auto":  # a fork may have another
+            log_weight = first_log_weight(self.entropy_weight)
+            state = state._replace(temperature=state.temperature._replace(log_weight=log_weight))
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.temperature.log_weight)
 

@@ -143,7 +143,9 @@ def _one_line(complaint: str, command: type[Any], elsewhere: Callable[[str], str
     what = " ".join(what.split())
     unknown = re.match(r"Unrecognized options: (.+?)(, |$)", what)
     if not unknown:
-        return re.sub(r"^Missing from [^:]*: (\S+).*", r"\1 is missing", re.sub(r"^Error parsing [A-Z]\w*: ", "", what))
+        what = re.sub(r"^Error parsing ([A-Za-z]\w*: )?", "", what)
+        what = re.sub(r"no type matching (\S+) could be instantiated from \['(.*?)'\].*", r"give \1, not \2", what)
+        return re.sub(r"^Missing from [^:]*: (\S+).*", r"\1 is missing", what)
     option = unknown[1].partition("=")[0].replace("_", "-") if unknown[1].startswith("-") else unknown[1]
     meant = re.findall(r"^ *(--[a-z-]+)", more, re.MULTILINE)[:2]
     hint = called_here(option, options_of(command)) or elsewhere(option)

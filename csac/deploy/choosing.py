@@ -80,7 +80,7 @@ def choose_run(runs: RunSet, seed: int | None = None) -> RunDirectory:
         failed, reason = next(iter(runs.failures.items()))
         raise InputError(f"every seed of {runs.path} failed (seed {failed} at {reason}): train again, or give a seed")
     if not sound:
-        raise InputError(f"{runs.path} holds no policies yet: its first evaluation writes them")
+        raise InputError(f"{runs.path} holds no policies: an evaluation writes them")
     scores = last_evaluations(np.concatenate([run.evaluations[["seed", "step", "return"]] for run in sound]))
     scores = {seed: score for seed, score in scores.items() if not math.isnan(score)}
     if len(sound) > 1 and not scores:

@@ -65,7 +65,7 @@ def evaluate_run(
     task, arguments = runs.config.task, runs.config.environment_arguments
     chosen = [run for run in runs.runs if has_policy(run, which)] if seed is None else [runs.run(seed)]
     if not chosen:
-        raise InputError(f"{runs.path} holds no {which} policies yet: the first evaluation writes them")
+        raise InputError(f"{runs.path} holds no {which} policies: an evaluation writes them")
     policies = {run.seed: load_run(run, which) for run in chosen}
     environments = runs.config.evaluation_environments or 1
     evaluator = Evaluator(

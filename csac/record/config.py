@@ -45,8 +45,7 @@ class RunConfig:
     evaluation_episodes: int = 10
     """Episodes per evaluation."""
     evaluation_environments: int = 10
-    """Environments that an evaluation steps side by side, beside the training one; they stay open. 0: it uses the
-    training environment itself, once the episode there has ended."""
+    """Environments of an evaluation, side by side and kept open. 0: the training environment, between its episodes."""
     evaluation_seed: int = EVALUATION_SEED
     """Resets the first evaluation episode; the next ones have the numbers after it."""
     checkpoint_interval: int = 50_000

@@ -161,6 +161,8 @@ def labels(arms: Sequence[Arm]) -> list[str]:
         own = [arm for arm, its in zip(arms, names, strict=True) if its == name and not arm.label]
         by_place = itertools.groupby(sorted(own, key=lambda arm: arm.place), key=lambda arm: arm.place)
         told = [item for _, beside in by_place for item in differing([settings(arm.config) for arm in beside])]
+        if own and name == own[0].config.title:  # no preset, which may differ between tasks
+            told += differing([arm.config.hyperparameters for arm in own])
         apart[name] = list(dict.fromkeys(told))
     full = [
         ", ".join([name, *(f"{item} {plain(settings(arm.config).get(item))}" for item in apart[name])])

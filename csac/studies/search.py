@@ -124,6 +124,8 @@ class Search:
         first = self.algorithm.cadence.side_by_side(self.config.environments).first_update
         if self.config.steps < first:
             raise InputError(f"no updates: steps ({self.config.steps:,}) < {first:,}, where the first one comes")
+        if not self.config.evaluation_interval:
+            raise InputError("a search goes by evaluations: evaluation_interval cannot be 0")
 
     def algorithm_with(self, values: Mapping[str, Any]) -> Any:
         """Return what a trial trains. Raises InputError for values that do not go with what is given."""

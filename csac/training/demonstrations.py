@@ -143,7 +143,8 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
         except (InputError, TypeError, ValueError, OverflowError) as error:
             raise InputError(f"demonstrations: {name}: {' '.join(str(error).split())}") from None
         if flat.shape[:1] != (number,) or flat.size != number * size:
-            raise InputError(f"demonstrations: {name} has shape {flat.shape}, not {(number, size)[: 1 + (size > 1)]}")
+            wanted = (number, size)[: 1 + (size > 1 or flat.ndim > 1)]
+            raise InputError(f"demonstrations: {name} has shape {flat.shape}, not {wanted}")
         if not np.isfinite(flat).all():
             raise InputError(f"demonstrations: {name} holds what is not finite")
         return flat.reshape(number, size)

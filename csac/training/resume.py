@@ -27,6 +27,7 @@ from csac.training.checkpoint import (
     steps_in,
     write_folder,
 )
+from csac.training.learner import incompatibility
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
     from csac.record.config import RunConfig
     from csac.training.config import TrainOptions
+    from csac.types import Algorithm, Spec
 
 # What a checkpoint's networks and optimisers are made for.
 _KINDS = ("activation", "layer_norm")
@@ -251,7 +253,7 @@ class Source(NamedTuple):
         old, new = before.hyperparameters, wanted.hyperparameters
         others = [name for name in _LEARNT_WITH if name in old and old[name] != new.get(name)]
         found += [f"its networks have learnt with {name} {old[name]}" for name in others]
-        if has_schedule and wanted.steps != before.steps:
+        if has_schedule and wanted.steps != before.steps and not others:
             found.append(f"its learning rate has a schedule over {before.steps:,} steps: give as many")
         kept, size = old.get("replay_size", 0), new.get("replay_size", 0)
         if kept < self.checkpoints[wanted.seed].transitions[1] and kept < size:
@@ -260,6 +262,13 @@ class Source(NamedTuple):
             raise InputError(f"{self.path} does not fit: {'; '.join(found)}")
         if wanted.steps <= self.step:
             raise InputError(f"steps counts from the beginning: give more than the {self.step:,} made already")
+
+    def refuse_misfit(self, algorithm: Algorithm, spec: Spec, wanted: RunConfig) -> None:
+        """Raise InputError where what was learnt is of another form than what the new run would learn."""
+        learnt = self.checkpoints[wanted.seed].state().part("learner")
+        if problem := incompatibility(algorithm, spec, wanted.steps, learnt):
+            told = "; ".join(differences(_fixed(self.runs[wanted.seed].config), _fixed(wanted)))
+            raise InputError(f"{self.path} does not fit: {told} ({problem})")
 
     def begun(self, manifest: Manifest) -> Manifest:
         """Return the manifest with which a new run begins."""

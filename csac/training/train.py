@@ -31,7 +31,7 @@ from csac.training.watch import Watch, draw_curve
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from typing_extensions import Unpack
 
@@ -123,6 +123,8 @@ def train(
     choose_device(configs[0].device)  # the task's module may have changed JAX's settings
     place = place or new_set_directory(configs[0].task, configs[0].algorithm)
     existing = _existing(place, configs, resume, source, algorithm.cadence.has_schedule)
+    if source:
+        source.refuse_misfit(algorithm, spec, configs[0])
 
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task, algorithm)
     how = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
@@ -131,11 +133,13 @@ def train(
     programs = programs_of(template, directories, existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
 
+    before = [run.config for run in existing.values()]
     runs = _create(place, configs, groups, existing, source, demonstrations)
     try:
         return _run(runs, programs, watch, notes)
     except InputError:  # so that the corrected call can use the directory
         _remove_unbegun(place, [run for run in runs.runs if run.seed not in existing])
+        _take_back(existing.values(), before)
         raise
 
 
@@ -171,6 +175,7 @@ def resume(
     watch = Watch(progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
+    before = [run.config for run in runs.runs]
     if steps is not None:
         _extend(runs, steps, algorithm.cadence.has_schedule)
     existing = {run.seed: run for run in runs.runs}
@@ -180,7 +185,11 @@ def resume(
     how = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
     template = Program((), algorithm, config.task, 1, *how)
     programs = programs_of(template, [[existing[seed].path for seed in group] for group in groups], existing, config)
-    return _run(runs, programs, watch, [])
+    try:
+        return _run(runs, programs, watch, [])
+    except InputError:
+        _take_back(runs.runs, before)
+        raise
 
 
 def _check_arguments(resume: bool, directory: str | Path | None, wandb: bool | str) -> None:
@@ -200,6 +209,13 @@ def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
             shutil.rmtree(run.path)
     with suppress(OSError):
         place.rmdir()
+
+
+def _take_back(runs: Iterable[RunDirectory], before: Sequence[RunConfig]) -> None:
+    """Give those of the runs that no process has begun since the configuration that they had."""
+    for run, config in zip(runs, before, strict=True):
+        if RunDirectory.open(run.path).manifest == run.manifest and run.config != config:
+            run.update_manifest(config=config)
 
 
 def _extend(runs: RunSet, steps: int, has_schedule: bool) -> None:

@@ -169,6 +169,8 @@ def test_a_fixed_temperature_stays_and_its_state_is_finite(weight):
     assert_equal(after.temperature, state.temperature)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after, metrics)))  # else the loop stops the seed
     assert float(metrics["temperature"]) == pytest.approx(weight)
+    _, metrics = update(SAC(entropy_weight=0.5, **LINEAR), state, batch_of(transition()))  # as in a fork
+    assert float(metrics["temperature"]) == pytest.approx(0.5)
 
 
 def test_a_temperature_that_was_fixed_at_zero_can_rise():

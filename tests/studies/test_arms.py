@@ -60,6 +60,12 @@ def test_arms_of_one_name_are_told_apart_by_what_differs_on_every_task(tmp_path)
     ]
 
 
+def test_other_hyperparameters_on_another_task_are_another_method(tmp_path):
+    write_run(tmp_path / "a", config(discount=0.9))
+    write_run(tmp_path / "b", config(discount=0.95, task="Hopper-v4"))
+    assert [label for label, *_ in labels(tmp_path)] == ["SAC, discount 0.9", "SAC, discount 0.95"]
+
+
 def test_the_same_seed_twice_is_told_apart_by_its_place(tmp_path):
     write_run(tmp_path / "a" / "seed-0", config())
     write_run(tmp_path / "b" / "seed-0", config())

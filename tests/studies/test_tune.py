@@ -132,9 +132,11 @@ def test_values_are_short_and_within_their_ends():
         assert float(f"{digits:.3g}") == digits
 
 
-def test_a_search_that_never_learns_is_refused():
+def test_a_search_that_never_learns_or_evaluates_is_refused():
     with pytest.raises(InputError, match="no updates"):
         search(steps=100, algorithm=SAC(warmup_steps=5_000))
+    with pytest.raises(InputError, match="evaluation_interval"):
+        search(evaluation_interval=0)
 
 
 def test_trials_begin_with_what_is_given_and_the_best_is_told(tmp_path, trained, capsys):

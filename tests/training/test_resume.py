@@ -64,11 +64,12 @@ def test_a_finished_run_is_extended_and_equals_a_longer_one(tmp_path):
     whole = run(tmp_path / "whole", steps=500)
     for table in ("evaluations.csv", "episodes.csv"):
         assert contents(longer.runs[0])[table] == contents(whole.runs[0])[table]
-    before = contents(whole.runs[0])
+    before, manifest = contents(whole.runs[0]), (whole.runs[0].path / "manifest.json").read_bytes()
     shutil.rmtree(whole.runs[0].checkpoints)
     with pytest.raises(InputError, match="no checkpoint to go on from"):
         csac.resume(tmp_path / "whole", steps=600)
     assert contents(whole.runs[0]) == before
+    assert (whole.runs[0].path / "manifest.json").read_bytes() == manifest
 
 
 def test_a_table_that_was_cut_is_read_from_the_checkpoint(tmp_path):
@@ -253,6 +254,7 @@ def test_a_fork_begins_with_the_checkpoint_and_leaves_its_source_alone(tmp_path)
     ("changes", "name"),
     [
         ({"algorithm": SAC(**SMALL)}, "algorithm"),
+        ({"algorithm": replace(LEARNERS[0], policy_delay=2)}, "policy_delay is 1, not 2"),
         ({"steps": 300}, "steps"),
         ({"first_seed": 7}, "seed 7"),
         ({"start_from": "@17"}, "step 17"),
