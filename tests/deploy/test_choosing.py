@@ -92,7 +92,7 @@ def test_load_says_what_is_missing(tmp_path):
         load(tmp_path / "nowhere")
     with pytest.raises(InputError, match="holds no run"):
         load(tmp_path / "empty")
-    with pytest.raises(InputError, match="holds no policies yet"):
+    with pytest.raises(InputError, match="holds no policies"):
         load(tmp_path / "young")
     for wrong in (7, "0"):
         with pytest.raises(InputError, match=f"{wrong!r}"):
