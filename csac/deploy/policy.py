@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from csac.types import Activation
 
 POLICY = "policy.safetensors"  # in the folder of a policy that was saved by itself, and of an artefact
+# What a folder holds that is a run, its policies or an artefact.
+OCCUPIED = {"manifest.json", "last.safetensors", "best.safetensors", "policy.py", "policy.onnx", "policy.h"}
 LOG_STD_RANGE = (-20.0, 2.0)
 GELU_SCALE, GELU_CUBE = (2 / math.pi) ** 0.5, 0.044715  # Hendrycks and Gimpel 2016, section 2
 
@@ -140,7 +142,8 @@ class Policy:
         folder = Path(directory)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            if {"manifest.json", "policy.py", "policy.onnx", "policy.h"} & {path.name for path in folder.iterdir()}:
+            names = {path.name for path in folder.iterdir()}
+            if names & OCCUPIED or any(name.startswith("seed-") for name in names):
                 raise InputError(f"{folder} holds a run or an artefact: choose another folder for the policy")
             self.write(folder / POLICY)
         except OSError as error:

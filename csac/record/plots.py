@@ -184,14 +184,17 @@ def _limits(curves: Sequence[Curve]) -> tuple[float, float]:
 def _draw_legend(figure: Figure, curves: Sequence[Curve], looks: Mapping[str, Look]) -> None:
     """Put the legend, and what lines and bands mean, below the axes; the picture grows by its lines."""
     texts = {f"{c.label} ({c.seeds} seed{'s' * (c.seeds > 1)})": looks[c.label] for c in curves}
+    wrapped = {text: textwrap.wrap(text, int(CHARACTERS * WIDTH) - 8) for text in texts}
     handles = [
-        Line2D([], [], color=look[0], linestyle=look[1], linewidth=2.2, label=text) for text, look in texts.items()
+        Line2D([], [], color=look[0], linestyle=look[1], linewidth=2.2, label="\n".join(wrapped[text]))
+        for text, look in texts.items()
     ]
     columns = max(1, min(len(texts), int(CHARACTERS * WIDTH) // (max(map(len, texts)) + 5)))
+    height = math.ceil(len(texts) / columns) if columns > 1 else sum(map(len, wrapped.values()))
     note = textwrap.wrap(_note(curves), int(1.1 * CHARACTERS * WIDTH))
     options = {"title": "\n".join(note), "title_fontsize": 9, "alignment": "left", "frameon": False}
     figure.legend(handles=handles, loc="outside lower left", ncols=columns, **options)
-    figure.set_figheight(figure.get_figheight() + LINE * (math.ceil(len(texts) / columns) + len(note)))
+    figure.set_figheight(figure.get_figheight() + LINE * (height + len(note)))
 
 
 def _note(curves: Sequence[Curve]) -> str:

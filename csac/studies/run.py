@@ -17,6 +17,7 @@ from csac.tasks.perturbations import perturbations_of
 from csac.tasks.trust import remember
 from csac.training.config import algorithm_of, make_manifest
 from csac.training.program import Program
+from csac.training.resume import refuse_lost
 from csac.training.signals import stop_requested
 from csac.training.supervisor import supervise
 from csac.training.watch import Watcher
@@ -90,6 +91,7 @@ def _program(path: Path, run: StudyRun, how: How) -> Program:
         existing = RunDirectory.open(path)
         if run.config.steps > existing.config.steps:
             with existing.locked():
+                refuse_lost(existing)
                 existing.update_manifest(config=run.config)
         if existing.manifest.process is not None:  # its last bits depend on it
             threads = min(existing.manifest.machine.cores, cores) or threads

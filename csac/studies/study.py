@@ -233,6 +233,7 @@ def read_study(path: Path) -> Study:
         for method in told.get("methods", []):
             _refuse_unknown(method, _names(Method), "a method has no")
         study = manifests.value(Study, {**told, "name": path.stem}, "")
+        _refuse_unknown(study.common, [one.algorithm for one in study.methods], "common: no method has the algorithm")
         study.runs()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None

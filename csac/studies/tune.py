@@ -23,6 +23,7 @@ from csac.record.rendering import Cell, Row, Table, number
 from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
 from csac.studies.arms import plain
+from csac.studies.run import try_tasks
 from csac.studies.search import Search, draw
 from csac.training.config import RUN_OPTIONS
 from csac.training.signals import Interrupted, stop_requested
@@ -54,11 +55,12 @@ def tune(search: Search, directory: Path, trials: int, command: str | None, cons
     """Run trials until the directory has so many, show the best, and return the exit code.
 
     Raises:
-        InputError: Optuna is missing, or the directory holds another search.
+        InputError: Optuna is missing, the task cannot be made, or the directory holds another search.
         StorageFailure: the directory can no longer be written.
     """
     check_whole("trials", trials, 1, 100_000)
     directory = directory.absolute()
+    try_tasks([(None, search.config, None)])
     study = _open(search, directory)
     with stop_requested(lambda text: console.print(text)) as request:
         while not request.is_set() and (trial := _next(study, search, directory, trials)):

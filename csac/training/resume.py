@@ -93,6 +93,11 @@ def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
     ]
 
 
+def refuse_lost(run: RunDirectory) -> None:
+    """Raise InputError where a run has no sound checkpoint to go on from, and cannot begin anew."""
+    _find(run, None)
+
+
 def _find(run: RunDirectory, until: int | None) -> ResumePoint:
     checkpoint, complaints = newest_sound(run.checkpoints, until)
     if checkpoint is None and complaints:

@@ -23,7 +23,7 @@ from csac.training.config import algorithm_of, check_algorithm, labels, make_con
 from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
 from csac.training.program import Program, choose_groups, cores_to_use, programs_of
-from csac.training.resume import Source, as_begun, refuse_differences
+from csac.training.resume import Source, as_begun, refuse_differences, refuse_lost
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.supervisor import supervise
@@ -31,7 +31,7 @@ from csac.training.watch import Watch, draw_curve
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
 
     from typing_extensions import Unpack
 
@@ -133,13 +133,11 @@ def train(
     programs = programs_of(template, directories, existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
 
-    before = [run.config for run in existing.values()]
     runs = _create(place, configs, groups, existing, source, demonstrations)
     try:
         return _run(runs, programs, watch, notes)
     except InputError:  # so that the corrected call can use the directory
         _remove_unbegun(place, [run for run in runs.runs if run.seed not in existing])
-        _take_back(existing.values(), before)
         raise
 
 
@@ -175,7 +173,6 @@ def resume(
     watch = Watch(progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
-    before = [run.config for run in runs.runs]
     if steps is not None:
         _extend(runs, steps, algorithm.cadence.has_schedule)
     existing = {run.seed: run for run in runs.runs}
@@ -185,11 +182,7 @@ def resume(
     how = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
     template = Program((), algorithm, config.task, 1, *how)
     programs = programs_of(template, [[existing[seed].path for seed in group] for group in groups], existing, config)
-    try:
-        return _run(runs, programs, watch, [])
-    except InputError:
-        _take_back(runs.runs, before)
-        raise
+    return _run(runs, programs, watch, [])
 
 
 def _check_arguments(resume: bool, directory: str | Path | None, wandb: bool | str) -> None:
@@ -211,13 +204,6 @@ def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
         place.rmdir()
 
 
-def _take_back(runs: Iterable[RunDirectory], before: Sequence[RunConfig]) -> None:
-    """Give those of the runs that no process has begun since the configuration that they had."""
-    for run, config in zip(runs, before, strict=True):
-        if RunDirectory.open(run.path).manifest == run.manifest and run.config != config:
-            run.update_manifest(config=config)
-
-
 def _extend(runs: RunSet, steps: int, has_schedule: bool) -> None:
     """Give every run so many steps. Raises InputError before any is changed."""
     wanted = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
@@ -227,10 +213,11 @@ def _extend(runs: RunSet, steps: int, has_schedule: bool) -> None:
 
 
 def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
-    """Give each run its configuration. Raises InputError, before any is changed, where one is in use."""
+    """Give each run its configuration. Raises InputError, before any is changed, where one cannot go on."""
     with ExitStack() as locks:
         for run in runs:
             locks.enter_context(run.locked())
+            refuse_lost(run)
         for run, config in zip(runs, configs, strict=True):
             run.update_manifest(config=config)
 

@@ -69,7 +69,7 @@ def test_what_another_process_trains_is_left_to_it(tmp_path, supervised, capsys)
 def test_more_steps_later_go_on(tmp_path, supervised):
     (run, *_) = tiny_study(tmp_path).runs()
     (longer, *_) = tiny_study(tmp_path, steps=2_000).runs()
-    write_run(tmp_path / run.folder, run.config)
+    write_run(tmp_path / run.folder, run.config, points=0)
     run_study([longer], tmp_path, How(), make_console())
     assert RunDirectory.open(tmp_path / run.folder).config.steps == 2_000
 
