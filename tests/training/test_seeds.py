@@ -31,10 +31,12 @@ SMALL: dict[str, Any] = {
     ids=lambda a: a.name,
 )
 def test_seeds_together_equal_seeds_alone(algorithm):
-    together = run(algorithm, "Pendulum-v1", 100, (0, 1, 2))
-    alone = run(algorithm, "Pendulum-v1", 100, (2,))
-    np.testing.assert_allclose(together.memories[2], alone.memories[0], rtol=1e-5, atol=1e-5)
-    ours, theirs = jax.tree.leaves(together.states[2]), jax.tree.leaves(alone.states[0])
-    for our, their in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(our, their, rtol=1e-3, atol=1e-5)
+    seeds, steps = (0, 1, 2), 100
+    together = run(algorithm, "Pendulum-v1", steps, seeds)
+    for i, seed in enumerate(seeds):
+        alone = run(algorithm, "Pendulum-v1", steps, (seed,))
+        np.testing.assert_allclose(together.memories[i], alone.memories[0], rtol=1e-5, atol=1e-5)
+        ours, theirs = jax.tree.leaves(together.states[i]), jax.tree.leaves(alone.states[0])
+        for our, their in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(our, their, rtol=1e-3, atol=1e-5)
     assert not np.allclose(together.memories[0], together.memories[1], atol=0.1)
