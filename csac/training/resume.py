@@ -272,8 +272,8 @@ class Source(NamedTuple):
         """Raise InputError where what was learnt is of another form than what the new run would learn."""
         learnt = self.checkpoints[wanted.seed].state().part("learner")
         if problem := incompatibility(algorithm, spec, wanted.steps, learnt):
-            told = "; ".join(differences(_fixed(self.runs[wanted.seed].config), _fixed(wanted)))
-            raise InputError(f"{self.path} does not fit: {told} ({problem})")
+            found = [*differences(_fixed(self.runs[wanted.seed].config), _fixed(wanted)), problem]
+            raise InputError(f"{self.path} does not fit: {'; '.join(found)}")
 
     def begun(self, manifest: Manifest) -> Manifest:
         """Return the manifest with which a new run begins."""
