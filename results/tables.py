@@ -142,16 +142,26 @@ def _form(value: float, spread: float = np.nan) -> str:
 
 
 def recovery_table(runs: Mapping[str, np.ndarray], step: int) -> str:
-    """Return what a change after `step` cost each seed, and how it came back."""
+    """Return what a change after `step` cost each seed, how it came back, and how two arms of five seeds compare."""
     headings = ("run", "seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "drawdown")
-    lines = []
+    lines, told = [], []
     for label, rows in runs.items():
         seeds = recovery(rows, step)
         values = np.array(list(seeds.values()))
         largest = max(abs(value) for one in seeds.values() for value in (one.before, one.drop, one.final))
         parts = {**seeds, "mean": Recovery(*values.mean(axis=0)), "± std": Recovery(*values.std(axis=0, ddof=1))}
         lines += [[label, str(name), *_recovery_cells(one, largest)] for name, one in parts.items()]
-    return table(headings, lines)
+        told.append(values)
+    if len(told) != 2 or min(map(len, told)) < FEWEST_FOR_BOOTSTRAP:
+        return table(headings, lines)
+    first, second = (dict(zip(Recovery._fields, values.T, strict=True)) for values in told)
+    claims = {
+        "has the smaller drop": (-first["relative_drop"], -second["relative_drop"]),
+        "is back at 90 % sooner": (-first["steps_to_regain"], -second["steps_to_regain"]),
+        "has the higher return at the end": (first["final"], second["final"]),
+    }
+    rows = [[claim, *compared(*values, 10_000)] for claim, values in claims.items()]
+    return table(headings, lines) + "\n\n" + table([" against ".join(runs), "probability", "so"], rows)
 
 
 def _recovery_cells(one: Recovery, largest: float) -> list[str]:
