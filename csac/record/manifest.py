@@ -108,6 +108,9 @@ def written(manifest: Manifest) -> bytes:
     return (json.dumps(fields, indent=2) + "\n").encode()
 
 
+_TOLD = {int: "a whole number", str: "a text", bool: "true or false", tuple: "a list"}
+
+
 def value(kind: Any, given: Any, name: str) -> Any:
     """Return a JSON value as one of this type. Raises InputError, with its name, where it is none."""
     origin, arguments = get_origin(kind), get_args(kind)
@@ -125,7 +128,8 @@ def value(kind: Any, given: Any, name: str) -> Any:
         return {key: value(arguments[1], item, name) for key, item in given.items()}
     if kind in (int, str, bool) and type(given) is kind:
         return given
-    raise InputError(f"{name!r} is {given!r:.60}")
+    told = " or ".join(map(repr, arguments)) if origin is Literal else _TOLD.get(origin or kind, "a table")
+    raise InputError(f"{name!r} is {given!r:.60}, not {told}")
 
 
 def _dataclass(kind: Any, given: dict[str, Any], name: str) -> Any:
