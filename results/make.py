@@ -130,13 +130,15 @@ def finals(page: Page, tasks: list[str], steps: int, **chosen: Any) -> str:
 
 def published(page: Page, steps: dict[str, int], ours: str, others: str, seeds: list[int]) -> str:
     """Return the paper's maximum average returns of CSAC and SAC beside those of two arms, after some steps."""
-    lines = []
+    lines, finals = [], []
     for task, until in steps.items():
         arms = page.arms([ours, others], task, seeds, until)
         told = [f"{cell.mean:,.0f} ± {cell.std:,.0f}" for cell in (RETURNS[task]["CSAC"], RETURNS[task]["SAC"])]
         best = [f"{maximum_average_return(rows)[0]:,.0f}" for rows in arms.values()]
         final = [measure(rows, until).final for rows in arms.values()]
         lines.append([task, *told, f"{until:,}", *best, compared(final[0], final[1])[0]])
+        finals.append(final)
+    lines.append(["all", *[""] * 5, compared(*np.stack(finals, axis=-1))[0]])
     headings = ["task", "paper: CSAC", "paper: SAC", "steps here", ours, others]
     return table([*headings, "P(higher final return)"], lines)
 
