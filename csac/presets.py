@@ -140,7 +140,14 @@ _STRONG: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "relative_entropy_estimator": "closed_form",
             "target_log_prob_bound": 0.0,
         },
-        "sac": _FASTER_CRITICS,
+        "sac": {
+            **_FASTER_CRITICS,
+            "n_steps": 2,
+            "warmup_steps": 5_000,
+            "initial_entropy_weight": 0.01,
+            "target_entropy_per_dimension": -0.5,
+            "weight_learning_rate": 1e-3,
+        },
     }
 )
 
