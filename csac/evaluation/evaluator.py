@@ -164,17 +164,18 @@ class Evaluator:
         self._make_environments(1)
         environment = self._environments[0]
         episode = Playing(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
-        episode.start()
-        state, start = None, np.ones(1, bool)
-        while not episode.ended:
-            observation = environment.raw_observation
-            answer = policy.predict(observation, state=state, episode_start=start, deterministic=deterministic)
-            if not isinstance(answer, tuple) or len(answer) != 2:
-                kind = type(policy).__name__
-                raise InputError(f"predict of a {kind} must return (action, state), not {answer!r:.40}")
-            action, state = answer
-            episode.step(action)
-            start = np.zeros(1, bool)
+        with globals_seeded(self._first_seed + number):
+            episode.start()
+            state, start = None, np.ones(1, bool)
+            while not episode.ended:
+                observation = environment.raw_observation
+                answer = policy.predict(observation, state=state, episode_start=start, deterministic=deterministic)
+                if not isinstance(answer, tuple) or len(answer) != 2:
+                    kind = type(policy).__name__
+                    raise InputError(f"predict of a {kind} must return (action, state), not {answer!r:.40}")
+                action, state = answer
+                episode.step(action)
+                start = np.zeros(1, bool)
         return episode.result()
 
     def close(self) -> None:

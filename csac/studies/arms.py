@@ -215,7 +215,8 @@ def train_command(config: RunConfig, seeds: Sequence[int]) -> str:
     words = ["csac", "train", config.task, "--algorithm", config.algorithm, "--steps", str(config.steps)]
     words += ["--seeds", str(seeds[-1] - seeds[0] + 1), *(["--first-seed", str(seeds[0])] if seeds[0] else [])]
     default = RunConfig(task=config.task)
-    for name in ("environments", "evaluation_interval", "evaluation_episodes", "device", "hindsight"):
+    evaluated = ("evaluation_interval", "evaluation_episodes", "evaluation_environments")
+    for name in ("environments", *evaluated, "device", "hindsight"):
         words += _option(name, getattr(config, name)) if getattr(config, name) != getattr(default, name) else []
     words += [word for change in config.perturbations for word in ("--perturb", change)]
     words += ["--env-kwargs", json.dumps(config.environment_arguments)] * bool(config.environment_arguments)

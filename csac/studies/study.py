@@ -230,7 +230,7 @@ def read_study(path: Path) -> Study:
     try:
         told = tomllib.loads(without_controls(path.read_bytes()).decode("utf-8-sig"))
         _refuse_unknown(told, _names(Study), "a study has no")
-        for method in told.get("methods", []):
+        for method in manifests.value(tuple[dict[str, Any], ...], told.get("methods", []), "methods"):
             _refuse_unknown(method, _names(Method), "a method has no")
         study = manifests.value(Study, {**told, "name": path.stem}, "")
         _refuse_unknown(study.common, [one.algorithm for one in study.methods], "common: no method has the algorithm")

@@ -117,8 +117,11 @@ class SeedEnvironments:
 
     def perturb(self, values: Mapping[str, float]) -> None:
         """Change every seed's task, as `Environment.perturb`."""
-        for environment in self.environments:
-            environment.perturb(values)
+        for place in self._running:
+            try:
+                self._at[place].perturb(values)
+            except EnvironmentFailure as error:
+                self._fail(place, error)
 
     def step(self, actions: np.ndarray) -> Steps:
         """Step every environment of the seeds that are alive with its action in [-1, 1], [seed, action]."""

@@ -79,7 +79,7 @@ def make_configs(
     hyperparameters = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
     with closing(Environment(task, arguments)) as environment:
         spec, name = environment.spec, environment.task_name
-        try_task(environment)
+        try_task(environment, arguments)
         facts = offered if is_told(offered) else {}
         if offered and not facts:
             if source:

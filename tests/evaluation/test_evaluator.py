@@ -392,6 +392,13 @@ def test_any_object_that_predicts_is_evaluated_alike():
     np.testing.assert_allclose(evaluate(Foreign(policy), Lottery, episodes=13), ours, rtol=1e-5)
 
 
+def test_a_foreign_policy_meets_the_same_episodes_again():
+    foreign = Foreign(policy_for(GlobalGenerator))
+    once, again = (evaluate(foreign, GlobalGenerator, episodes=3).tolist() for _ in range(2))
+    assert once == again
+    assert len(set(once)) == 3
+
+
 def test_a_foreign_policy_sees_raw_observations_its_state_and_the_starts():
     foreign = Foreign(policy_for(Goal))
     assert evaluate(foreign, Goal, episodes=2, deterministic=False).tolist() == [2.0, 2.0]

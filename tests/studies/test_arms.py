@@ -114,6 +114,7 @@ def test_nothing_there_is_said(tmp_path):
         (config(discount=0.9, normalise_observations=True), "--normalise-observations --discount 0.9"),
         (config(critic_hidden_sizes=(32, 16)), "--critic-hidden-sizes 32 16"),
         (config(perturbations=("friction=2@300",)), "--perturb friction=2@300"),
+        (dataclasses.replace(config(), evaluation_environments=0), "--evaluation-environments 0"),
     ],
 )
 def test_the_command_trains_the_same_again(one, words, monkeypatch):

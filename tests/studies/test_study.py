@@ -144,6 +144,12 @@ def test_a_strangers_study_moves_no_terminal(tmp_path):
     assert study.title == "\ufffd[2J\ufffdx"
 
 
+@pytest.mark.parametrize("methods", ["methods = 5", "methods = [1]", '[methods]\nlabel = "a"'])
+def test_methods_that_are_no_list_of_tables_are_refused(tmp_path, methods):
+    with pytest.raises(InputError, match=r"'methods' is .*, not a (list|table)"):
+        study_of(tmp_path, f'tasks = ["Ant-v4"]\n{methods}')
+
+
 def test_there_is_no_such_study():
     with pytest.raises(InputError, match="did you mean mujoco"):
         find("mujocco")

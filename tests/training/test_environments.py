@@ -159,6 +159,7 @@ def test_the_death_of_a_process_is_the_failure_of_its_seeds():
     environments.reset()
     actions = np.zeros((1, 2, 1), np.float32)
     outcomes = [environments.step(actions) for _ in range(3)]
+    environments.perturb({"action_noise": 0.1})  # of what is left
     environments.close()
     assert [len(outcome.failures) for outcome in outcomes] == [0, 0, 1]  # episodes have three steps
     assert "SIGKILL" in outcomes[2].failures[0].reason
