@@ -3,60 +3,55 @@
 from __future__ import annotations
 
 import re
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
 
 _RATES = "--actor-learning-rate and --critic-learning-rate"
 _SIZES = "--actor-hidden-sizes and --critic-hidden-sizes"
 
-NAMES = MappingProxyType(
-    {
-        "--tau": "--relative-entropy-weight (the paper's tau) or --target-rate (Polyak's)",
-        "--rho": "--target-rate",
-        "--polyak": "--target-rate",
-        "--sigma": "--entropy-weight",
-        "--alpha": "--entropy-weight",
-        "--ent-coef": "--entropy-weight",
-        "--temperature": "--entropy-weight (a number, or auto)",
-        "--autotune": "--entropy-weight auto",
-        "--temperature-learning-rate": "--weight-learning-rate",
-        "--gamma": "--discount",
-        "--lr": _RATES,
-        "--learning-rate": _RATES,
-        "--policy-lr": "--actor-learning-rate",
-        "--q-lr": "--critic-learning-rate",
-        "--net-arch": _SIZES,
-        "--hidden-sizes": _SIZES,
-        "--batch-size": "--minibatches (their number)",
-        "--buffer-size": "--replay-size",
-        "--learning-starts": "--warmup-steps",
-        "--train-freq": "--update-interval",
-        "--gradient-steps": "--updates-per-step",
-        "--policy-frequency": "--policy-delay",
-        "--n-steps": "--rollout-steps",
-        "--total-timesteps": "--steps",
-        "--seed": "--first-seed",
-        "--n-envs": "--environments",
-        "--num-envs": "--environments",
-        "--eval-freq": "--evaluation-interval",
-        "--n-eval-episodes": "--evaluation-episodes",
-        "--env-kwargs": "--environment-arguments",  # in Python
-        "--groups": "--seeds-per-process",
-        "--cuda": "--device gpu",
-        "--track": "--wandb",
-        "--out": "--video",
-    }
-)
+NAMES: Mapping[str, str] = {
+    "--tau": "--relative-entropy-weight (the paper's tau) or --target-rate (Polyak's)",
+    "--rho": "--target-rate",
+    "--polyak": "--target-rate",
+    "--sigma": "--entropy-weight",
+    "--alpha": "--entropy-weight",
+    "--ent-coef": "--entropy-weight",
+    "--temperature": "--entropy-weight (a number, or auto)",
+    "--autotune": "--entropy-weight auto",
+    "--temperature-learning-rate": "--weight-learning-rate",
+    "--gamma": "--discount",
+    "--lr": _RATES,
+    "--learning-rate": _RATES,
+    "--policy-lr": "--actor-learning-rate",
+    "--q-lr": "--critic-learning-rate",
+    "--net-arch": _SIZES,
+    "--hidden-sizes": _SIZES,
+    "--batch-size": "--minibatches (their number)",
+    "--buffer-size": "--replay-size",
+    "--learning-starts": "--warmup-steps",
+    "--train-freq": "--update-interval",
+    "--gradient-steps": "--updates-per-step",
+    "--policy-frequency": "--policy-delay",
+    "--n-steps": "--rollout-steps",
+    "--total-timesteps": "--steps",
+    "--seed": "--first-seed",
+    "--n-envs": "--environments",
+    "--num-envs": "--environments",
+    "--eval-freq": "--evaluation-interval",
+    "--n-eval-episodes": "--evaluation-episodes",
+    "--env-kwargs": "--environment-arguments",  # in Python
+    "--groups": "--seeds-per-process",
+    "--cuda": "--device gpu",
+    "--track": "--wandb",
+    "--out": "--video",
+}
 
-_FORMERLY = MappingProxyType(
-    {
-        ("reference_policy", "previous"): 'reference_policy="average", reference_rate=1',
-        ("reference_policy", "algorithm1"): 'reference_policy="periodic", reference_period=1',
-    }
-)
+_FORMERLY: Mapping[tuple[str, str], str] = {
+    ("reference_policy", "previous"): 'reference_policy="average", reference_rate=1',
+    ("reference_policy", "algorithm1"): 'reference_policy="periodic", reference_period=1',
+}
 
 
 def called_here(option: str, known: Collection[str]) -> str:

@@ -10,8 +10,7 @@ import itertools
 import math
 import textwrap
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import matplotlib.style
 import numpy as np
@@ -40,28 +39,24 @@ PIXELS = 1200  # from side to side
 CHARACTERS = 13  # of a legend in an inch
 LINE = 0.2  # inches from line to line of a legend or a title
 RETURN = "return per evaluation episode"
-STYLE = MappingProxyType(
-    {
-        "font.size": 10.0,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.edgecolor": "#888888",
-        "axes.labelcolor": "#333333",
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "grid.color": "#E4E4E4",
-        "xtick.color": "#888888",
-        "ytick.color": "#888888",
-        "xtick.labelcolor": "#333333",
-        "ytick.labelcolor": "#333333",
-        "text.parse_math": False,
-        "lines.markersize": 4.0,
-        "pdf.fonttype": 42,
-        "svg.hashsalt": "csac",
-    }
-)
-
-NO_LOOKS: Mapping[str, Look] = MappingProxyType({})
+STYLE: Mapping[str, Any] = {
+    "font.size": 10.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#888888",
+    "axes.labelcolor": "#333333",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E4E4E4",
+    "xtick.color": "#888888",
+    "ytick.color": "#888888",
+    "xtick.labelcolor": "#333333",
+    "ytick.labelcolor": "#333333",
+    "text.parse_math": False,
+    "lines.markersize": 4.0,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "csac",
+}
 
 
 class Curve(NamedTuple):
@@ -103,7 +98,7 @@ def figure_of(
     marks: Sequence[tuple[int, str]] = (),
     quantity: str = RETURN,
     limits: tuple[float, float] | None = None,
-    looks: Mapping[str, Look] = NO_LOOKS,
+    looks: Mapping[str, Look] | None = None,
 ) -> Figure:
     """Return a figure with the curve of each run, given as `(label, rows of evaluations.csv)`.
 
@@ -111,7 +106,7 @@ def figure_of(
     axis; `looks` are those that labels have elsewhere.
     """
     curves = [Curve.of(*run) for run in runs if not np.isnan(run[1]["return"]).all()]
-    looks = {**looks_of(label for label, _ in runs), **looks}
+    looks = {**looks_of(label for label, _ in runs), **(looks or {})}
     with matplotlib.style.context(["default", dict(STYLE)]):
         figure = Figure(figsize=(WIDTH, HEIGHT), dpi=PIXELS / WIDTH, layout="constrained")
         axes = figure.subplots()

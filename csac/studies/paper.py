@@ -5,7 +5,6 @@ Shang, Yuan, Huang, Cui, Chen, Zhu: Effective Reinforcement Learning Control usi
 
 from __future__ import annotations
 
-from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -30,9 +29,7 @@ COLUMNS = ("CSAC", "SAC", "PPO", "TD3", "SD3")
 CHEETAH, WALKER, ANT, HOPPER = "HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"
 QUADX, PANDA = "PyFlyt/QuadX-Waypoints-v1", "PandaReach-v3"  # the arm's task was v2, which ran on after a success
 
-STEPS: Mapping[str, int] = MappingProxyType(
-    {**dict.fromkeys((CHEETAH, WALKER, ANT, QUADX, PANDA), 1_000_000), HOPPER: 2_000_000}
-)
+STEPS: Mapping[str, int] = {**dict.fromkeys((CHEETAH, WALKER, ANT, QUADX, PANDA), 1_000_000), HOPPER: 2_000_000}
 
 
 class Published(NamedTuple):
@@ -43,51 +40,41 @@ class Published(NamedTuple):
 
 
 def _columns(*cells: tuple[float, float]) -> Mapping[str, Published]:
-    return MappingProxyType({name: Published(*cell) for name, cell in zip(COLUMNS, cells, strict=True)})
+    return {name: Published(*cell) for name, cell in zip(COLUMNS, cells, strict=True)}
 
 
 # Tables "Maximum average returns over four benchmark tasks" and "... over two real-robot-based simulation tasks".
-RETURNS: Mapping[str, Mapping[str, Published]] = MappingProxyType(
-    {
-        CHEETAH: _columns(
-            (11672.74, 151.21), (11052.89, 422.84), (4181.89, 723.54), (8224.70, 337.13), (7158.19, 2821.74)
-        ),
-        WALKER: _columns(
-            (4106.21, 501.45), (2710.65, 1272.01), (2403.55, 502.86), (3513.25, 295.81), (3404.03, 989.50)
-        ),
-        ANT: _columns((5538.20, 209.62), (5229.39, 269.52), (1836.47, 233.91), (2368.35, 99.15), (2960.61, 212.54)),
-        HOPPER: _columns((3458.22, 59.87), (3037.19, 242.06), (2204.01, 540.71), (3296.80, 356.86), (3515.30, 107.84)),
-        QUADX: _columns((530.28, 29.04), (388.55, 189.51), (267.06, 32.07), (433.56, 56.03), (383.03, 145.51)),
-        PANDA: _columns((-2.04, 0.18), (-2.12, 0.22), (-49.80, 0.04), (-48.57, 0.08), (-48.36, 0.10)),
-    }
-)
+RETURNS: Mapping[str, Mapping[str, Published]] = {
+    CHEETAH: _columns((11672.74, 151.21), (11052.89, 422.84), (4181.89, 723.54), (8224.70, 337.13), (7158.19, 2821.74)),
+    WALKER: _columns((4106.21, 501.45), (2710.65, 1272.01), (2403.55, 502.86), (3513.25, 295.81), (3404.03, 989.50)),
+    ANT: _columns((5538.20, 209.62), (5229.39, 269.52), (1836.47, 233.91), (2368.35, 99.15), (2960.61, 212.54)),
+    HOPPER: _columns((3458.22, 59.87), (3037.19, 242.06), (2204.01, 540.71), (3296.80, 356.86), (3515.30, 107.84)),
+    QUADX: _columns((530.28, 29.04), (388.55, 189.51), (267.06, 32.07), (433.56, 56.03), (383.03, 145.51)),
+    PANDA: _columns((-2.04, 0.18), (-2.12, 0.22), (-49.80, 0.04), (-48.57, 0.08), (-48.36, 0.10)),
+}
 
 # Table "Number of interactions required to reach the lower bound of maximum average return".
-INTERACTIONS: Mapping[str, Mapping[str, int]] = MappingProxyType(
-    {
-        task: MappingProxyType(dict(zip(COLUMNS, cells, strict=True)))
-        for task, cells in {
-            CHEETAH: (105_000, 115_000, 950_000, 135_000, 165_000),
-            WALKER: (450_000, 905_000, 980_000, 815_000, 655_000),
-            ANT: (225_000, 300_000, 980_000, 770_000, 280_000),
-            HOPPER: (325_000, 845_000, 1_640_000, 670_000, 220_000),
-        }.items()
-    }
-)
+INTERACTIONS: Mapping[str, Mapping[str, int]] = {
+    task: dict(zip(COLUMNS, cells, strict=True))
+    for task, cells in {
+        CHEETAH: (105_000, 115_000, 950_000, 135_000, 165_000),
+        WALKER: (450_000, 905_000, 980_000, 815_000, 655_000),
+        ANT: (225_000, 300_000, 980_000, 770_000, 280_000),
+        HOPPER: (325_000, 845_000, 1_640_000, 670_000, 220_000),
+    }.items()
+}
 
 BEST_TAU = 0.5  # section "Ablation study on Walker2d task"
 FRICTION_STEP = 300_000  # section "Evaluation of robustness in HalfCheetah task"
 
 # Table "Case analysis in QuadX-Waypoints-v1": counts in 1,000 rollouts of each of five trials.
-CASES: Mapping[str, Mapping[str, Published]] = MappingProxyType(
-    {
-        "out_of_bounds": _columns((20.6, 11.24), (48.2, 27.54), (38.4, 17.93), (73.2, 20.5), (56.0, 18.72)),
-        "collision": _columns((31.6, 10.41), (50.6, 14.36), (175.4, 4.16), (45.4, 15.01), (61.2, 24.34)),
-        "env_complete": _columns((352.0, 241.57), (173.4, 230.56), (31.0, 19.67), (64.0, 68.31), (125.4, 158.86)),
-    }
-)
+CASES: Mapping[str, Mapping[str, Published]] = {
+    "out_of_bounds": _columns((20.6, 11.24), (48.2, 27.54), (38.4, 17.93), (73.2, 20.5), (56.0, 18.72)),
+    "collision": _columns((31.6, 10.41), (50.6, 14.36), (175.4, 4.16), (45.4, 15.01), (61.2, 24.34)),
+    "env_complete": _columns((352.0, 241.57), (173.4, 230.56), (31.0, 19.67), (64.0, 68.31), (125.4, 158.86)),
+}
 
-SUCCESS_STEPS: Mapping[str, int] = MappingProxyType({"CSAC": 600_000, "SAC": 800_000})  # near 100 % on PandaReach
+SUCCESS_STEPS: Mapping[str, int] = {"CSAC": 600_000, "SAC": 800_000}  # near 100 % on PandaReach
 NEARLY_ALL = 0.95  # of an evaluation's episodes: the paper's "nearly 100 %"
 
 
