@@ -88,7 +88,7 @@ def comparison_table(
         count = Cell(str(over.seeds) + (f" ({len(lost)} failed)" if lost else ""), over.seeds)
         cells = [Cell(label), count, _whole(int(rows["step"].max(initial=0))), plus_minus(over), interval(over)]
         cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(own_rows)]
-        cells += [_middle(own), EMPTY if own is scores[0] else _above(own, scores[0])] * has_middles
+        cells += [middle(own), EMPTY if own is scores[0] else above(own, scores[0])] * has_middles
         cells += [_share(share)] * any(shares)
         body.append(Row(tuple(cells)))
     last = f"last {'three' if points == 3 else points} evaluations"
@@ -183,6 +183,18 @@ def interval_rows(over: Sequence[OverSeeds], largest: float, blank: int) -> list
     return [_summary("± 95 %", *reach, *[EMPTY] * blank)]
 
 
+def middle(scores: np.ndarray, form: str = "") -> Cell:
+    """Return the interquartile mean of scores [seed, ...] with its bootstrap interval; by itself it finds its form."""
+    value = interquartile_mean(scores)
+    return _with_interval(value, stratified_bootstrap_interval(scores, interquartile_mean), form or _form(value))
+
+
+def above(scores: np.ndarray, first: np.ndarray) -> Cell:
+    """Return the probability that a seed of `scores` [seed, ...] is above one of `first`, with its interval."""
+    probability = probability_of_improvement(scores, first) if len(scores) and len(first) else math.nan
+    return _with_interval(probability, improvement_interval(scores, first), ".2f")
+
+
 def few_seeds(count: int) -> str:
     """Return what a table says where seeds are too few for an interval, nothing where there is but one."""
     return no_interval(count) if 1 < count < FEWEST_FOR_INTERVAL else ""
@@ -218,16 +230,6 @@ def _maximum(rows: np.ndarray) -> Cell:
     except InputError:  # no evaluation holds every seed
         return EMPTY
     return Cell(f"{best:{_form(best)}} at {step:,}", best)
-
-
-def _middle(scores: np.ndarray) -> Cell:
-    middle = interquartile_mean(scores)
-    return _with_interval(middle, stratified_bootstrap_interval(scores, interquartile_mean), _form(middle))
-
-
-def _above(scores: np.ndarray, first: np.ndarray) -> Cell:
-    probability = probability_of_improvement(scores, first) if len(scores) and len(first) else math.nan
-    return _with_interval(probability, improvement_interval(scores, first), ".2f")
 
 
 def _with_interval(value: float, bounds: tuple[float, float] | None, form: str) -> Cell:

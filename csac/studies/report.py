@@ -12,21 +12,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from csac.console.tables import duration
-from csac.record import rendering
+from csac.record import rendering, report_tables
 from csac.record.files import write_atomically
 from csac.record.plots import encoded, figure_of, looks_of
 from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric
-from csac.record.report_tables import case_comparison_table, comparison_table, plus_minus, recovery_table
-from csac.record.statistics import (
-    drawdown,
-    evaluation_matrix,
-    improvement_interval,
-    interquartile_mean,
-    is_case,
-    last_evaluations,
-    probability_of_improvement,
-    stratified_bootstrap_interval,
-)
+from csac.record.statistics import drawdown, evaluation_matrix, is_case, last_evaluations
 from csac.record.summaries import last_rows, over_seeds, recoveries
 from csac.studies import paper
 from csac.studies.arms import by_place, differing, plain, seconds_per_step, settings, train_command
@@ -152,7 +142,7 @@ def returns(arms: Sequence[Arm]) -> Iterator[Part]:
     yield Heading("Returns")
     for place, own in by_place(arms).items():
         runs = [(arm.label, arm.rows) for arm in own]
-        yield comparison_table(runs, [list(arm.failures) for arm in own], POINTS)._replace(title=place)
+        yield report_tables.comparison_table(runs, [list(arm.failures) for arm in own], POINTS)._replace(title=place)
         yield Table(
             ("method", "maximum average return", "the paper's", "worst seed", "largest drawdown"),
             tuple(map(_extremes, own)),
@@ -167,10 +157,10 @@ def _extremes(arm: Arm) -> Row:
     return Row(
         (
             Cell(arm.label),
-            plus_minus(over_seeds(arm.best()[0])),
+            report_tables.plus_minus(over_seeds(arm.best()[0])),
             Cell(f"{told.mean:,.2f} ± {told.std:,.2f}", told.mean) if told else EMPTY,
             Cell(f"{number(last[worst])} (seed {worst})", last[worst]),
-            plus_minus(over_seeds(map(drawdown, evaluation_matrix(arm.rows)[2]))),
+            report_tables.plus_minus(over_seeds(map(drawdown, evaluation_matrix(arm.rows)[2]))),
         )
     )
 
@@ -201,14 +191,14 @@ def robustness(arms: Sequence[Arm]) -> Iterator[Part]:
         steps = [-1, *(step for step, _ in own[0].marks), None]
         for index, (step, text) in enumerate(own[0].marks):
             found = [recoveries(arm.label, arm.rows, step, steps[index + 2], steps[index] or -1) for arm in own]
-            yield recovery_table(found)._replace(title=f"{own[0].task}, {text} after step {step:,}")
+            yield report_tables.recovery_table(found)._replace(title=f"{own[0].task}, {text} after step {step:,}")
 
 
 def cases(arms: Sequence[Arm]) -> Iterator[Part]:
     """How often success and events came in the last evaluations."""
     tables = []
     for place, own in by_place(arms).items():
-        if table := case_comparison_table([(arm.label, last_rows(arm.rows, POINTS)) for arm in own]):
+        if table := report_tables.case_comparison_table([(arm.label, last_rows(arm.rows, POINTS)) for arm in own]):
             tables.append(table._replace(title=place))
     if tables:
         yield Heading("How episodes end, in the last three evaluations")
@@ -262,22 +252,13 @@ def over_tasks(arms: Sequence[Arm]) -> Iterator[Part]:
         return
     rows = []
     for label, own in values.items():
-        shares = own / reference
-        interval = stratified_bootstrap_interval(shares, interquartile_mean)
-        above = probability_of_improvement(own, values[first]), improvement_interval(own, values[first])
-        cells = [
-            _with_interval(interquartile_mean(shares), interval),
-            EMPTY if label == first else _with_interval(*above),
-        ]
-        rows.append(Row((Cell(label), *cells, Cell(str(own.size), own.size))))
+        above = EMPTY if label == first else report_tables.above(own, values[first])
+        middle = report_tables.middle(own / reference, ".2f")
+        rows.append(Row((Cell(label), middle, above, Cell(str(own.size), own.size))))
     yield Heading("Over all tasks")
     told = f"{', '.join(tasks)}; seeds {', '.join(map(str, seeds))}; scores as shares of the mean of {first}"
     headings = ("method", "IQM (95 % bootstrap interval)", f"above {first}, probability (95 %)", "runs")
     yield Table(headings, tuple(rows), told)
-
-
-def _with_interval(value: float, interval: tuple[float, float] | None) -> Cell:
-    return Cell(f"{value:.2f}" + (f" ({interval[0]:.2f} to {interval[1]:.2f})" if interval else ""), value)
 
 
 def the_papers(arms: Sequence[Arm]) -> Iterator[Part]:
