@@ -89,7 +89,7 @@ def comparison_table(
         cells = [Cell(label), count, _whole(int(rows["step"].max(initial=0))), plus_minus(over), interval(over)]
         cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(own_rows)]
         cells += [middle(own), EMPTY if own is scores[0] else above(own, scores[0])] * has_middles
-        cells += [_share(share)] * any(shares)
+        cells += [plus_minus(share, ".0%") if share else EMPTY] * any(shares)
         body.append(Row(tuple(cells)))
     last = f"last {'three' if points == 3 else points} evaluations"
     headings = ["run", "seeds", "steps", f"{last}, mean ± std over seeds", "95 % t-interval", "to the first"]
@@ -162,9 +162,11 @@ def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | Non
     return Table(headings, (returns, *body))
 
 
-def plus_minus(over: OverSeeds) -> Cell:
-    """Return `mean ± std`, of one seed its value alone; whole numbers from 20 on, but for a spread below 1."""
-    return _plus_minus(over, _form(over.mean, over.std))
+def plus_minus(over: OverSeeds, form: str = "") -> Cell:
+    """Return `mean ± std`, of one seed the mean alone; without a form whole from 20 on, but for a spread below 1."""
+    form = form or _form(over.mean, over.std)
+    spread = "" if math.isnan(over.std) else f" ± {over.std:{form}}"
+    return numeric(over.mean, f"{over.mean:{form}}{spread}")
 
 
 def interval(over: OverSeeds) -> Cell:
@@ -213,11 +215,6 @@ def _whole(value: int) -> Cell:
     return Cell(f"{value:,}", value)
 
 
-def _plus_minus(over: OverSeeds, form: str) -> Cell:
-    spread = "" if math.isnan(over.std) else f" ± {over.std:{form}}"
-    return numeric(over.mean, f"{over.mean:{form}}{spread}")
-
-
 def _form(value: float, spread: float = math.nan) -> str:
     if abs(value) >= 20:
         return ",.2f" if 0 < spread < 1 else ",.0f"
@@ -241,10 +238,6 @@ def _success(rows: np.ndarray, points: int) -> OverSeeds | None:
     """Return the share of successful episodes in the last evaluations, None where the task says nothing of success."""
     found = cases(last_rows(rows, points), {"success": True}) if is_case(rows["success"]) else []
     return found[0].over_seeds if found else None
-
-
-def _share(success: OverSeeds | None) -> Cell:
-    return _plus_minus(success, ".0%") if success else EMPTY
 
 
 def _largest(run: RecoverySummary) -> float:
@@ -285,7 +278,7 @@ def _rate(is_case: bool, value: float) -> Cell:
 
 def _mean_return(rows: np.ndarray) -> Cell:
     over = over_seeds(rows["return"][rows["seed"] == seed].mean() for seed in set(rows["seed"].tolist()))
-    return _plus_minus(over, ".3g" if 0 < abs(over.mean) < SMALL else ",.1f")
+    return plus_minus(over, ".3g" if 0 < abs(over.mean) < SMALL else ",.1f")
 
 
 def _rate_over_seeds(case: CaseSummary | None) -> Cell:
