@@ -214,19 +214,12 @@ def _recovery(steps: np.ndarray, returns: np.ndarray, step: int, since: int) -> 
     drop = max(before - after.min(), 0.0)
     shortfall = np.maximum(before - after, 0.0)
     area = np.trapezoid([0.0, *shortfall], [step, *steps])
-    time = _time_to_regain(steps - step, after, (REGAINED if before >= 0 else 2 - REGAINED) * before)
+    threshold = (REGAINED if before >= 0 else 2 - REGAINED) * before
+    below = after < threshold
+    fallen = int(below.argmax())
+    time = steps_to_reach(steps[fallen:] - step, after[fallen:], threshold) if below.any() else 0.0
     relative = drop / abs(before) if before else np.nan
     return Recovery(*map(float, (before, drop, relative, time, area, final, worst)))
-
-
-def _time_to_regain(times: np.ndarray, returns: np.ndarray, threshold: float) -> float:
-    """Return the time of the first return at the threshold or above after the first below it."""
-    below = returns < threshold
-    if not below.any():
-        return 0.0
-    fallen = int(below.argmax())
-    back = ~below[fallen:]
-    return float(times[fallen + int(back.argmax())]) if back.any() else np.inf
 
 
 def _bootstrap_interval(
