@@ -88,19 +88,15 @@ def interquartile_mean(values: np.ndarray) -> float:
 
 
 def stratified_bootstrap_interval(
-    scores: np.ndarray,
-    statistic: Callable[[np.ndarray], float],
-    repetitions: int = 2000,
-    seed: int = 0,
-    confidence: float = 0.95,
+    scores: np.ndarray, statistic: Callable[[np.ndarray], float], repetitions: int = 2000, seed: int = 0
 ) -> tuple[float, float] | None:
-    """Percentile interval of `statistic`, resampling the seeds of `scores` [seed, ...] anew for every other index.
+    """95 % percentile interval of `statistic`, resampling the seeds of `scores` [seed, ...] anew for every other index.
 
     The other index is a task: where it is an evaluation of the same seed, average over it first. Seeds with a NaN are
     left out whole; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge
     of the Statistical Precipice".
     """
-    return _bootstrap_interval([scores], statistic, repetitions, seed, confidence)
+    return _bootstrap_interval([scores], statistic, repetitions, seed, confidence=0.95)
 
 
 def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
