@@ -112,7 +112,7 @@ class Evaluator:
         deterministic: bool = True,
         should_stop: Callable[[], bool] | None = None,
     ) -> list[EvaluationEpisode]:
-        """Return the episodes of the batch that begins with number `first`.
+        """Return the episodes of the batch that begins with number `first`, played side by side to their ends.
 
         `should_stop` is asked before each step.
 
@@ -127,9 +127,23 @@ class Evaluator:
             Playing(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
             for environment, number in zip(self._environments, numbers, strict=False)
         ]
+        observation_size, action_size = policy.contract.spec[:2]
+        observations = np.zeros((EPISODES_AT_ONCE, observation_size), np.float32)
+        noise = None if deterministic else np.zeros((EPISODES_AT_ONCE, action_size), np.float32)
+        running = list(enumerate(episodes))
         try:
             with globals_seeded(self._first_seed + first):
-                self._play(policy, episodes, deterministic, should_stop)
+                self._ignores_seed = start(episodes, observations[: len(episodes)], self._ignores_seed)
+                while running:
+                    if should_stop and should_stop():
+                        raise EvaluationStopped
+                    if noise is not None:
+                        for row, episode in running:
+                            episode.generator.standard_normal(dtype=np.float32, out=noise[row])
+                    actions = policy.contract.to_environment(policy.act(observations, deterministic, noise))
+                    for row, episode in running:
+                        observations[row] = episode.step(actions[row])
+                    running = [(row, episode) for row, episode in running if not episode.ended]
         except EvaluationFailure:
             self.close()  # what has raised may be broken for good, and the next policy is to fail by itself alone
             raise
@@ -197,30 +211,6 @@ class Evaluator:
                 environment.close()
                 raise
             self._environments.append(environment)
-
-    def _play(
-        self,
-        policy: Policy,
-        episodes: Sequence[Playing],
-        deterministic: bool,
-        should_stop: Callable[[], bool] | None,
-    ) -> None:
-        """Play episodes side by side to their ends."""
-        observation_size, action_size = policy.contract.spec[:2]
-        observations = np.zeros((EPISODES_AT_ONCE, observation_size), np.float32)
-        noise = None if deterministic else np.zeros((EPISODES_AT_ONCE, action_size), np.float32)
-        self._ignores_seed = start(episodes, observations[: len(episodes)], self._ignores_seed)
-        running = list(enumerate(episodes))
-        while running:
-            if should_stop and should_stop():
-                raise EvaluationStopped
-            if noise is not None:
-                for row, episode in running:
-                    episode.generator.standard_normal(dtype=np.float32, out=noise[row])
-            actions = policy.contract.to_environment(policy.act(observations, deterministic, noise))
-            for row, episode in running:
-                observations[row] = episode.step(actions[row])
-            running = [(row, episode) for row, episode in running if not episode.ended]
 
 
 def evaluate(
