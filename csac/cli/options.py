@@ -119,16 +119,8 @@ class Train(_Training):
         if "none" in self.perturbations and len(self.perturbations) > 1:
             raise InputError("--perturb none leaves everything out: give it alone")
         planned = () if "none" in self.perturbations else self.perturbations or None  # None: as the source has it
-        others = (
-            "task",
-            "algorithm",
-            _field_of(self.algorithm),
-            "preset",
-            "hyperparameters",
-            "seed",
-            "task_is_callable",
-            "given",
-        )
+        others = ("task", "algorithm", _field_of(self.algorithm), "preset", "hyperparameters", "seed")
+        others += ("task_is_callable", "given")
         given = {name: value for name, value in vars(self).items() if name not in others}
         return {**given, "perturbations": planned, "events": self.events or None, "demonstrations": self.given}
 
