@@ -19,8 +19,9 @@ from csac.checks import check_whole
 from csac.console.tables import Fitted, duration, make_console, program
 from csac.processes import core_quota, usable_cores
 from csac.record.rendering import Cell, Row, Table, short
-from csac.record.run import RunDirectory, StorageFailure
+from csac.record.run import StorageFailure
 from csac.record.wandb import import_wandb
+from csac.studies.arms import gather, read_arms, seconds_per_step
 from csac.studies.study import find, named
 from csac.types import InputError
 
@@ -191,7 +192,7 @@ def show(options: Show) -> int:
     directory, rows, paces = options.home(), [], {}
     found = [(run, run.open(directory)) for run in options.study().runs()]
     for run, existing in found:
-        if existing and (pace := _pace(existing)):
+        if existing and (pace := seconds_per_step(existing)):
             paces.setdefault((run.config.task, run.config.algorithm), []).append(pace)
     for index, (run, existing) in enumerate(found):
         steps = existing.manifest.steps_done if existing else 0
@@ -235,7 +236,6 @@ def run(options: Run) -> int:
 
 def report_study(options: StudyReport) -> int:
     """Write the report of a study and print where it is."""
-    from csac.studies.arms import gather
     from csac.studies.report import report_of, write  # matplotlib is slow to import
 
     study, directory = options.study(), options.home()
@@ -252,7 +252,6 @@ def report_study(options: StudyReport) -> int:
 
 def report(options: Report, command: str) -> int:
     """Write the report of any runs and print where it is; `command` is the line that asked for it."""
-    from csac.studies.arms import read_arms
     from csac.studies.report import ANALYSES, report_of, write  # matplotlib is slow to import
 
     if not (options.runs or options.label):
@@ -279,12 +278,6 @@ COMMANDS: Mapping[str, tuple[type, Any]] = {
     "run": (Run, run),
     "report": (StudyReport, report_study),
 }
-
-
-def _pace(run: RunDirectory) -> float | None:
-    from csac.studies.arms import seconds_per_step
-
-    return seconds_per_step(run)
 
 
 def _print_table(headings: tuple[str, ...], rows: Sequence[Sequence[str]]) -> None:
