@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
@@ -61,18 +61,11 @@ def export_run(
 ) -> Exported:
     """Export a run's policy into a folder and verify it.
 
-    Args:
-        directory: the run.
-        format: numpy, onnx or c.
-        seed: the seed's label; by default the one that `csac.load` chooses.
-        which: the seed's last policy, or the one of its best evaluation.
-        place: the folder; by default `export/<format>` in the run.
-        fallback: a guard, as in `make_guards`.
-        rate_limit: a guard, as in `make_guards`.
-        episodes: how many of `csac evaluate`'s episodes to verify with; 0 plays none, and the task is not made.
-        card: whether to write a model card.
-        task: makes the environment, of a run whose task was made by a Python function.
-        trust_task: lets the task import a module that the user has never named here.
+    `seed` and `which` choose its policy as in `csac.load`, `fallback` and `rate_limit` are guards as in `make_guards`,
+    and `format` is numpy, onnx or c. The folder is `place`, by default `export/<format>` in the run; `card` adds a
+    model card. `episodes` of `csac evaluate`'s verify it: 0 plays none, and the task is not made. `task` makes the
+    environment of a run whose task was made by a Python function; `trust_task` lets the task import a module that the
+    user has never named here.
 
     Raises:
         InputError: arguments that cannot be used, a run, seed or task that is not there, or an artefact that is not the
@@ -91,7 +84,9 @@ def export_run(
     arguments = run.config.environment_arguments
     if episodes:
         task = _task(run, task, trust_task)
-        facts["control_rate_hz"] = _control_rate(policy, task, arguments)
+        with closing(Environment(task, arguments)) as environment:
+            check_contract(policy, environment)
+            facts["control_rate_hz"] = control_rate(environment.raw)
     place = Path(runs.path / "export" / format if place is None else place)
     with placed(place) as folder:
         write_artefact(folder, policy, format, guards, facts)
@@ -236,15 +231,6 @@ def _task(run: RunDirectory, task: Task | None, trust_task: bool) -> Task:
         )
     refuse_untrusted(run.config.task, run.path, trust_task)
     return run.config.task
-
-
-def _control_rate(policy: Policy, task: Task, arguments: dict[str, Any]) -> float | None:
-    environment = Environment(task, arguments)
-    try:
-        check_contract(policy, environment)
-        return control_rate(environment.raw)
-    finally:
-        environment.close()
 
 
 def control_rate(raw: Any) -> float | None:
