@@ -291,13 +291,7 @@ def cause_of_death(exit_code: int) -> str:
     """Return how a process ended that nobody asked to end, as the end of a sentence."""
     if exit_code >= 0:
         return f"its process ended by itself with exit code {exit_code} (does the task call os._exit?)"
-    name = _signal_name(-exit_code)
+    names = {one.value: one.name for one in signal.Signals}
+    name = names.get(-exit_code, f"signal {-exit_code}")  # a real-time signal has no name
     hints = {"SIGKILL": " (out of memory?)", "SIGSEGV": " (a fault in native code, such as the task's simulator)"}
     return f"its process was killed by {name}{hints.get(name, '')}"
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:  # a real-time signal
-        return f"signal {number}"
