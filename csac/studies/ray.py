@@ -49,7 +49,41 @@ class Cluster:
         """
         ray = self._connect()
         try:
-            self._run(ray, programs, watcher_of, should_stop)
+            from ray.util.queue import Queue
+            from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+            here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+            messages = Queue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
+            task = ray.remote(
+                num_cpus=self.cores,
+                num_gpus=self.gpus or None,
+                memory=int(self.memory * 2**30) or None,
+                max_retries=RETRIES,
+                max_calls=1,  # XLA counts its cores once in a process
+            )(_train)
+            running = {task.remote(program, index, messages): program for index, program in enumerate(programs)}
+            errors: list[Exception] = []
+            is_stopping = False
+            while running:
+                if (should_stop() or errors) and not is_stopping:
+                    is_stopping = True
+                    for reference in running:
+                        ray.cancel(reference)  # raises SIGINT there, on which the run is saved
+                over, _ = ray.wait(list(running), num_returns=1, timeout=SECONDS_BETWEEN_LOOKS)
+                for index, name, arguments in messages.get_nowait_batch(messages.size()):
+                    getattr(watcher_of(programs[index]), name)(*arguments)
+                for reference in over:
+                    program = running.pop(reference)
+                    try:
+                        ray.get(reference)
+                    except ray.exceptions.RayError as error:
+                        cause = getattr(error, "cause", None)
+                        if isinstance(cause, InputError | StorageFailure):  # a mistake, which ends the study
+                            errors.append(cause)
+                        elif not is_stopping:
+                            record_failure(program, watcher_of(program), error)
+            if errors:
+                raise errors[0]
         finally:
             ray.shutdown()
 
@@ -73,56 +107,6 @@ class Cluster:
             raise InputError(f"no Ray cluster can be reached at {self.address}: {error!s:.200}") from None
         return ray
 
-    def _run(
-        self,
-        ray: Any,
-        programs: Sequence[Program],
-        watcher_of: Callable[[Program], Watcher],
-        should_stop: Callable[[], bool],
-    ) -> None:
-        from ray.util.queue import Queue
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
-        messages = Queue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
-        task = ray.remote(
-            num_cpus=self.cores,
-            num_gpus=self.gpus or None,
-            memory=int(self.memory * 2**30) or None,
-            max_retries=RETRIES,
-            max_calls=1,  # XLA counts its cores once in a process
-        )(_train)
-        running = {task.remote(program, index, messages): program for index, program in enumerate(programs)}
-        errors: list[Exception] = []
-        is_stopping = False
-        while running:
-            if (should_stop() or errors) and not is_stopping:
-                is_stopping = True
-                for reference in running:
-                    ray.cancel(reference)  # raises SIGINT there, on which the run is saved
-            over, _ = ray.wait(list(running), num_returns=1, timeout=SECONDS_BETWEEN_LOOKS)
-            for index, name, arguments in messages.get_nowait_batch(messages.size()):
-                getattr(watcher_of(programs[index]), name)(*arguments)
-            for reference in over:
-                program = running.pop(reference)
-                try:
-                    ray.get(reference)
-                except ray.exceptions.RayError as error:
-                    _note_loss(program, watcher_of(program), error, is_stopping, errors)
-        if errors:
-            raise errors[0]
-
-
-def _note_loss(
-    program: Program, watcher: Watcher, error: Exception, is_stopping: bool, errors: list[Exception]
-) -> None:
-    """Note why a task ended without a result: a mistake that ends the study, or a run that failed."""
-    cause = getattr(error, "cause", None)
-    if isinstance(cause, InputError | StorageFailure):
-        errors.append(cause)
-    elif not is_stopping:
-        record_failure(program, watcher, error)
-
 
 def _train(program: Program, index: int, messages: Any) -> None:
     """Train a program on a node."""
@@ -132,9 +116,10 @@ def _train(program: Program, index: int, messages: Any) -> None:
     from csac.training.running import begin_with, train_program  # JAX
 
     begin_with(program.threads)
-
-    for path in program.directories:
-        _wait_until_free(path / LOCK)
+    for path in program.directories:  # of a run lost with its node the lock becomes free; another process may keep it
+        lock, end = path / LOCK, time.monotonic() + SECONDS_FOR_LOCK
+        while lock.exists() and is_locked(lock) and time.monotonic() < end:
+            time.sleep(1.0)
     try:
         with stop_requested() as request:
             train_program(program, watcher, request.is_set)
@@ -144,13 +129,6 @@ def _train(program: Program, index: int, messages: Any) -> None:
         record_failure(program, watcher, error)
     finally:
         ray.wait(watcher.sent, num_returns=len(watcher.sent))
-
-
-def _wait_until_free(lock: Any) -> None:
-    """Wait for the lock of a run that was lost with its node; but not for ever, as another process may have it."""
-    end = time.monotonic() + SECONDS_FOR_LOCK
-    while lock.exists() and is_locked(lock) and time.monotonic() < end:
-        time.sleep(1.0)
 
 
 class _QueueWatcher(Watcher):
