@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -114,19 +114,22 @@ def play(
         longest, done = min(limit or LONGEST_EPISODE, LONGEST_EPISODE), 0
         check_contract(policy, environment)
         environment.perturb(perturbed)
-        with _filming(environment, run.config.task, video) as film:
+        with nullcontext() if video is None else _filming(environment, run.config.task, video) as film:
             for number in range(episodes):
                 episode = Playing(environment, number, FRESH_EVALUATION_SEED + number, longest)
                 observation = episode.start()
-                film.add()
+                if film:
+                    film.add()
                 while not episode.ended:
                     action = policy.contract.to_environment(policy.act(observation[None])[0])
                     observation = episode.step(action)
-                    film.add()
+                    if film:
+                        film.add()
                     if on_progress:
                         on_progress(done + episode.length, done + (episodes - number) * longest)
                 done += episode.length
-                film.end_episode()
+                if film:
+                    film.end_episode()
                 yield episode.result()
 
 
@@ -230,22 +233,9 @@ class _Film:
         self._shown += 1
 
 
-class _Window:
-    """Where an environment draws by itself."""
-
-    def add(self) -> None:
-        """Do nothing."""
-
-    def end_episode(self) -> None:
-        """Do nothing."""
-
-
 @contextmanager
-def _filming(environment: Environment, task: str, video: str | Path | None) -> Iterator[_Film | _Window]:
+def _filming(environment: Environment, task: str, video: str | Path) -> Iterator[_Film]:
     """Yield what takes the pictures; a video gets its name once it is whole."""
-    if video is None:
-        yield _Window()
-        return
     path = Path(video).absolute()  # a task may change where we are
     aside = path.with_name(f".{os.getpid()}.{path.name}")
     film = _Film(environment, task, aside)
