@@ -121,7 +121,7 @@ def placed(place: Path) -> Iterator[Path]:
 def _check_place(place: Path) -> None:
     names = {entry.name for entry in place.iterdir()} if place.exists() else set()
     fields = read_json(place / CONTRACT) if CONTRACT in names else {}
-    if names and (names - _KNOWN or "format" not in fields):
+    if names and (names - _KNOWN or not isinstance(fields, dict) or "format" not in fields):
         raise InputError(f"{place} holds something else than an artefact: choose a new or an empty folder")
 
 

@@ -238,15 +238,17 @@ def test_an_older_artefact_is_replaced_and_nothing_else(tmp_path):
     assert told(place)["provenance"]["seed"] == 0
     assert {path.name for path in place.iterdir()} == {"contract.json", "policy.py", "policy.safetensors", "README.md"}
     random_policy(contract()).save(tmp_path / "saved")
+    (tmp_path / "five").mkdir()
+    (tmp_path / "five" / "contract.json").write_text("5")
     (place / "notes.txt").touch()
-    for kept in (place, tmp_path / "saved", run.path):
+    for kept in (place, tmp_path / "saved", tmp_path / "five", run.path):
         before = sorted(kept.rglob("*"))
         with pytest.raises(InputError, match="holds something else than an artefact"):
             export_run(run.path, place=kept, episodes=0)
         assert sorted(kept.rglob("*")) == before
     with pytest.raises(InputError, match="cannot write"):
         export_run(run.path, place=place / "notes.txt", episodes=0)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "made", "run", "saved"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["five", "link", "made", "run", "saved"]
 
 
 # As a user types it.
