@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac.algorithms.adaptation import Weights
 from csac.algorithms.csac import CSAC
 from csac.algorithms.networks import MLP
 from csac.types import Layer
@@ -35,12 +34,11 @@ def flat_critics() -> tuple[MLP, MLP]:
 def gradients(algorithm: CSAC, std: float) -> np.ndarray:
     """Return dJ/dmean at every quadrature node of the action noise [64], with the actor as its own reference."""
     actor = constant_policy(0.3, std)
-    weights = Weights(algorithm.entropy_weight, algorithm.relative_entropy_weight)
 
     def gradient(noise: jax.Array) -> jax.Array:
         def loss(learnt: MLP) -> jax.Array:
             networks = {"reference": actor, "critics": flat_critics()}
-            return algorithm.actor_loss(learnt, jnp.zeros(1), noise, weights=weights, **networks)[0]
+            return algorithm.actor_loss(learnt, jnp.zeros(1), noise, sigma=algorithm.entropy_weight, **networks)[0]
 
         return jax.grad(loss)(actor).layers[0].bias[0]
 

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from csac.algorithms.adaptation import Weights
 from csac.algorithms.csac import CSAC
 from csac.algorithms.networks import MLP
 from csac.types import Layer
@@ -25,6 +24,13 @@ from csac.types import Layer
 STATES, ACTIONS = 10, 5
 PULL = 0.01  # slope of the Q that rises evenly with the mean
 NOISE = 0.05  # standard deviation of the noise in the gradient that Adam is given
+
+
+class Weights(NamedTuple):
+    """σ and τ."""
+
+    entropy: float
+    relative_entropy: float
 
 
 class Choice(NamedTuple):
@@ -171,11 +177,12 @@ def means(
         reference_period=choice.period,
         reference_rate=choice.rate,
         relative_entropy_estimator="closed_form",
+        relative_entropy_weight=weights.relative_entropy,
     )
 
     def loss(actor: MLP, reference: MLP) -> jax.Array:
         networks = {"reference": reference, "critics": (critic, critic)}
-        return algorithm.actor_loss(actor, jnp.zeros(1), jnp.zeros(1), weights=weights, **networks)[0]
+        return algorithm.actor_loss(actor, jnp.zeros(1), jnp.zeros(1), sigma=weights.entropy, **networks)[0]
 
     def update(carry: tuple[MLP, MLP, optax.OptState], step: jax.Array) -> tuple[tuple, jax.Array]:
         actor, kept, optimiser_state = carry

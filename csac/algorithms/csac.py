@@ -12,16 +12,15 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms import adaptation
-from csac.algorithms.adaptation import LearntWeights, Weights
 from csac.algorithms.critics import Critics, min_q, update_critics
 from csac.algorithms.distributions import action_at, bounded, kl, log_ratio, policy_at
-from csac.algorithms.hyperparameters import COUNT, NOT_NEGATIVE, POSITIVE, RATE
-from csac.algorithms.networks import MLP, copy_tree, gradient_step, make_optimiser, polyak
+from csac.algorithms.hyperparameters import COUNT, NOT_NEGATIVE, RATE
+from csac.algorithms.networks import MLP, copy_tree, gradient_step, polyak
 from csac.algorithms.off_policy import MaximumEntropy, first_metrics, improve_delayed, policy_network
 from csac.algorithms.shapes import Action, Actions, Count, Key, Observation, Observations, Scalar
 from csac.algorithms.statistics import Statistics, normalise, normalise_batch
-from csac.types import InputError, Metrics, PolicyNetwork, Spec, Transition
+from csac.algorithms.temperature import Temperature
+from csac.types import Metrics, PolicyNetwork, Spec, Transition
 
 
 class State(NamedTuple):
@@ -33,7 +32,7 @@ class State(NamedTuple):
     target_critics: Critics | None  # θ̂₁, θ̂₂
     actor_optimiser: Any
     critic_optimiser: Any
-    learnt_weights: LearntWeights | None = None
+    temperature: Temperature | None = None  # σ, where it is learnt
     observation_statistics: Statistics | None = None
     actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
@@ -44,8 +43,8 @@ class CSAC(MaximumEntropy):
 
     entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.2
     """Weight of the entropy (the paper's sigma); `auto` learns it, to keep the entropy at its target as SAC does."""
-    relative_entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.5
-    """Weight of the relative entropy towards the reference (the paper's tau); 0 is SAC, `auto` learns it."""
+    relative_entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.5
+    """Weight of the relative entropy towards the reference (the paper's tau); 0 is SAC."""
     reference_policy: Literal["periodic", "average"] = "average"
     """A copy of the actor, taken every `reference_period` updates, or a running average of past actors."""
     reference_period: Annotated[int, COUNT] = 1000
@@ -58,26 +57,16 @@ class CSAC(MaximumEntropy):
     """Whether the relative entropy is in the critic's target and in the actor's loss, or in the actor's loss alone."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on log π and on the relative entropy of an action in the critic's target, in nats; 0 is no bound."""
-    target_relative_entropy: Annotated[float, POSITIVE] = 0.01
-    """Relative entropy per refresh that `auto` aims at, in nats per action dimension; less for `average`."""
 
     name: ClassVar[str] = "csac"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        least = 2 * self.policy_delay
-        is_learnt = self.relative_entropy_weight == "auto" and self.reference_policy == "periodic"
-        if is_learnt and self.reference_period < least:  # else the actor may not have moved away from its reference
-            raise InputError(f"relative_entropy_weight auto needs a reference_period of at least {least}")
-
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return random networks; targets and reference are copies (Algorithm 1, line 1)."""
-        networks, given = self.first_networks(key, spec, steps, 2 * spec.action_size), self.given_weights
-        first = Weights(self.initial_entropy_weight, 0.5)  # of those that are `auto`
+        networks = self.first_networks(key, spec, steps, 2 * spec.action_size)
         return State(
             **networks,
             reference=copy_tree(networks["actor"]),
-            learnt_weights=adaptation.make_weights(given, first, make_optimiser(self.weight_learning_rate)),
+            temperature=self.first_temperature("auto") if self.entropy_weight == "auto" else None,
             actor_metrics=first_metrics(("actor_loss", "entropy", "relative_entropy"), self.policy_delay),
         )
 
@@ -94,36 +83,33 @@ class CSAC(MaximumEntropy):
         """Run the update phase of Algorithm 1, lines 12 to 23, on the mini-batch of line 13."""
         statistics, batch = normalise_batch(state.observation_statistics, batch)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
-        weights = adaptation.current_weights(self.given_weights, state.learnt_weights)
+        sigma = self.sigma(state)
         # Line 12: φ_p ← φ; an average moves later, in `improve`
         reference = self.reference_before(state.reference, state.actor, step)
         state = state._replace(reference=reference, observation_statistics=statistics)
         # Lines 16 to 19: a' ~ π(·|s'), then y(s, a, s'), then a step down Σᵢ [Qᵢ(s, a) - y]²
-        critic_target = partial(self.critic_target, actor=state.actor, reference=reference, weights=weights)
+        critic_target = partial(self.critic_target, actor=state.actor, reference=reference, sigma=sigma)
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
         # Line 21: a step down J(φ)
-        given = (folded_critics, batch.observation, actor_noise, step)
+        given = (folded_critics, batch.observation, actor_noise)
         state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
         # Line 23: θ̂ᵢ ← ρ θᵢ + (1 - ρ) θ̂ᵢ
         state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
-        return state, {**metrics, **actor_metrics, **adaptation.weight_metrics(weights, state.learnt_weights)}
+        return state, {**metrics, **actor_metrics, **({"entropy_weight": sigma} if state.temperature else {})}
 
     def improve(
-        self, state: State, critics: Critics, observations: Observations, noise: Actions, step: Count
+        self, state: State, critics: Critics, observations: Observations, noise: Actions
     ) -> tuple[State, Metrics]:
-        """Return the state after one step on the actor, then of a running average and of weights that are learnt."""
-        weights = adaptation.current_weights(self.given_weights, state.learnt_weights)
-        loss = partial(self.actor_loss, reference=state.reference, critics=critics, weights=weights)
+        """Return the state after one step on the actor, then of a running average and of σ where it is learnt."""
+        loss = partial(self.actor_loss, reference=state.reference, critics=critics, sigma=self.sigma(state))
         adam = self.optimiser(self.actor_learning_rate)
         actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)
-        new_state = state._replace(
-            actor=actor,
-            actor_optimiser=optimiser,
-            reference=self.reference_after(state.reference, state.actor),
-            learnt_weights=self.update_weights(state, metrics, noise.shape[-1], step),
-        )
-        return new_state, metrics
+        reference, temperature = self.reference_after(state.reference, state.actor), state.temperature
+        if temperature:
+            temperature = self.adapt_temperature(temperature, metrics["entropy"], noise.shape[-1])
+        learnt = {"actor": actor, "actor_optimiser": optimiser, "reference": reference, "temperature": temperature}
+        return state._replace(**learnt), metrics
 
     def soft_value_terms(
         self, observation: Observation, noise: Action, *, actor: MLP, reference: MLP, critics: Critics
@@ -136,27 +122,25 @@ class CSAC(MaximumEntropy):
         return q_value, log_prob, kl(policy, previous) if is_exact else log_ratio(policy, previous, noise)
 
     def critic_target(
-        self, transition: Transition, noise: Action, *, actor: MLP, reference: MLP, targets: Critics, weights: Weights
+        self, transition: Transition, noise: Action, *, actor: MLP, reference: MLP, targets: Critics, sigma: Any
     ) -> Scalar:
         """Return y = r + γ [min Q - σ log π - τ D] at s' (Eq. Q_TD_2), D as below; no future after an end."""
-        sigma, tau = weights
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             transition.next_observation, noise, actor=actor, reference=reference, critics=targets
         )
         value = q_value - sigma * bounded(log_prob, self.target_log_prob_bound)
         if self.relative_entropy_form == "explicit":
-            value = value - tau * bounded(relative_entropy, self.target_log_prob_bound)
+            value = value - self.relative_entropy_weight * bounded(relative_entropy, self.target_log_prob_bound)
         return transition.reward + self.discount_after(transition) * value
 
     def actor_loss(
-        self, actor: MLP, observation: Observation, noise: Action, *, reference: MLP, critics: Critics, weights: Weights
+        self, actor: MLP, observation: Observation, noise: Action, *, reference: MLP, critics: Critics, sigma: Any
     ) -> tuple[Scalar, Metrics]:
         """Return J(φ) = σ log π + τ D - min Q at ã(s, ξ), and what to log; `sampled`, it is Eq. actor_update_2."""
-        sigma, tau = weights
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             observation, noise, actor=actor, reference=reference, critics=critics
         )
-        loss = -(q_value - sigma * log_prob - tau * relative_entropy)
+        loss = -(q_value - sigma * log_prob - self.relative_entropy_weight * relative_entropy)
         return loss, {"actor_loss": loss, "entropy": -log_prob, "relative_entropy": relative_entropy}
 
     def reference_before(self, kept: MLP, actor: MLP, step: Count) -> MLP:
@@ -172,16 +156,6 @@ class CSAC(MaximumEntropy):
         """Return φ_p to keep, given that of the update and the actor before it."""
         return polyak(used, actor, self.reference_rate) if self.reference_policy == "average" else used
 
-    @property
-    def given_weights(self) -> Weights:
-        """σ and τ, or `auto`."""
-        return Weights(self.entropy_weight, self.relative_entropy_weight)
-
-    def update_weights(self, state: State, metrics: Metrics, dimensions: int, step: Count) -> LearntWeights | None:
-        """Return the learnt weights after one step: σ follows the entropy, τ the relative entropy before a refresh."""
-        target = self.entropy_target(dimensions)
-        targets = Weights(target, self.target_relative_entropy * dimensions)
-        until_refresh = self.reference_period - step % self.reference_period
-        is_last = self.reference_policy == "average" or until_refresh <= self.policy_delay
-        adam = make_optimiser(self.weight_learning_rate)
-        return adaptation.adapt_weights(state.learnt_weights, metrics, targets, is_last, adam)
+    def sigma(self, state: State) -> Any:
+        """Return σ as it is given or, where it is `auto`, as it is learnt."""
+        return self.entropy_weight if state.temperature is None else jnp.exp(state.temperature.log_weight)

@@ -38,6 +38,7 @@ from csac.algorithms.networks import (
 )
 from csac.algorithms.shapes import Action, Count, Key, Scalar
 from csac.algorithms.statistics import Statistics, normaliser_of
+from csac.algorithms.temperature import Temperature, adapt, make_temperature
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class OffPolicy(Architecture):
     critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the critics."""
     learning_rate_schedule: Schedule = "constant"
-    """How both fall to zero over the run: not at all, linearly or as a cosine. Learnt weights keep their rate."""
+    """How both fall to zero over the run: not at all, linearly or as a cosine. A learnt temperature keeps its rate."""
     actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
@@ -150,7 +151,7 @@ class TwinCritics(OffPolicy):
     normalise_observations: bool = False
     """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
     policy_delay: Annotated[int, COUNT] = 1
-    """Critic updates per update of the actor and of learnt weights (TD3's d)."""
+    """Critic updates per update of the actor and of a learnt entropy weight (TD3's d)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -190,7 +191,16 @@ class MaximumEntropy(TwinCritics):
     target_entropy_per_dimension: float = -1.0
     """Entropy that `auto` aims at, in nats per action dimension."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
-    """Learning rate of weights that are `auto`."""
+    """Learning rate of an entropy weight that is `auto`."""
+
+    def first_temperature(self, given: float | Literal["auto"]) -> Temperature:
+        """Return an entropy weight that is given, or what one of `auto` begins with."""
+        weight = self.initial_entropy_weight if given == "auto" else given
+        return make_temperature(weight, make_optimiser(self.weight_learning_rate))
+
+    def adapt_temperature(self, temperature: Temperature, entropy: Scalar, dimensions: int) -> Temperature:
+        """Return the weight after one gradient step towards the entropy that `auto` aims at."""
+        return adapt(temperature, entropy, self.entropy_target(dimensions), make_optimiser(self.weight_learning_rate))
 
     def entropy_target(self, dimensions: int) -> float:
         """Return the entropy that `auto` aims at, in nats."""

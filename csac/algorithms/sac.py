@@ -9,14 +9,14 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms.adaptation import LearntWeight, adapt_weight, first_log_weight, make_weight
 from csac.algorithms.critics import Critics, min_q, update_critics
 from csac.algorithms.distributions import action_at, policy_at
 from csac.algorithms.hyperparameters import NOT_NEGATIVE
-from csac.algorithms.networks import MLP, gradient_step, make_optimiser, polyak
+from csac.algorithms.networks import MLP, gradient_step, polyak
 from csac.algorithms.off_policy import MaximumEntropy, first_metrics, improve_delayed, policy_network
 from csac.algorithms.shapes import Action, Actions, Count, Key, Observation, Observations, Scalar
 from csac.algorithms.statistics import Statistics, normalise, normalise_batch
+from csac.algorithms.temperature import Temperature, logarithm
 from csac.types import Metrics, PolicyNetwork, Spec, Transition
 
 
@@ -26,7 +26,7 @@ class State(NamedTuple):
     actor: MLP
     critics: Critics
     target_critics: Critics | None
-    temperature: LearntWeight  # a fixed one as well
+    temperature: Temperature  # a fixed one as well
     actor_optimiser: Any
     critic_optimiser: Any
     observation_statistics: Statistics | None = None
@@ -66,7 +66,7 @@ class SAC(MaximumEntropy):
         statistics, batch = normalise_batch(state.observation_statistics, batch)
         state = state._replace(observation_statistics=statistics)
         if self.entropy_weight != "auto":  # a fork may have another
-            log_weight = first_log_weight(self.entropy_weight)
+            log_weight = logarithm(self.entropy_weight)
             state = state._replace(temperature=state.temperature._replace(log_weight=log_weight))
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.temperature.log_weight)
@@ -89,17 +89,14 @@ class SAC(MaximumEntropy):
         adam = self.optimiser(self.actor_learning_rate)
         actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)
         if self.entropy_weight == "auto":
-            target = self.entropy_target(noise.shape[-1])
-            adam = make_optimiser(self.weight_learning_rate)
-            temperature = adapt_weight(temperature, metrics["entropy"], adam, target)
+            temperature = self.adapt_temperature(temperature, metrics["entropy"], noise.shape[-1])
         return state._replace(actor=actor, actor_optimiser=optimiser, temperature=temperature), metrics
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return random networks; the targets are copies."""
-        weight = self.initial_entropy_weight if self.entropy_weight == "auto" else self.entropy_weight
         return State(
             **self.first_networks(key, spec, steps, 2 * spec.action_size),
-            temperature=make_weight(weight, make_optimiser(self.weight_learning_rate)),
+            temperature=self.first_temperature(self.entropy_weight),
             actor_metrics=first_metrics(("actor_loss", "entropy"), self.policy_delay),
         )
 

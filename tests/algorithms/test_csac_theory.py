@@ -15,7 +15,6 @@ from scipy.special import logsumexp, softmax
 
 from csac.algorithms import CSAC, SAC
 from csac.algorithms import csac as csac_file
-from csac.algorithms.adaptation import Weights
 from csac.types import Transition
 
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(80)
@@ -34,17 +33,12 @@ def critic(inputs: jax.Array) -> jax.Array:
     return 1.5 * action - 2.0 * action**2 + 0.4 * jnp.sin(5.0 * action)
 
 
-def weights_of(algorithm):
-    return Weights(algorithm.entropy_weight, algorithm.relative_entropy_weight)
-
-
 def actor_losses(algorithm, parameters, reference, noises):
     """The actor loss at each noise, of the policy with these [mean, log_std] at the only observation."""
 
     def loss(noise):
-        networks = {"reference": lambda _: reference, "critics": (critic, critic)}
-        weights = weights_of(algorithm)
-        return algorithm.actor_loss(lambda _: parameters, ONE_OBSERVATION, noise[None], weights=weights, **networks)[0]
+        given = {"reference": lambda _: reference, "critics": (critic, critic), "sigma": algorithm.entropy_weight}
+        return algorithm.actor_loss(lambda _: parameters, ONE_OBSERVATION, noise[None], **given)[0]
 
     return jax.vmap(loss)(noises)
 
@@ -126,7 +120,7 @@ def test_a_learnt_entropy_weight_is_sac_s_learnt_temperature():
     ours, theirs = after_updates(CSAC(relative_entropy_weight=0.0, **settings)), after_updates(SAC(**settings))
     assert_equals_sac(ours, theirs)
     assert abs(float(theirs.temperature.log_weight)) > 0.05
-    assert_close(ours.learnt_weights.entropy.log_weight, theirs.temperature.log_weight)
+    assert_close(ours.temperature.log_weight, theirs.temperature.log_weight)
 
 
 def best_tanh_gaussian(sigma, tau, mean, log_std):
@@ -235,9 +229,8 @@ def expected_loss(algorithm, log_policy, log_reference, q):
     """The mean of `actor_loss` over the policy's actions [state]."""
 
     def loss(state, noise):
-        networks = {"reference": actor_of(log_reference), "critics": critics_of(q)}
-        weights = weights_of(algorithm)
-        return algorithm.actor_loss(actor_of(log_policy), state[None], noise[None], weights=weights, **networks)[0]
+        given = {"reference": actor_of(log_reference), "critics": critics_of(q), "sigma": algorithm.entropy_weight}
+        return algorithm.actor_loss(actor_of(log_policy), state[None], noise[None], **given)[0]
 
     losses = jax.vmap(jax.vmap(loss, (None, 0)), (0, None))(jnp.arange(STATES), jnp.asarray(PRE_TANH))
     return jnp.sum(jnp.exp(log_policy) * losses, axis=1)
@@ -254,7 +247,7 @@ def expected_target(algorithm, log_policy, log_reference, q):
             actor=actor_of(log_policy),
             reference=actor_of(log_reference),
             targets=critics_of(q),
-            weights=weights_of(algorithm),
+            sigma=algorithm.entropy_weight,
         )
 
     for axes in ((4,), (3,), (1, 2), (0, 2)):  # in the end [state, action, next state, next action]

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac.algorithms import CSAC
-from csac.algorithms.adaptation import Weights
 from csac.algorithms.networks import MLP
 from csac.types import Layer, Spec, Transition
 
@@ -99,8 +98,6 @@ REFERENCES: dict[str, dict[str, Any]] = {
 def csac(**settings) -> CSAC:
     return CSAC(**{"entropy_weight": 0.2, "relative_entropy_weight": 0.5, "discount": 0.9, **CLOSED_FORM, **settings})
 
-
-BOTH_WEIGHTS = Weights(0.2, 0.5)
 
 LINEAR = {
     "actor_hidden_sizes": (),

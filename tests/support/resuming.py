@@ -28,7 +28,6 @@ LEARNERS = [
 ]
 ADAPTIVE = CSAC(
     entropy_weight="auto",
-    relative_entropy_weight="auto",
     weight_learning_rate=0.01,
     reference_policy="periodic",
     reference_period=30,

@@ -99,8 +99,7 @@ def state_of(algorithm: CSAC) -> Snapshot:
     ("before", "after", "problem"),
     [
         ({"entropy_weight": "auto"}, {}, None),
-        ({"relative_entropy_weight": "auto", "reference_policy": "average"}, {}, None),
-        ({}, {"relative_entropy_weight": "auto", "reference_policy": "average"}, "state.learnt_weights"),
+        ({}, {"entropy_weight": "auto"}, "state.temperature"),
         ({"policy_delay": 2}, {}, None),
         ({}, {"policy_delay": 2}, "state.actor_metrics"),
     ],

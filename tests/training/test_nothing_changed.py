@@ -37,9 +37,6 @@ LEARNERS = {
     "csac, paper": CSAC(**hyperparameters("paper", "csac", "Hopper-v4") | SMALL),
     "csac, strong": CSAC(**hyperparameters("strong", "csac", "Hopper-v4") | SMALL),
     "csac, average": CSAC(**SMALL),
-    "csac, learnt": CSAC(
-        reference_policy="periodic", reference_period=50, entropy_weight="auto", relative_entropy_weight="auto", **SMALL
-    ),
     "sac": SAC(**SMALL),
     "sac, paper": SAC(**hyperparameters("paper", "sac", "Hopper-v4") | SMALL),
     "sac, strong": SAC(**hyperparameters("strong", "sac", "Hopper-v4") | SMALL),

@@ -1,0 +1,49 @@
+"""The weight of the entropy, SAC's temperature, learnt as the dual variable of a bound on the entropy from below."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax.numpy as jnp
+
+from csac.algorithms.networks import gradient_step, init_optimiser
+from csac.algorithms.shapes import Scalar
+from csac.types import Metrics
+
+if TYPE_CHECKING:
+    import optax
+
+FLOOR = math.log(1e-8)  # from here a weight can rise again: one that was fixed at 0 may go on as a learnt one
+
+
+class Temperature(NamedTuple):
+    """A weight as its logarithm, so that it stays positive, and its optimiser's state."""
+
+    log_weight: Scalar
+    optimiser: Any
+
+
+def make_temperature(weight: float, optimiser: optax.GradientTransformation) -> Temperature:
+    """Return a weight to begin with."""
+    return Temperature(logarithm(weight), init_optimiser(optimiser, logarithm(weight)))
+
+
+def logarithm(weight: float) -> Scalar:
+    """Return log w. Instead of log 0, which is no number, it has the lowest float, whose exp is 0."""
+    return jnp.maximum(jnp.log(jnp.float32(weight)), jnp.finfo(jnp.float32).min)
+
+
+def temperature_loss(log_weight: Scalar, entropy: Scalar, *, target: float) -> tuple[Scalar, Metrics]:
+    """Return log α · (entropy - target): SAC's second paper, Eq. 18, with log α for α as in the authors' code."""
+    return log_weight * (entropy - target), {}
+
+
+def adapt(
+    temperature: Temperature, entropy: Scalar, target: float, optimiser: optax.GradientTransformation
+) -> Temperature:
+    """Return the weight after one gradient step: down where the entropy, a mean in nats, is above its target."""
+    loss, log_weight = partial(temperature_loss, target=target), jnp.maximum(temperature.log_weight, FLOOR)
+    log_weight, state, _ = gradient_step(optimiser, loss, log_weight, temperature.optimiser, entropy[None])
+    return Temperature(log_weight, state)
