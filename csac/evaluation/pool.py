@@ -6,7 +6,7 @@ import pickle
 from typing import TYPE_CHECKING
 
 from csac.evaluation.pending import Pending
-from csac.processes import Child, core_quota, die_with_parent, end, outlive_termination, usable_cores
+from csac.processes import Child, cores_to_use, die_with_parent, end, outlive_termination
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _BATCHES_THAT_PAY = 2  # for each process: it takes as long to start as a short 
 
 def choose_processes(evaluator: Evaluator, policies: int) -> int:
     """Return how many processes pay for evaluating so many policies: at most one per core."""
-    return max(1, min(len(usable_cores()[: core_quota()]), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
+    return max(1, min(cores_to_use(), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
 
 
 class EvaluationPool:

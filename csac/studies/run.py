@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.console.waiting import progress_shown
-from csac.processes import core_quota, usable_cores
+from csac.processes import cores_to_use, usable_cores
 from csac.record.rendering import number
 from csac.record.run import RunDirectory, is_run
 from csac.record.statistics import last_evaluations
@@ -85,7 +85,7 @@ def try_tasks(runs: Any) -> None:
 
 def _program(path: Path, run: StudyRun, how: How) -> Program:
     """Return what trains a run, after making its directory or giving it its larger number of steps."""
-    cores = how.cluster.cores if how.cluster else len(usable_cores()[: core_quota()])
+    cores = how.cluster.cores if how.cluster else cores_to_use()
     threads = cores if how.cluster else max(1, cores // how.workers)
     if is_run(path):
         existing = RunDirectory.open(path)

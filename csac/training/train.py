@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from csac.checks import check_flag, check_path
 from csac.deploy.choosing import TrainedRuns
-from csac.processes import end_if_unguarded
+from csac.processes import cores_to_use, end_if_unguarded
 from csac.record.files import name_aside
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
@@ -22,7 +22,7 @@ from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs, make_manifest
 from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
-from csac.training.program import Program, choose_groups, cores_to_use, programs_of
+from csac.training.program import Program, choose_groups, programs_of
 from csac.training.resume import Source, as_begun, refuse_differences, refuse_lost
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
