@@ -10,7 +10,6 @@ from csac.algorithms import ALGORITHMS
 from csac.checks import check_arguments, check_whole, did_you_mean
 from csac.evaluation.evaluator import LONGEST_EPISODE
 from csac.record.config import SEED_LIMIT, RunConfig, as_json
-from csac.record.manifest import Manifest
 from csac.synonyms import called_in_python
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
@@ -121,11 +120,6 @@ def labels(seeds: int, first_seed: int) -> list[int]:
     check_whole("seeds", seeds, 1, MOST_SEEDS)
     check_whole("first_seed", first_seed, 0, SEED_LIMIT - seeds)
     return list(range(first_seed, first_seed + seeds))
-
-
-def make_manifest(config: RunConfig, program: Sequence[int]) -> Manifest:
-    """Return the manifest of a new run that shares its program with these seeds."""
-    return Manifest(config=config, program=tuple(program))
 
 
 def name_of(algorithm: Algorithm) -> str:

@@ -13,13 +13,14 @@ from csac.checks import check_flag, check_path
 from csac.deploy.choosing import TrainedRuns
 from csac.processes import cores_to_use, end_if_unguarded
 from csac.record.files import name_aside
+from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
 from csac.record.wandb import import_wandb
 from csac.tasks.trust import refuse_untrusted
 from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
-from csac.training.config import algorithm_of, check_algorithm, labels, make_configs, make_manifest
+from csac.training.config import algorithm_of, check_algorithm, labels, make_configs
 from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
 from csac.training.program import Program, choose_groups, programs_of
@@ -265,7 +266,8 @@ def _create(
     aside = {config.seed: name_aside(run_path(place, config.seed)) for config in new}
     try:
         for config in new:
-            manifest = make_manifest(config, next(group for group in groups if config.seed in group))
+            program = next(group for group in groups if config.seed in group)
+            manifest = Manifest(config=config, program=tuple(program))
             run = RunDirectory.create(aside[config.seed], source.begun(manifest) if source else manifest)
             if source:
                 source.copy_to(run)
