@@ -175,7 +175,10 @@ def resume(
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
     if steps is not None:
-        _extend(runs, steps, algorithm.cadence.has_schedule)
+        longer = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
+        for run, config in zip(runs.runs, longer, strict=True):
+            refuse_differences(run, config, algorithm.cadence.has_schedule)
+        _change(runs.runs, longer)
     existing = {run.seed: run for run in runs.runs}
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
     tensorboard = any(run.tensorboard.exists() for run in runs.runs)
@@ -203,14 +206,6 @@ def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
             shutil.rmtree(run.path)
     with suppress(OSError):
         place.rmdir()
-
-
-def _extend(runs: RunSet, steps: int, has_schedule: bool) -> None:
-    """Give every run so many steps. Raises InputError before any is changed."""
-    wanted = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
-    for run, config in zip(runs.runs, wanted, strict=True):
-        refuse_differences(run, config, has_schedule)
-    _change(runs.runs, wanted)
 
 
 def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
