@@ -155,9 +155,8 @@ def _checked(kind: str, value: object) -> float:
     number = math.nan if isinstance(value, str | bool) else _number(value)
     if not 0 <= number < math.inf or (kind == "mass" and not number):
         what = "factor" if kind in PHYSICS else "standard deviation"
-        raise InputError(
-            f"{kind} takes a finite {what} {'above 0' if kind == 'mass' else 'of 0 or more'}, not {number}"
-        )
+        least = "above 0" if kind == "mass" else "of 0 or more"
+        raise InputError(f"{kind} takes a finite {what} {least}, not {number}")
     return number
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from csac.tasks.vector import Steps
-    from csac.types import Algorithm, PolicyParameters, Spec
+    from csac.types import Algorithm, Spec
 
 
 class Learner:
@@ -108,11 +108,8 @@ class Learner:
 
     def networks(self) -> list[PolicyNetwork]:
         """Return each seed's policy as NumPy layers."""
-
-        def parameters_of(state: Any) -> PolicyParameters:
-            return self.algorithm.policy(state).parameters
-
-        parameters = jax.tree.map(np.array, self._axis.map(parameters_of)(self._states()))
+        parameters_of = self._axis.map(lambda state: self.algorithm.policy(state).parameters)
+        parameters = jax.tree.map(np.array, parameters_of(self._states()))
         return [self.network._replace(parameters=self._axis.of(parameters, i)) for i in range(self._axis.seeds)]
 
     def metrics(self) -> list[dict[str, float]]:
