@@ -196,9 +196,7 @@ def _refuse_unknown(given: TrainOptions, algorithm: Algorithm) -> None:
     for name in given:
         if name in RUN_OPTIONS:
             continue
-        if name in (item.name for item in dataclasses.fields(algorithm)):  # pyright: ignore[reportArgumentType]
-            raise InputError(
-                f"train takes no {name}: it is a hyperparameter, as in {type(algorithm).__name__}({name}=...)"
-            )
         hint = called_in_python(name, RUN_OPTIONS) or did_you_mean(name, RUN_OPTIONS)
+        if name in (item.name for item in dataclasses.fields(algorithm)):  # pyright: ignore[reportArgumentType]
+            hint = f"it is a hyperparameter, as in {type(algorithm).__name__}({name}=...)"
         raise InputError(f"train takes no {name}" + (f": {hint}" if hint else ""))
