@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import safetensors.numpy
 
-from csac.record.files import write_atomically
+from csac.record.files import name_aside, write_atomically
 from csac.types import InputError, Snapshot
 
 if TYPE_CHECKING:
@@ -170,9 +170,8 @@ class Writer:
 
 def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:
     """Write a folder of files beside `path`, sync and rename: it is whole or not there. Raises OSError."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    for folder in (aside, path):
-        shutil.rmtree(folder, ignore_errors=True)
+    aside = name_aside(path)
+    shutil.rmtree(path, ignore_errors=True)
     aside.mkdir()
     for name, content in contents.items():
         write_atomically(aside / name, content)
