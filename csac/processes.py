@@ -57,6 +57,11 @@ def core_quota(folders: Iterable[Path] | None = None) -> int | None:
     return min(quotas, default=None)
 
 
+def cores_to_use() -> int:
+    """Return how many cores this process may compute on at a time."""
+    return len(usable_cores()[: core_quota()])
+
+
 def memory_left(folders: Iterable[Path] | None = None) -> int | None:
     """Return the bytes that a container leaves to this process, or None where nothing bounds them.
 

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -82,13 +83,8 @@ def header(policy: Policy, guards: Guards, control_rate: float | None) -> str:
 def _array(name: str, array: np.ndarray) -> str:
     """Return the definition of a constant array."""
     numbers = _in_blocks(array) if array.ndim == 2 else np.atleast_1d(array)
-    lines, line = [], "   "
-    for word in (f" {_number(number)}f," for number in numbers):
-        if len(line) + len(word) > _WIDTH:
-            lines.append(line)
-            line = "   "
-        line += word
-    return "\n".join([f"static const float csac_{name}[{len(numbers)}] = {{", *lines, line, "};"])
+    lines = textwrap.wrap(" ".join(f"{_number(number)}f," for number in numbers), _WIDTH - 4, break_on_hyphens=False)
+    return "\n    ".join([f"static const float csac_{name}[{len(numbers)}] = {{", *lines]) + "\n};"
 
 
 def _in_blocks(weight: np.ndarray) -> np.ndarray:

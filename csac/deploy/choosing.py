@@ -84,9 +84,6 @@ def choose_run(runs: RunSet, seed: int | None = None) -> RunDirectory:
     scores = last_evaluations(np.concatenate([run.evaluations[["seed", "step", "return"]] for run in sound]))
     scores = {seed: score for seed, score in scores.items() if not math.isnan(score)}
     if len(sound) > 1 and not scores:
-        raise InputError(f"{runs.path} has no evaluations to choose by: give a seed, one of {_listed(runs.seeds)}")
+        seeds = ", ".join(map(str, runs.seeds))
+        raise InputError(f"{runs.path} has no evaluations to choose by: give a seed, one of {seeds}")
     return max(sound, key=lambda run: (scores.get(run.seed, -math.inf), -run.seed))
-
-
-def _listed(seeds: list[int]) -> str:
-    return ", ".join(str(seed) for seed in seeds)

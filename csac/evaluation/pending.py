@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from csac.deploy.policy import Policy
     from csac.evaluation.evaluator import Evaluator
-    from csac.evaluation.pool import Worker
+    from csac.processes import Child
 
     # A policy, the number of a batch's first episode, whether deterministic, how the task is perturbed.
     Work = tuple[Policy, int, bool, dict[str, float]]
@@ -43,14 +43,14 @@ class Pending:
         policies: Sequence[Policy],
         deterministic: bool,
         on_progress: OnProgress | None,
-        workers: Sequence[Worker] = (),
+        workers: Sequence[Child] = (),
     ) -> None:
         self.notes: list[str] = []
         self._evaluator, self._policies, self._deterministic = evaluator, policies, deterministic
         self._perturbed, self._on_progress = dict(evaluator.perturbed), on_progress
         self._answers: dict[Batch, Result] = {}
         self._idle, self._waiting = list(workers), deque(evaluator.batches(len(policies)))
-        self._busy: dict[Worker, Batch] = {}
+        self._busy: dict[Child, Batch] = {}
         self._hand_out()
 
     @property

@@ -6,7 +6,7 @@ import pickle
 from typing import TYPE_CHECKING
 
 from csac.evaluation.pending import Pending
-from csac.processes import Child, core_quota, die_with_parent, end, outlive_termination, usable_cores
+from csac.processes import Child, cores_to_use, die_with_parent, end, outlive_termination
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _BATCHES_THAT_PAY = 2  # for each process: it takes as long to start as a short 
 
 def choose_processes(evaluator: Evaluator, policies: int) -> int:
     """Return how many processes pay for evaluating so many policies: at most one per core."""
-    return max(1, min(len(usable_cores()[: core_quota()]), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
+    return max(1, min(cores_to_use(), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
 
 
 class EvaluationPool:
@@ -46,7 +46,7 @@ class EvaluationPool:
                 f"the task cannot be sent to another process: make it a module's function ({error})"
             ) from None
         self._evaluator, self._processes = evaluator, processes
-        self._workers: list[Worker] = []
+        self._workers: list[Child] = []
 
     def start(self) -> None:
         """Start every process that is not there, so that an evaluation need not wait for it."""
@@ -76,14 +76,7 @@ class EvaluationPool:
             self._workers.remove(worker)
         while len(self._workers) < processes:
             self._evaluator.close()  # no process is sent open environments
-            self._workers.append(Worker(self._evaluator))
-
-
-class Worker(Child):
-    """The parent's end of one process, which is told what to evaluate, or None to end."""
-
-    def __init__(self, evaluator: Evaluator) -> None:
-        super().__init__(_work, evaluator, daemon=False)
+            self._workers.append(Child(_work, self._evaluator, daemon=False))
 
 
 def _work(connection: Connection, evaluator: Evaluator) -> None:

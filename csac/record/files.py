@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from contextlib import suppress
 from typing import TYPE_CHECKING
-
-from csac.types import InputError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,18 +28,5 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 def name_aside(path: Path) -> Path:
     """Return what a file is called until it is whole: a name that no other writer takes, on whatever machine."""
-    return path.with_name(f".{path.name}.{_unique()}.{os.getpid()}")
-
-
-def check_name(path: Path, aside: Path) -> None:
-    """Raise InputError where no file can be called `aside`, as `path` is until it is whole: it may not exist yet."""
-    try:
-        with suppress(FileNotFoundError):
-            aside.lstat()
-    except OSError as error:  # the name is too long, or a part of the path is no folder
-        raise InputError(f"cannot write {path}: {error.strerror}; choose another place or name") from None
-
-
-def _unique() -> str:
-    """Return what no other writer has: containers on several machines often have the same process number."""
-    return secrets.token_hex(4)
+    unique = secrets.token_hex(4)  # containers on several machines often have the same process number
+    return path.with_name(f".{path.name}.{unique}.{os.getpid()}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.record.run import TABLES
-from csac.record.statistics import best_returns, is_case
+from csac.record.statistics import best_return, is_case
 from csac.record.wandb import WandbLog
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class Recorder:
         origin, known = run.manifest.forked_from, run.evaluations
         if origin and origin.changed("task ", "environment_arguments"):  # whose returns are of another task
             known = known[known["step"] > origin.step]
-        self.best = best_returns(known).get(run.seed, -np.inf) if run.policy_file("best").exists() else -np.inf
+        self.best = best_return(known) if run.policy_file("best").exists() else -np.inf
         self._log = self._wandb = None
         if tensorboard or wandb:
             from csac.record.tensorboard import TensorBoardLog  # slow to import

@@ -58,7 +58,12 @@ class RunDirectory:
     def create(cls, path: str | Path, manifest: Manifest) -> RunDirectory:
         """Start a run in a new or empty directory. Raises InputError where it is none, or cannot be written."""
         path = Path(os.path.abspath(path))
-        _refuse_occupied(path)
+        if is_run(path):
+            raise InputError(f"{path} already holds a run; resume it, or choose another directory")
+        if path.exists() and not path.is_dir():
+            raise InputError(f"{path} is a file; choose another directory")
+        if path.exists() and any(not entry.name.startswith(".") for entry in path.iterdir()):
+            raise InputError(f"{path} is not empty and holds no run; choose a new or an empty directory")
         content = manifests.written(dataclasses.replace(manifest, created=manifest.created or now()))
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -213,15 +218,6 @@ def now() -> str:
 def is_run(path: str | Path) -> bool:
     """Return whether there is a run in this directory, sound or not."""
     return os.path.exists(Path(path) / MANIFEST) or bool(_copies(Path(path)))
-
-
-def _refuse_occupied(path: Path) -> None:
-    if is_run(path):
-        raise InputError(f"{path} already holds a run; resume it, or choose another directory")
-    if path.exists() and not path.is_dir():
-        raise InputError(f"{path} is a file; choose another directory")
-    if path.exists() and any(not entry.name.startswith(".") for entry in path.iterdir()):
-        raise InputError(f"{path} is not empty and holds no run; choose a new or an empty directory")
 
 
 def _is_listed(copy: Path, content: bytes) -> bool:

@@ -139,11 +139,9 @@ def last_evaluations(rows: np.ndarray, points: int = 3) -> dict[int, float]:
     return {int(seed): float(line.mean()) for seed, line in zip(seeds, last, strict=True) if line.size}
 
 
-def best_returns(rows: np.ndarray) -> dict[int, float]:
-    """Return the highest of each seed's evaluations, each the mean over its episodes."""
-    _, seeds, returns = evaluation_matrix(rows)
-    known = [(seed, line[~np.isnan(line)]) for seed, line in zip(seeds.tolist(), returns, strict=True)]
-    return {seed: float(line.max()) for seed, line in known if line.size}
+def best_return(rows: np.ndarray) -> float:
+    """Return the highest of a seed's evaluations, each the mean over its episodes; minus infinity where it has none."""
+    return float(np.nanmax(evaluation_matrix(rows)[2], initial=-np.inf))
 
 
 def steps_to_reach(steps: np.ndarray, returns: np.ndarray, threshold: float) -> float:

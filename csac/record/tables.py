@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from csac.record.files import check_name, name_aside, write_atomically
+from csac.record.files import name_aside, write_atomically
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -75,7 +75,11 @@ def check_new(path: Path) -> None:
     if path.suffix.lower() != ".csv":
         better = path.with_suffix(".csv") if path.name else path / "table.csv"
         raise InputError(f"the table is a .csv file: name it {better}")
-    check_name(path, name_aside(path))
+    try:
+        with suppress(FileNotFoundError):
+            name_aside(path).lstat()
+    except OSError as error:  # the name is too long, or a part of the path is no folder
+        raise InputError(f"cannot write {path}: {error.strerror}; choose another place or name") from None
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
     folder = path.parent

@@ -17,7 +17,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from csac.checks import check_whole
 from csac.console.tables import Fitted, duration, make_console, program
-from csac.processes import core_quota, usable_cores
+from csac.processes import cores_to_use
 from csac.record.rendering import Cell, Row, Table, short
 from csac.record.run import StorageFailure
 from csac.record.wandb import import_wandb
@@ -129,8 +129,7 @@ class Run(Show):
         from csac.studies.ray import Cluster
         from csac.studies.run import How
 
-        cores = len(usable_cores()[: core_quota()])
-        workers = self.workers if self.workers is not None else cores
+        workers = cores_to_use() if self.workers is None else self.workers
         check_whole("--workers", workers, 1, 10_000)
         if self.workers is not None and self.engine != "processes":
             raise InputError(f"--workers is for --engine processes, not {self.engine}")

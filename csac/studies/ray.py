@@ -17,7 +17,7 @@ from csac.training.watch import Watcher
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from csac.training.program import Program
 
@@ -137,18 +137,6 @@ class _QueueWatcher(Watcher):
     def __init__(self, index: int, messages: Any) -> None:
         self.index, self.messages, self.sent = index, messages, list[Any]()
 
-    def _send(self, name: str, *arguments: Any) -> None:
+    def send(self, name: str, *arguments: Any) -> None:
         # Nobody waits until it was heard: Ray would lend the core of who waits to another run.
         self.sent = [*self.sent[-100:], self.messages.actor.put.remote((self.index, name, arguments))]
-
-    def progress(self, steps: Mapping[int, int]) -> None:
-        self._send("progress", dict(steps))
-
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
-        self._send("evaluated", step, dict(returns))
-
-    def failed(self, seed: int, step: int, reason: str) -> None:
-        self._send("failed", seed, step, reason)
-
-    def note(self, text: str) -> None:
-        self._send("note", text)

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.console.waiting import progress_shown
-from csac.processes import core_quota, usable_cores
+from csac.processes import cores_to_use, usable_cores
+from csac.record.manifest import Manifest
 from csac.record.rendering import number
 from csac.record.run import RunDirectory, is_run
 from csac.record.statistics import last_evaluations
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import perturbations_of
 from csac.tasks.trust import remember
-from csac.training.config import algorithm_of, make_manifest
+from csac.training.config import algorithm_of
 from csac.training.program import Program
 from csac.training.resume import refuse_lost
 from csac.training.signals import stop_requested
@@ -85,7 +86,7 @@ def try_tasks(runs: Any) -> None:
 
 def _program(path: Path, run: StudyRun, how: How) -> Program:
     """Return what trains a run, after making its directory or giving it its larger number of steps."""
-    cores = how.cluster.cores if how.cluster else len(usable_cores()[: core_quota()])
+    cores = how.cluster.cores if how.cluster else cores_to_use()
     threads = cores if how.cluster else max(1, cores // how.workers)
     if is_run(path):
         existing = RunDirectory.open(path)
@@ -96,7 +97,7 @@ def _program(path: Path, run: StudyRun, how: How) -> Program:
         if existing.manifest.process is not None:  # its last bits depend on it
             threads = min(existing.manifest.machine.cores, cores) or threads
     else:
-        RunDirectory.create(path, make_manifest(run.config, (run.config.seed,)))
+        RunDirectory.create(path, Manifest(config=run.config, program=(run.config.seed,)))
     return Program((path,), algorithm_of(run.config), run.config.task, threads, wandb=how.wandb, command=how.command)
 
 

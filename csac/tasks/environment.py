@@ -121,11 +121,6 @@ class Environment:
             raise failure_of("step", error) from error
         return self._flatten(observation), scalar(reward), terminated, truncated, info
 
-    @property
-    def has_goals(self) -> bool:
-        """Whether the task can compute the reward of another goal."""
-        return self.raw.has_wrapper_attr("compute_reward")
-
     def relabel(self, achieved: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Return rewards [n] of flat goals [n, goal] that were achieved where others were desired.
 

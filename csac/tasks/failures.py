@@ -42,9 +42,8 @@ def raised(error: BaseException) -> str:
     origin = error
     while origin.__cause__:  # Gymnasium raises another one from what a constructor raised
         origin = origin.__cause__
-    return one_line(error) + place_of(
-        [(frame.f_code.co_filename, line) for frame, line in walk_tb(origin.__traceback__)]
-    )
+    places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(origin.__traceback__)]
+    return one_line(error) + place_of(places)
 
 
 def place_of(places: Sequence[tuple[str, int]]) -> str:

@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -74,7 +75,7 @@ class Perturbation:
         return cls(match["kind"].replace("-", "_"), value, int(step))
 
     def __str__(self) -> str:
-        return f"{self.kind}={_plain(self.value)}" + (f"@{self.step}" if self.step else "")
+        return f"{self.kind}={repr(self.value).removesuffix('.0')}" + (f"@{self.step}" if self.step else "")
 
     @property
     def label(self) -> str:
@@ -154,9 +155,8 @@ def _checked(kind: str, value: object) -> float:
     number = math.nan if isinstance(value, str | bool) else _number(value)
     if not 0 <= number < math.inf or (kind == "mass" and not number):
         what = "factor" if kind in PHYSICS else "standard deviation"
-        raise InputError(
-            f"{kind} takes a finite {what} {'above 0' if kind == 'mass' else 'of 0 or more'}, not {number}"
-        )
+        least = "above 0" if kind == "mass" else "of 0 or more"
+        raise InputError(f"{kind} takes a finite {what} {least}, not {number}")
     return number
 
 
@@ -166,11 +166,6 @@ def _number(value: object) -> float:
         return float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError, OverflowError):
         return math.nan
-
-
-def _plain(value: float) -> str:
-    """Return the shortest text that gives the number back."""
-    return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
 
 class Physics:
@@ -201,12 +196,12 @@ class Physics:
             self._refuse_curved_actuators()
         for kind, factor in changed.items():
             for name in _SCALED[kind]:
-                _array(self._model, name)[...] = _array(self._original, name) * factor
+                attrgetter(name)(self._model)[...] = attrgetter(name)(self._original) * factor
         if "mass" in changed:
             self._renew_constants()
         self._factors = wanted
         names = (name for kind, factor in wanted.items() if factor != 1.0 for name in _SCALED[kind])
-        self._scaled = {name: _array(self._model, name).copy() for name in names}
+        self._scaled = {name: attrgetter(name)(self._model).copy() for name in names}
 
     def undone(self) -> str | None:
         """Return what to say where a reset has taken back what was scaled, and None where it has not.
@@ -214,7 +209,7 @@ class Physics:
         A task does so that draws other physics for each episode. To see it takes a few microseconds.
         """
         is_same = not self._scaled or getattr(self._environment, "model", None) is self._model
-        if is_same and all((_array(self._model, name) == array).all() for name, array in self._scaled.items()):
+        if is_same and all((attrgetter(name)(self._model) == array).all() for name, array in self._scaled.items()):
             return None
         kinds = " and ".join(kind for kind, factor in self._factors.items() if factor != 1.0)
         return f"{self._task_name} sets its own physics at reset: {kinds} cannot be perturbed"
@@ -285,8 +280,3 @@ class Noise:
 def _generators(kinds: Iterable[str], seed: int) -> dict[str, np.random.Generator]:
     """Return a generator for each kind, of a stream that neither the task nor a stochastic policy draws from."""
     return {kind: np.random.default_rng([seed, 1 + NOISES.index(kind)]) for kind in kinds}
-
-
-def _array(model: Any, name: str) -> np.ndarray:
-    first, _, rest = name.partition(".")
-    return getattr(getattr(model, first), rest) if rest else getattr(model, first)

@@ -42,14 +42,12 @@ def seed_warning(environment: Environment) -> str | None:
     except EnvironmentFailure:
         return None
     if not np.array_equal(first, second):
-        return (
-            f"{environment.task_name}: reset(seed=...) gives other observations for the same seed: runs do not repeat"
-        )
-    if np.array_equal(first, other):
-        return (
-            f"{environment.task_name}: reset(seed=...) gives the same observation for every seed: episodes may be one"
-        )
-    return None
+        told = "gives other observations for the same seed: runs do not repeat"
+    elif np.array_equal(first, other):
+        told = "gives the same observation for every seed: episodes may be one"
+    else:
+        return None
+    return f"{environment.task_name}: reset(seed=...) {told}"
 
 
 def limit_warning(environment: Environment, task: Task, longest: int) -> str | None:

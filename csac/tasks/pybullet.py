@@ -84,9 +84,7 @@ def follow(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
 
     def picture() -> np.ndarray:
         position = drone.env.state(0)[-1]
-        eye = position + _BESIDE
-        eye[2] = max(eye[2], 0.1)
-        return _photograph(drone.env, eye, position)
+        return _photograph(drone.env, position + _BESIDE, position)
 
     return picture
 
@@ -108,15 +106,14 @@ def chase(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
             # A new waypoint turns the camera by and by; a new episode, at once.
             direction = wanted if drone.step_count == 0 else 0.9 * direction + 0.1 * wanted
         level = direction * np.array([1.0, 1.0, 0.3])
-        eye = position - 1.2 * level + _EYE
-        eye[2] = max(eye[2], 0.1)
-        return _photograph(drone.env, eye, position + level)
+        return _photograph(drone.env, position - 1.2 * level + _EYE, position + level)
 
     return picture
 
 
 def _photograph(client: Any, eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return what PyBullet sees from `eye` towards `target`, both in metres: uint8 [480, 640, 4]."""
+    """Return what PyBullet sees from `eye`, above the ground, towards `target`, in metres: uint8 [480, 640, 4]."""
+    eye = np.maximum(eye, (-np.inf, -np.inf, 0.1))
     view = client.computeViewMatrix(eye.tolist(), target.tolist(), [0.0, 0.0, 1.0])
     projection = client.computeProjectionMatrixFOV(fov=60.0, aspect=640 / 480, nearVal=0.05, farVal=60.0)
     return np.asarray(client.getCameraImage(640, 480, view, projection)[2], np.uint8).reshape(480, 640, 4)
@@ -136,20 +133,18 @@ _PANDA = Adapter(
     pictures_per_second=10,
 )
 
-ADAPTERS: Mapping[str, Adapter] = MappingProxyType(
-    {
-        "PyFlyt/QuadX-Waypoints-v1": _WAYPOINTS._replace(camera=chase),
-        "PyFlyt/QuadX-Hover-v1": _PYFLYT._replace(events=("out_of_bounds", "collision"), camera=follow),
-        "PyFlyt/Fixedwing-Waypoints-v1": _WAYPOINTS,
-        "PyFlyt/Rocket-Landing-v1": _PYFLYT._replace(events=("out_of_bounds", "fatal_collision", "env_complete")),
-        **{
-            f"Panda{task}{control}{reward}-v3": _PANDA._replace(has_memory=task not in ("Reach", "Slide"))
-            for task in ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
-            for control in ("", "Joints")
-            for reward in ("", "Dense")
-        },
-    }
-)
+ADAPTERS: Mapping[str, Adapter] = {
+    "PyFlyt/QuadX-Waypoints-v1": _WAYPOINTS._replace(camera=chase),
+    "PyFlyt/QuadX-Hover-v1": _PYFLYT._replace(events=("out_of_bounds", "collision"), camera=follow),
+    "PyFlyt/Fixedwing-Waypoints-v1": _WAYPOINTS,
+    "PyFlyt/Rocket-Landing-v1": _PYFLYT._replace(events=("out_of_bounds", "fatal_collision", "env_complete")),
+    **{
+        f"Panda{task}{control}{reward}-v3": _PANDA._replace(has_memory=task not in ("Reach", "Slide"))
+        for task in ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
+        for control in ("", "Joints")
+        for reward in ("", "Dense")
+    },
+}
 FAMILIES = {"PyFlyt/": _PYFLYT, "Panda": Adapter("panda_gym")}  # what other ids of that name take is not known
 
 

@@ -37,9 +37,14 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
     adapter = adapter_of(task)
     _silence_mujoco()
     with _undisturbed(bool(adapter) or "pybullet" in sys.modules):
-        make_one = _maker(task, adapter)
+        known = registered(task) if isinstance(task, str) else task
         try:
-            environment = make_one(**arguments)
+            if isinstance(known, str):
+                environment = gymnasium.make(known, disable_env_checker=True, **arguments)
+            else:
+                environment = known(**arguments)
+            if adapter and adapter.wrap:
+                environment = adapter.wrap(environment)
         except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
             raise InputError(_missing(name, error, adapter)) from error
         except BaseException as error:
@@ -51,18 +56,6 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
     if not isinstance(environment, gymnasium.Env):
         raise InputError(f"{name} returned {environment!r:.40}: a task's callable returns a gymnasium.Env")
     return environment
-
-
-def _maker(task: Task, adapter: Adapter | None) -> Callable[..., gymnasium.Env]:
-    if not isinstance(task, str):
-        return task
-    there = registered(task)
-
-    def make_one(**arguments: Any) -> gymnasium.Env:
-        environment = gymnasium.make(there, disable_env_checker=True, **arguments)
-        return adapter.wrap(environment) if adapter and adapter.wrap else environment
-
-    return make_one
 
 
 def registered(task: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -82,11 +83,12 @@ class SeedEnvironments:
         if processes:
             shares = [len(share) for share in np.array_split(self._places, processes)]
             self._workers = Workers(task, environment_arguments, shares, seeds[0], events)
-        self.environments: list[Any] = (
-            self._workers.environments
-            if self._workers
-            else [Environment(task, environment_arguments) for _ in self._places]
-        )
+        self.environments: list[Any] = self._workers.environments if self._workers else []
+        with ExitStack() as stack:
+            stack.callback(self.close)
+            while len(self.environments) < len(self._places):
+                self.environments.append(Environment(task, environment_arguments))
+            stack.pop_all()
         self._at = dict(zip(self._places, self.environments, strict=True))
         first = self.environments[0]
         self.spec = first.spec._replace(environments=environments)

@@ -42,7 +42,8 @@ class Workers:
         self._workers: list[Worker] = []
         try:
             for index, number in enumerate(numbers):
-                self._workers.append(Worker(task, environment_arguments, number, seed + index, events))
+                work = _serve, task, environment_arguments, number, seed + index, events
+                self._workers.append(Worker(*work, daemon=False))
             facts = [worker.answer() for worker in self._workers]
         except BaseException:
             self.close()
@@ -94,16 +95,6 @@ class RemoteEnvironment:
 
 class Worker(Child):
     """The parent's end of a process that steps environments."""
-
-    def __init__(
-        self,
-        task: Task,
-        environment_arguments: dict[str, Any] | None,
-        number: int,
-        seed: int,
-        events: Sequence[str],
-    ) -> None:
-        super().__init__(_serve, task, environment_arguments, number, seed, events, daemon=False)
 
     def answer(self) -> Any:
         """Return the next answer, or raise what was raised there; EnvironmentFailure where the process is gone."""
@@ -161,14 +152,8 @@ def choose_processes(task: Task, environment_arguments: dict[str, Any] | None, e
     processes = min(environments, cores)
     if processes < 2:
         return 0
-    with closing(Environment(task, environment_arguments)) as environment:
-        return processes if seconds_of_step(environment) > SECONDS_THAT_PAY else 0
-
-
-def seconds_of_step(environment: Environment) -> float:
-    """Return what a step of an environment takes at least, in seconds; 0 where it fails."""
-    action, fastest = np.zeros(environment.spec.action_size, np.float32), np.inf
-    try:
+    with closing(Environment(task, environment_arguments)) as environment, suppress(EnvironmentFailure):
+        action, fastest = np.zeros(environment.spec.action_size, np.float32), np.inf
         environment.reset(0)
         for _ in range(STEPS_TRIED):
             began = time.perf_counter()
@@ -176,6 +161,5 @@ def seconds_of_step(environment: Environment) -> float:
             fastest = min(fastest, time.perf_counter() - began)
             if terminated or truncated:
                 break
-    except EnvironmentFailure:
-        return 0.0
-    return fastest
+        return processes if fastest > SECONDS_THAT_PAY else 0
+    return 0  # it fails

@@ -195,18 +195,22 @@ class Callbacks:
     @property
     def hears(self) -> Hears:
         """What they want to be told of."""
-        overridden = {name: [c for c in self.callbacks if _overrides(c, name)] for name in _METHODS}
+
+        def hearing(method: str) -> list[Callback]:
+            return [one for one in self.callbacks if getattr(type(one), method) is not getattr(Callback, method)]
+
         has_function = self.on_evaluation is not None or self.stop_when is not None
         return Hears(
-            tuple(sorted({callback.interval for callback in overridden["on_step"]})),
-            bool(overridden["on_episode"]),
-            bool(overridden["on_evaluation"]) or has_function,
+            tuple(sorted({callback.interval for callback in hearing("on_step")})),
+            bool(hearing("on_episode")),
+            bool(hearing("on_evaluation")) or has_function,
             any(callback.needs_policy for callback in self.callbacks),
         )
 
     def call(self, event: Event) -> Answer:
         """Tell all of them, and return what they have to say."""
-        stopped_by = [self._tell(callback, event) for callback in self.callbacks if _wants(callback, event)]
+        due = [one for one in self.callbacks if event.method != "on_step" or one.interval in event.intervals]
+        stopped_by = [self._tell(callback, event) for callback in due]
         if event.method == "on_evaluation":
             moments = zip(event.moments, event.arguments, strict=True)
             returns = {moment.seed: mean_return(episodes) for moment, (episodes,) in moments}
@@ -248,15 +252,3 @@ class Callbacks:
             self.failure = CallbackFailure(f"{name} raised {raised(error)}")
             self.failure.__cause__ = error
             return None
-
-
-_METHODS = ("on_step", "on_episode", "on_evaluation")
-
-
-def _overrides(callback: Callback, method: str) -> bool:
-    return getattr(type(callback), method) is not getattr(Callback, method)
-
-
-def _wants(callback: Callback, event: Event) -> bool:
-    is_due = event.method != "on_step" or callback.interval in event.intervals
-    return is_due and _overrides(callback, event.method)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import safetensors.numpy
 
-from csac.record.files import write_atomically
+from csac.record.files import name_aside, write_atomically
 from csac.types import InputError, Snapshot
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Checkpoint(NamedTuple):
             fields = json.loads(_read(path))
             checksum = fields.pop("sha256")
             first, last = fields["transitions"]
-            if checksum != sha256(_encoded(fields)) or fields["step"] != step:
+            if checksum != _checksum(fields) or fields["step"] != step:
                 raise Damaged(f"{path} has changed since it was written")
             if fields["schema_version"] != SCHEMA_VERSION:
                 raise Damaged(f"{path} has schema {fields['schema_version']!r} and this csac reads {SCHEMA_VERSION}")
@@ -80,12 +80,12 @@ class Checkpoint(NamedTuple):
         path, facts = self._path(name), self.files[name]
         try:
             content = _read(path)
-            if not is_unchanged(content, facts):
+            if facts_of(content) != facts:
                 raise Damaged(f"{path} has changed since it was written")
             return content
         except Damaged:
             own = self.folder.parent / ("policy" if name.endswith(".safetensors") else "") / name
-            if own.is_file() and is_unchanged(content := own.read_bytes()[: facts["bytes"]], facts):
+            if own.is_file() and facts_of(content := own.read_bytes()[: facts["bytes"]]) == facts:
                 return content
             raise
 
@@ -154,7 +154,7 @@ class Writer:
             "values": saved.values,
         }
         fields = json.loads(json.dumps(fields))  # as it will be read: the checksum is of that
-        contents[LIST] = json.dumps({**fields, "sha256": sha256(_encoded(fields))}, indent=1).encode()
+        contents[LIST] = json.dumps({**fields, "sha256": _checksum(fields)}, indent=1).encode()
         write_folder(self.folder / f"step_{step}", contents)
         prune(self.folder, self.keep)
 
@@ -170,9 +170,8 @@ class Writer:
 
 def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:
     """Write a folder of files beside `path`, sync and rename: it is whole or not there. Raises OSError."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    for folder in (aside, path):
-        shutil.rmtree(folder, ignore_errors=True)
+    aside = name_aside(path)
+    shutil.rmtree(path, ignore_errors=True)
     aside.mkdir()
     for name, content in contents.items():
         write_atomically(aside / name, content)
@@ -246,17 +245,7 @@ def shards(files: Mapping[str, Any]) -> list[tuple[int, int, str]]:
 
 def facts_of(content: bytes) -> Facts:
     """Return the size and the checksum of a file's content."""
-    return {"bytes": len(content), "sha256": sha256(content)}
-
-
-def is_unchanged(content: bytes, facts: Facts) -> bool:
-    """Return whether a file holds what was written."""
-    return facts_of(content) == facts
-
-
-def sha256(content: bytes) -> str:
-    """Return a checksum in hexadecimal digits."""
-    return hashlib.sha256(content).hexdigest()
+    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def _read(path: Path) -> bytes:
@@ -268,5 +257,5 @@ def _read(path: Path) -> bytes:
         raise kind(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _encoded(fields: dict[str, Any]) -> bytes:
-    return json.dumps(fields, sort_keys=True).encode()
+def _checksum(fields: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()

@@ -10,7 +10,6 @@ from csac.algorithms import ALGORITHMS
 from csac.checks import check_arguments, check_whole, did_you_mean
 from csac.evaluation.evaluator import LONGEST_EPISODE
 from csac.record.config import SEED_LIMIT, RunConfig, as_json
-from csac.record.manifest import Manifest
 from csac.synonyms import called_in_python
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
@@ -123,11 +122,6 @@ def labels(seeds: int, first_seed: int) -> list[int]:
     return list(range(first_seed, first_seed + seeds))
 
 
-def make_manifest(config: RunConfig, program: Sequence[int]) -> Manifest:
-    """Return the manifest of a new run that shares its program with these seeds."""
-    return Manifest(config=config, program=tuple(program))
-
-
 def name_of(algorithm: Algorithm) -> str:
     """Return what the manifest calls an algorithm: a name of `ALGORITHMS`, or `module:Class` of one from elsewhere."""
     kind = type(algorithm)
@@ -202,9 +196,7 @@ def _refuse_unknown(given: TrainOptions, algorithm: Algorithm) -> None:
     for name in given:
         if name in RUN_OPTIONS:
             continue
-        if name in (item.name for item in dataclasses.fields(algorithm)):  # pyright: ignore[reportArgumentType]
-            raise InputError(
-                f"train takes no {name}: it is a hyperparameter, as in {type(algorithm).__name__}({name}=...)"
-            )
         hint = called_in_python(name, RUN_OPTIONS) or did_you_mean(name, RUN_OPTIONS)
+        if name in (item.name for item in dataclasses.fields(algorithm)):  # pyright: ignore[reportArgumentType]
+            hint = f"it is a hyperparameter, as in {type(algorithm).__name__}({name}=...)"
         raise InputError(f"train takes no {name}" + (f": {hint}" if hint else ""))

@@ -14,7 +14,7 @@ import safetensors.numpy
 from csac.algorithms.memory import pack
 from csac.deploy.contract import Contract
 from csac.record.files import write_atomically
-from csac.training.checkpoint import REPLAY, Facts, facts_of, is_unchanged
+from csac.training.checkpoint import REPLAY, Facts, facts_of
 from csac.types import InputError, Transition
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def rows_of(run: RunDirectory) -> np.ndarray:
     """Return the packed transitions [n, width] that a run begins with. Raises InputError where they are lost."""
     ((name, facts),) = files_of(run.config.demonstrations).items()
     path = run.checkpoints / name
-    if not path.is_file() or not is_unchanged(content := path.read_bytes(), facts):
+    if not path.is_file() or facts_of(content := path.read_bytes()) != facts:
         raise InputError(f"{path} is missing or has changed: train anew, in another directory")
     return safetensors.numpy.load(content)["rows"]
 

@@ -79,13 +79,9 @@ class Evaluations:
 
     def policy(self, network: PolicyNetwork, step: int) -> Policy:
         """Return the policy that leaves training with this network."""
-        environments = self.environments
-        parts = environments.task_name, self._algorithm, network.activation, network.head
-        return Policy(
-            network,
-            Contract(*parts, *environments.contract_parts, critic_activation=network.critic_activation),
-            step=step,
-        )
+        names = self.environments.task_name, self._algorithm, network.activation, network.head
+        contract = Contract(*names, *self.environments.contract_parts, critic_activation=network.critic_activation)
+        return Policy(network, contract, step=step)
 
     def begin(self, step: int, networks: Sequence[PolicyNetwork], task_step: int) -> None:
         """Begin to evaluate each seed's network after `step`, on the task of `task_step`."""

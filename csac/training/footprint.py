@@ -25,10 +25,8 @@ BYTES_PER_EVALUATION_PROCESS = 80 * 2**20  # on MuJoCo, without JAX; PyBullet ta
 def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at_once: int) -> str:
     """Return the line that predicts the memory of programs, `at_once` at a time. Raises InputError for too much."""
     programs = programs[:at_once]
-    per_seed, seeds = (
-        _bytes_per_seed(programs[0].algorithm, config, spec),
-        sum(len(p.directories) for p in programs),
-    )
+    per_seed = _bytes_per_seed(programs[0].algorithm, config, spec)
+    seeds = sum(len(program.directories) for program in programs)
     evaluating = sum((program.evaluation_processes or 0) + (program.environment_processes or 0) for program in programs)
     per_process = BYTES_PER_GPU_PROCESS if config.device == "gpu" else BYTES_PER_PROCESS
     needed = seeds * per_seed + len(programs) * per_process + evaluating * BYTES_PER_EVALUATION_PROCESS

@@ -112,7 +112,7 @@ def check_goals(algorithm: Algorithm, environment: Environment) -> None:
     if getattr(algorithm, "n_steps", 1) > 1:
         raise InputError("hindsight gives the replay single steps: n_steps must be 1")
     achieved, desired = places_of(environment.contract_parts.observation_parts)
-    if not environment.has_goals:
+    if not environment.raw.has_wrapper_attr("compute_reward"):
         raise InputError(
             f"hindsight needs compute_reward(achieved_goal, desired_goal, info) of {environment.task_name}"
         )

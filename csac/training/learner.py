@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from csac.tasks.vector import Steps
-    from csac.types import Algorithm, PolicyParameters, Spec
+    from csac.types import Algorithm, Spec
 
 
 class Learner:
@@ -70,11 +70,8 @@ class Learner:
         `step` is the number of the last of these steps. One dispatch, whatever the algorithm does. Between updates
         transitions wait on the host, so that an algorithm that learns from rollouts is only asked to act.
         """
-        rows = pack(
-            Transition(
-                observations, actions, outcome.reward, outcome.next_observation, outcome.terminated, outcome.truncated
-            )
-        )
+        ends = outcome.terminated, outcome.truncated
+        rows = pack(Transition(observations, actions, outcome.reward, outcome.next_observation, *ends))
         self._waiting[:, self._rows_of(step)] = rows.reshape(len(rows), self.spec.environments, -1)
         if step % self._cadence.update_interval:
             return self.next_actions(outcome.observation, step)
@@ -111,11 +108,8 @@ class Learner:
 
     def networks(self) -> list[PolicyNetwork]:
         """Return each seed's policy as NumPy layers."""
-
-        def parameters_of(state: Any) -> PolicyParameters:
-            return self.algorithm.policy(state).parameters
-
-        parameters = jax.tree.map(np.array, self._axis.map(parameters_of)(self._states()))
+        parameters_of = self._axis.map(lambda state: self.algorithm.policy(state).parameters)
+        parameters = jax.tree.map(np.array, parameters_of(self._states()))
         return [self.network._replace(parameters=self._axis.of(parameters, i)) for i in range(self._axis.seeds)]
 
     def metrics(self) -> list[dict[str, float]]:
@@ -133,10 +127,7 @@ class Learner:
 
     def carry(self, index: int) -> Carry:
         """Return what the seed at this place carries, its state unpacked; views of NumPy, to read only."""
-        return self._of_seed(self._carry, index)
-
-    def _of_seed(self, carry: Carry, index: int) -> Carry:
-        own = self._axis.of(jax.tree.map(np.asarray, carry), index)
+        own = self._axis.of(jax.tree.map(np.asarray, self._carry), index)
         return own._replace(state=self._one.packing.unpack(own.state))
 
     def save(self, index: int) -> Snapshot:

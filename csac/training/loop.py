@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from csac.deploy.policy import Policy
     from csac.record.run import RunDirectory
+    from csac.training.checkpoint import Checkpoint
     from csac.training.program import Program
     from csac.training.watch import Watcher
 
@@ -161,7 +163,7 @@ class Loop:
                 restarted.append(index)
             elif self.hindsight:
                 self.hindsight.restore(index, saved.part("hindsight"))
-            fills.append(self._replay_loader(index, point))
+            fills.append(partial(self._fill, index, point.checkpoint))
         self.learner.restore(learnt, fills)
         self._observations = self.environments.observations
         for index, reason in self.environments.refused.items():
@@ -170,20 +172,12 @@ class Loop:
             self.learner.truncate_last(restarted, self.step)
             self._actions[restarted] = self.learner.next_actions(self._observations, self.step)[restarted]
 
-    def _replay_loader(self, index: int, point: ResumePoint) -> Callable[[np.ndarray], None]:
-        """Return a function that fills rows [capacity, width] with a run's transitions, and goes on with its files."""
-        checkpoint, run = point.checkpoint, self.runs[index]
-        assert checkpoint
-
-        def fill(rows: np.ndarray) -> None:
-            lost = checkpoint.fill(rows)
-            for text in lost:
-                self._note_inexact(run, f"warning: {text}")
-            self._writers[index] = Writer(
-                run.checkpoints, self.config.keep_checkpoints, {} if lost else checkpoint.files
-            )
-
-        return fill
+    def _fill(self, index: int, checkpoint: Checkpoint, rows: np.ndarray) -> None:
+        """Fill rows [capacity, width] with a run's transitions, and go on with the checkpoint's files."""
+        run, lost = self.runs[index], checkpoint.fill(rows)
+        for text in lost:
+            self._note_inexact(run, f"warning: {text}")
+        self._writers[index] = Writer(run.checkpoints, self.config.keep_checkpoints, {} if lost else checkpoint.files)
 
     def _advance(self) -> bool:
         """Make one step of each environment, and learn from them; return whether a callback ends the runs."""

@@ -88,7 +88,8 @@ class OneSeed:
         memory = self._remember(carry, rows, step).memory
         count = step if carry.extra is None else step + carry.extra
         draw_key, update_key, _ = _keys(carry.key, step)
-        first = self._updates_before(step)
+        rounds = (step - self.cadence.first_update) // self.cadence.update_interval  # before this one
+        first = rounds * self.cadence.updates_per_interval
 
         def update(i: jax.Array, learnt: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
             state, sums = learnt
@@ -123,11 +124,6 @@ class OneSeed:
 
     def _draw(self, memory: Any, key: jax.Array, count: jax.Array) -> Transition:
         return memory.draw(key, count, self.cadence.transitions_per_update, self.spec)
-
-    def _updates_before(self, step: jax.Array) -> jax.Array:
-        """Return how many updates came before those that follow environment step `step`."""
-        cadence = self.cadence
-        return (step - cadence.first_update) // cadence.update_interval * cadence.updates_per_interval
 
     def _act(self, state: Any, key_data: jax.Array, observation: jax.Array, step: jax.Array) -> jax.Array:
         keys = self._act_keys(key_data, observation, step)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium
 
 from csac.checks import check_whole
-from csac.processes import core_quota, may_be_imported, script, usable_cores
+from csac.processes import cores_to_use, may_be_imported, script, usable_cores
 from csac.training.callbacks import Hears
 from csac.training.devices import preallocates
 from csac.types import InputError
@@ -67,11 +67,6 @@ def choose_groups(
             size = max(1, -(-len(rest) // (1 if preallocates() else processes)))
     check_whole("seeds_per_process", size, min(len(rest), 1), max(len(seeds), 1))
     return together + [rest[i : i + size] for i in range(0, len(rest), max(size, 1))]
-
-
-def cores_to_use() -> int:
-    """Return how many cores this process may compute on at a time."""
-    return len(usable_cores()[: core_quota()])
 
 
 def programs_of(

@@ -119,10 +119,11 @@ def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
         path = run.table(table)
         if not checkpoint or path.name not in checkpoint.files:
             path.unlink(missing_ok=True)
-        elif not _cut_back(path, content := checkpoint.read(path.name)):
-            if not (path.is_file() and continues(path.read_bytes(), content)):
-                notes.append(f"warning: {path} had changed since the checkpoint; it is restored")
-            write_atomically(path, content)
+            continue
+        content = checkpoint.read(path.name)
+        if not (path.is_file() and continues(path.read_bytes(), content)):
+            notes.append(f"warning: {path} had changed since the checkpoint; it is restored")
+        write_atomically(path, content)
     best = run.policy_file("best")
     try:
         if checkpoint and best.name in checkpoint.files:
@@ -134,18 +135,6 @@ def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
         notes.append(f"warning: {error}; the best policy is one of later evaluations")
         best.unlink(missing_ok=True)
     return notes
-
-
-def _cut_back(path: Path, content: bytes) -> bool:
-    """Cut off what a file has beyond `content`; return false where it does not begin so."""
-    try:
-        with open(path, "rb") as file:
-            is_sound = file.read(len(content)) == content
-    except OSError:
-        return False
-    if is_sound:
-        os.truncate(path, len(content))
-    return is_sound
 
 
 def _remove_unfinished(run: RunDirectory) -> None:
@@ -218,6 +207,7 @@ class Source(NamedTuple):
     path: Path
     runs: dict[int, RunDirectory]
     checkpoints: dict[int, Checkpoint]
+    step: int
 
     @classmethod
     def find(cls, where: str | Path, seeds: Sequence[int]) -> Source:
@@ -233,12 +223,7 @@ class Source(NamedTuple):
         runs = {seed: found.run(seed) for seed in seeds}
         step = int(text) if has_step else min(max(steps_in(run.checkpoints), default=0) for run in runs.values())
         checkpoints = {seed: checkpoint_of(run.checkpoints, step) for seed, run in runs.items()}
-        return cls(found.path, runs, checkpoints)
-
-    @property
-    def step(self) -> int:
-        """The step of the checkpoints."""
-        return next(iter(self.checkpoints.values())).step
+        return cls(found.path, runs, checkpoints, step)
 
     def perturbations(self, seed: int, given: Any) -> tuple[str, ...]:
         """Return those of the run before the checkpoint and those `given`; with None those that it had planned."""
@@ -290,8 +275,12 @@ class Source(NamedTuple):
         own: dict[str, bytes] = {}
         for name in checkpoint.files:
             if name.startswith(f"{REPLAY}/"):
-                if not _link(checkpoint.folder / name, run.checkpoints / name):
-                    write_atomically(run.checkpoints / name, checkpoint.read(name))
+                target = run.checkpoints / name
+                target.unlink(missing_ok=True)
+                try:
+                    os.link(checkpoint.folder / name, target)
+                except OSError:  # the file system has no links
+                    write_atomically(target, checkpoint.read(name))
                 continue
             own[name] = checkpoint.read(name)
             if name.endswith(".csv"):
@@ -307,13 +296,3 @@ def _fixed(config: RunConfig) -> dict[str, Any]:
     if config.algorithm in ALGORITHMS:
         fixed["hyperparameters"] = asdict(ALGORITHMS[config.algorithm]()) | config.hyperparameters
     return fixed
-
-
-def _link(source: Path, target: Path) -> bool:
-    """Give a file that is only ever replaced whole a second name; false where the file system has no links."""
-    target.unlink(missing_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:
-        return False
-    return True

@@ -17,7 +17,7 @@ from csac.training.watch import Watcher
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from csac.training.callbacks import Answer, Event
@@ -182,30 +182,21 @@ class _RemoteWatcher(Watcher):
         self._turns: queue.SimpleQueue[None] = queue.SimpleQueue()
         threading.Thread(target=self._listen, daemon=True).start()
 
+    def send(self, name: str, *arguments: Any) -> None:
+        self._connection.send((name, *arguments))
+
     def wait_for_turn(self, step: int) -> None:
         if not self.stopped.is_set():
-            self._connection.send(("turn", step))
+            self.send("turn", step)
             self._turns.get()
-
-    def progress(self, steps: Mapping[int, int]) -> None:
-        self._connection.send(("progress", dict(steps)))
-
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
-        self._connection.send(("evaluated", step, dict(returns)))
 
     def call(self, event: Event) -> Answer:
         is_heard = not self.stopped.is_set()
-        self._connection.send(("call", event))
+        self.send("call", event)
         answer = self._answers.get() if is_heard else STOPPED
         if answer.failed:
             self.stopped.set()
         return answer
-
-    def failed(self, seed: int, step: int, reason: str) -> None:
-        self._connection.send(("failed", seed, step, reason))
-
-    def note(self, text: str) -> None:
-        self._connection.send(("note", text))
 
     def _listen(self) -> None:
         while not self.stopped.is_set():

@@ -11,18 +11,19 @@ from typing import TYPE_CHECKING, Any
 
 from csac.checks import check_flag, check_path
 from csac.deploy.choosing import TrainedRuns
-from csac.processes import end_if_unguarded
+from csac.processes import cores_to_use, end_if_unguarded
 from csac.record.files import name_aside
+from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
 from csac.record.wandb import import_wandb
 from csac.tasks.trust import refuse_untrusted
 from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
-from csac.training.config import algorithm_of, check_algorithm, labels, make_configs, make_manifest
+from csac.training.config import algorithm_of, check_algorithm, labels, make_configs
 from csac.training.devices import choose_device
 from csac.training.footprint import memory_needed
-from csac.training.program import Program, choose_groups, cores_to_use, programs_of
+from csac.training.program import Program, choose_groups, programs_of
 from csac.training.resume import Source, as_begun, refuse_differences, refuse_lost
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
@@ -174,7 +175,10 @@ def resume(
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
     if steps is not None:
-        _extend(runs, steps, algorithm.cadence.has_schedule)
+        longer = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
+        for run, config in zip(runs.runs, longer, strict=True):
+            refuse_differences(run, config, algorithm.cadence.has_schedule)
+        _change(runs.runs, longer)
     existing = {run.seed: run for run in runs.runs}
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
     tensorboard = any(run.tensorboard.exists() for run in runs.runs)
@@ -202,14 +206,6 @@ def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
             shutil.rmtree(run.path)
     with suppress(OSError):
         place.rmdir()
-
-
-def _extend(runs: RunSet, steps: int, has_schedule: bool) -> None:
-    """Give every run so many steps. Raises InputError before any is changed."""
-    wanted = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
-    for run, config in zip(runs.runs, wanted, strict=True):
-        refuse_differences(run, config, has_schedule)
-    _change(runs.runs, wanted)
 
 
 def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
@@ -265,7 +261,8 @@ def _create(
     aside = {config.seed: name_aside(run_path(place, config.seed)) for config in new}
     try:
         for config in new:
-            manifest = make_manifest(config, next(group for group in groups if config.seed in group))
+            program = next(group for group in groups if config.seed in group)
+            manifest = Manifest(config=config, program=tuple(program))
             run = RunDirectory.create(aside[config.seed], source.begun(manifest) if source else manifest)
             if source:
                 source.copy_to(run)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from csac.checks import check_flag
 from csac.tasks.perturbations import by_step, perturbations_of
@@ -18,16 +18,21 @@ if TYPE_CHECKING:
 
 
 class Watcher:
-    """Receives progress, results and notes while a program trains; this one does nothing."""
+    """Receives progress, results and notes while a program trains; all go to `send`, and this one's does nothing."""
+
+    def send(self, name: str, *arguments: Any) -> None:
+        """Pass on a call of the method of this name."""
 
     def wait_for_turn(self, step: int) -> None:
         """Wait until it is this program's turn to train on, after so many steps."""
 
     def progress(self, steps: Mapping[int, int]) -> None:
         """Receive how many steps each seed has made."""
+        self.send("progress", dict(steps))
 
     def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
         """Receive the mean return of each seed's evaluation."""
+        self.send("evaluated", step, dict(returns))
 
     def call(self, event: Event) -> Answer:
         """Tell the callbacks of an event, and return their answer."""
@@ -35,9 +40,11 @@ class Watcher:
 
     def failed(self, seed: int, step: int, reason: str) -> None:
         """Receive that a seed has failed, and why."""
+        self.send("failed", seed, step, reason)
 
     def note(self, text: str) -> None:
         """Receive a line for the user."""
+        self.send("note", text)
 
 
 class Watch(Watcher):
@@ -51,15 +58,10 @@ class Watch(Watcher):
 
             self.reporter = Reporter()
 
-    def progress(self, steps: Mapping[int, int]) -> None:
-        """Show how many steps each seed has made."""
+    def send(self, name: str, *arguments: Any) -> None:
+        """Show it."""
         if self.reporter:
-            self.reporter.progress(steps)
-
-    def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
-        """Show an evaluation."""
-        if self.reporter:
-            self.reporter.evaluated(step, returns)
+            getattr(self.reporter, name)(*arguments)
 
     def call(self, event: Event) -> Answer:
         """Tell the callbacks; show who ends the runs."""
@@ -70,16 +72,10 @@ class Watch(Watcher):
         return answer
 
     def failed(self, seed: int, step: int, reason: str) -> None:
-        """Show that a seed failed."""
-        if self.reporter:
-            self.reporter.failed(seed, step, reason)
-        else:
+        """Show that a seed failed, or warn of it."""
+        super().failed(seed, step, reason)
+        if not self.reporter:
             warnings.warn(f"seed {seed} failed at step {step}: {reason}", RuntimeWarning, stacklevel=2)
-
-    def note(self, text: str) -> None:
-        """Show a line."""
-        if self.reporter:
-            self.reporter.note(text)
 
     def is_over(self, run: RunDirectory) -> bool:
         """Return whether a run needs no more training: all its steps are made, or a callback still ends it there."""

@@ -135,10 +135,10 @@ def test_an_evaluation_is_stopped_between_steps(how):
 
 
 def test_processes_are_chosen_by_the_work_and_at_least_one_is_asked_for(monkeypatch):
-    monkeypatch.setattr("csac.evaluation.pool.usable_cores", lambda: [0, 1, 2])
+    monkeypatch.setattr("csac.processes.usable_cores", lambda: [0, 1, 2])
     assert choose_processes(Evaluator("probes:Cases-v0", episodes=EPISODES_AT_ONCE), 1) == 1
     for quota, most in ((None, 3), (2, 2)):
-        monkeypatch.setattr("csac.evaluation.pool.core_quota", lambda quota=quota: quota)
+        monkeypatch.setattr("csac.processes.core_quota", lambda quota=quota: quota)
         assert choose_processes(Evaluator("probes:Cases-v0", episodes=1000), 5) == most
     with pytest.raises(InputError, match="0 processes"):
         EvaluationPool(Evaluator("probes:Cases-v0"), processes=0)

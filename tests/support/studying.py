@@ -4,15 +4,14 @@ import re
 
 import numpy as np
 
-from csac.record.manifest import Machine
+from csac.record.manifest import Machine, Manifest
 from csac.record.run import RunDirectory
 from csac.studies.study import read_study
-from csac.training.config import make_manifest
 
 
 def write_run(path, config, height=1000.0, points=10, state="finished", episodes=2, **columns):
     """Write a run whose returns rise to about `height`; `columns` are more columns of its evaluations."""
-    run = RunDirectory.create(path, make_manifest(config, (config.seed,)))
+    run = RunDirectory.create(path, Manifest(config=config, program=(config.seed,)))
     generator = np.random.default_rng(config.seed)
     interval = config.steps // 10
     for point in range(1, points + 1):

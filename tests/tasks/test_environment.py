@@ -332,6 +332,23 @@ def test_each_episode_has_a_reset_seed_of_its_own():
     assert seeds[:2] == [1_895_069_886, 1_817_441_348]  # for good: an old run resumes with them
 
 
+def test_environments_are_closed_where_another_of_them_cannot_be_made():
+    made = []
+
+    class Scarce(probes.Endless):
+        def __init__(self):
+            assert len(made) < 2, "no more simulators"
+            super().__init__()
+            made.append("open")
+
+        def close(self):
+            made[made.index("open")] = "closed"
+
+    with pytest.raises(InputError, match="no more simulators"):
+        SeedEnvironments(Scarce, None, [7, 9], environments=2)
+    assert made == ["closed", "closed"]
+
+
 def test_steps_keep_the_true_final_observation_and_both_flags():
     environments = SeedEnvironments(probes.IdEncoded, None, [7, 9])
     observations = environments.reset()
