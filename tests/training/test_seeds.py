@@ -23,8 +23,7 @@ SMALL: dict[str, Any] = {
     "algorithm",
     [
         CSAC(reference_policy="periodic", reference_period=7, **SMALL),
-        SAC(**SMALL),
-        TD3(**SMALL),
+        *(pytest.param(algorithm(**SMALL), marks=pytest.mark.slow) for algorithm in (SAC, TD3)),
         SD3(noise_samples=4, **SMALL),
         PPO(rollout_steps=32, minibatches=2, hidden_sizes=(16, 16)),
     ],
