@@ -123,12 +123,12 @@ def test_methods_are_compared_over_all_tasks_with_common_seeds(tmp_path):
 
 def test_the_papers_claims_have_verdicts(tmp_path):
     arms = arms_of("mujoco", tmp_path)
-    claims = {(c.arm.label, c.text, c.other.label, c.arm.task): c.verdict() for c in paper.claims(arms)}
+    claims = {(c.arm.label, c.text, c.other.label, c.arm.task): c for c in paper.claims(arms)}
     higher = "a higher maximum average return"
-    verdict, why = claims["CSAC (paper)", higher, "SAC", "Ant-v4"]
+    verdict, why = claims["CSAC (paper)", higher, "SAC", "Ant-v4"].verdict()
     assert (verdict, why) == ("reproduced", "better in 100% of the pairs of seeds, 95 % interval 100% to 100%")
     assert ("CSAC (paper)", higher, "SD3", "Hopper-v4") not in claims  # where the paper has SD3 higher
-    assert claims["CSAC (periodic)", "fewer steps to the lower boundary", "SAC", "Ant-v4"][0] == "reproduced"
+    assert claims["CSAC (periodic)", "fewer steps to the lower boundary", "SAC", "Ant-v4"].verdict()[0] == "reproduced"
     worse = arms_of("mujoco", tmp_path / "worse", {**HEIGHTS, "csac": 500.0})
     assert next(c for c in paper.claims(worse) if c.text == higher).verdict()[0] == "not reproduced"
 

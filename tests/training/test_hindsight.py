@@ -126,13 +126,12 @@ def test_goals_are_found_among_the_parts_in_the_order_of_their_names():
     assert places_of(parts) == (slice(3, 7), slice(7, 11))
 
 
-@pytest.mark.parametrize("task", [Walk, Ending])
 @pytest.mark.parametrize(
-    "settings",
+    ("task", "settings"),
     [
-        {},
-        {"environments": 3, "environment_processes": 2},
-        {"algorithm": SAC(update_interval=7, **{**SMALL, "replay_size": 10_000})},
+        (Walk, {}),
+        (Ending, {"environments": 3, "environment_processes": 2}),
+        (Ending, {"algorithm": SAC(update_interval=7, **{**SMALL, "replay_size": 10_000})}),
     ],
     ids=["one", "several", "interval"],
 )

@@ -33,7 +33,7 @@ SETTINGS: dict[str, Any] = {**COMMON, "entropy_weight": 1e-3}
 NOISY: dict[str, Any] = {**COMMON, "exploration_std": 0.5}
 
 
-@pytest.fixture(params=["csac", "sac", "csac-periodic", "csac-average", "td3", "sd3"])
+@pytest.fixture(params=["sac", "csac-periodic", "csac-average", "td3", "sd3"])
 def algorithm(request):
     if request.param == "sac":
         return SAC(**SETTINGS)
@@ -41,8 +41,6 @@ def algorithm(request):
         return TD3(**NOISY)
     if request.param == "sd3":
         return SD3(noise_samples=4, **NOISY)
-    if request.param == "csac":
-        return CSAC(relative_entropy_weight=0.01, **SETTINGS)
     if request.param == "csac-average":
         return CSAC(
             relative_entropy_weight=0.01, reference_policy="average", relative_entropy_estimator="sampled", **SETTINGS

@@ -35,6 +35,12 @@ def resumed_after(directory: Any, step: int, **settings: Any) -> Any:
     return run(directory, resume=True, **settings)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What a run that never stopped has, by name."""
+    return contents(run(tmp_path_factory.mktemp("whole") / "run").runs[0])
+
+
 @pytest.mark.parametrize("algorithm", [*LEARNERS, ADAPTIVE], ids=lambda a: f"{a.name}-{a.cadence.update_interval}")
 def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path, algorithm):
     whole = run(tmp_path / "whole", algorithm)
@@ -126,8 +132,8 @@ def test_what_would_be_another_run_is_refused(tmp_path, changes, name):
 
 
 @pytest.mark.parametrize("at", [2, 5], ids=["between", "last"])
-def test_a_stop_breaks_off_a_long_evaluation_which_the_resume_makes(tmp_path, monkeypatch, at):
-    whole, reset, begun = run(tmp_path / "whole"), HopperEnv.reset, []
+def test_a_stop_breaks_off_a_long_evaluation_which_the_resume_makes(tmp_path, monkeypatch, whole, at):
+    reset, begun = HopperEnv.reset, []
 
     def interrupting(self, *, seed=None, options=None):
         begun.extend([seed] * (seed == EVALUATION_SEED))
@@ -142,7 +148,7 @@ def test_a_stop_breaks_off_a_long_evaluation_which_the_resume_makes(tmp_path, mo
     stopped = RunDirectory.open(tmp_path / "run" / "seed-0")
     assert (stopped.manifest.steps_done, stopped.evaluations["step"].max()) == (100 * at, 100 * (at - 1))
     resumed = run(tmp_path / "run", resume=True)
-    assert contents(resumed.runs[0]) == contents(whole.runs[0])
+    assert contents(resumed.runs[0]) == whole
 
 
 def sized(observations: int, actions: int) -> type[Probe]:
@@ -182,14 +188,21 @@ def test_a_run_with_a_learning_rate_schedule_is_neither_extended_nor_forked_with
         run(tmp_path / "fork", otherwise, steps=256, start_from=tmp_path / "run")
 
 
-@pytest.fixture
-def stopped(tmp_path):
-    """A run that crashed at step 400, with checkpoints at 240 and 360, and one that never stopped."""
+@pytest.fixture(scope="module")
+def crashed(tmp_path_factory):
+    """A run that crashed at step 400, with checkpoints at 240 and 360."""
+    directory = tmp_path_factory.mktemp("crashed") / "run"
     with pytest.raises(Crash):
-        run(tmp_path / "run", on_evaluation=crash_at(400))
-    made = RunDirectory.open(tmp_path / "run" / "seed-0")
-    assert steps_in(made.checkpoints) == [240, 360]
-    return made
+        run(directory, on_evaluation=crash_at(400))
+    assert steps_in(RunDirectory.open(directory / "seed-0").checkpoints) == [240, 360]
+    return directory
+
+
+@pytest.fixture
+def stopped(tmp_path, crashed):
+    """A copy of it."""
+    shutil.copytree(crashed, tmp_path / "run")
+    return RunDirectory.open(tmp_path / "run" / "seed-0")
 
 
 def damage(path, kind: str) -> None:
@@ -204,21 +217,21 @@ def damage(path, kind: str) -> None:
 @pytest.mark.parametrize(
     "name", ["checkpoint/step_360/state.safetensors", "checkpoint/step_360/checkpoint.json", "evaluations.csv"]
 )
-def test_a_damaged_file_costs_at_most_the_work_since_the_checkpoint_before(tmp_path, stopped, name, kind):
+def test_a_damaged_file_costs_at_most_the_work_since_the_checkpoint_before(tmp_path, stopped, whole, name, kind):
     damage(stopped.path / name, kind)
     again = run(tmp_path / "run", resume=True)
-    assert contents(again.runs[0]) == contents(run(tmp_path / "whole").runs[0])
+    assert contents(again.runs[0]) == whole
 
 
 @pytest.mark.parametrize("kind", ["missing", "cut"])
-def test_a_lost_manifest_is_taken_from_the_newest_checkpoint(tmp_path, stopped, kind):
+def test_a_lost_manifest_is_taken_from_the_newest_checkpoint(tmp_path, stopped, whole, kind):
     damage(stopped.path / "manifest.json", kind)
     with pytest.warns(UserWarning, match=r"manifest\.json is lost or damaged"):
         found = find_sets(tmp_path)
     assert [runs.path for runs in found] == [tmp_path / "run"]
     with pytest.warns(UserWarning, match=r"manifest\.json is lost or damaged"):
         again = csac.resume(tmp_path / "run")
-    assert contents(again.runs[0])["evaluations.csv"] == contents(run(tmp_path / "whole").runs[0])["evaluations.csv"]
+    assert contents(again.runs[0])["evaluations.csv"] == whole["evaluations.csv"]
 
 
 def test_lost_transitions_are_replaced_by_others_with_a_warning(tmp_path, stopped):
@@ -240,10 +253,15 @@ def test_where_no_checkpoint_is_sound_nothing_is_touched(tmp_path, stopped):
     assert contents(stopped) == before
 
 
-def test_a_fork_begins_with_the_checkpoint_and_leaves_its_source_alone(tmp_path):
-    source = run(tmp_path / "source", keep_checkpoints=0)
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """A run with all its checkpoints."""
+    return run(tmp_path_factory.mktemp("source") / "run", keep_checkpoints=0)
+
+
+def test_a_fork_begins_with_the_checkpoint_and_leaves_its_source_alone(tmp_path, source):
     before = contents(source.runs[0])
-    fork = run(tmp_path / "fork", start_from=f"{tmp_path / 'source'}@360", steps=500, keep_checkpoints=0)
+    fork = run(tmp_path / "fork", start_from=f"{source.path}@360", steps=500, keep_checkpoints=0)
     assert contents(fork.runs[0]) == before == contents(source.runs[0])
     origin = fork.runs[0].manifest.forked_from
     assert origin
@@ -260,11 +278,10 @@ def test_a_fork_begins_with_the_checkpoint_and_leaves_its_source_alone(tmp_path)
         ({"start_from": "@17"}, "step 17"),
     ],
 )
-def test_a_fork_that_does_not_fit_is_refused_and_leaves_nothing(tmp_path, changes, name):
-    run(tmp_path / "source", keep_checkpoints=0)
-    where = f"{tmp_path / 'source'}{changes.pop('start_from', '@360')}"
+def test_a_fork_that_does_not_fit_is_refused_and_leaves_nothing(tmp_path, source, changes, name):
+    given = {"start_from": "@360", **changes}
     with pytest.raises(InputError, match=name):
-        run(tmp_path / "fork", start_from=where, **changes)
+        run(tmp_path / "fork", **{**given, "start_from": f"{source.path}{given['start_from']}"})
     assert not (tmp_path / "fork").exists()
 
 
