@@ -152,14 +152,6 @@ def test_the_actor_descends_against_the_new_critics_and_targets_move_last(algori
     assert float(state.actor.layers[0].bias[0]) == pytest.approx(-0.1, abs=1e-5)
 
 
-@pytest.mark.parametrize(("target_entropy", "expected"), [(-100.0, -0.1), (100.0, 0.1)])
-def test_a_learnt_temperature_moves_after_it_was_used(target_entropy, expected):
-    algorithm = SAC(target_entropy=target_entropy, weight_learning_rate=0.1, **LINEAR)
-    state, metrics = update(algorithm, begin(algorithm), batch_of(transition()))
-    assert float(state.temperature.log_weight) == pytest.approx(expected, abs=1e-5)
-    assert float(metrics["temperature"]) == 1.0
-
-
 @pytest.mark.parametrize("weight", [0.0, 0.2])
 def test_a_fixed_temperature_stays_and_its_state_is_finite(weight):
     algorithm = SAC(entropy_weight=weight, **LINEAR)

@@ -225,14 +225,6 @@ def test_linear_learning_rate():
     assert (SMALL.cadence.has_schedule, constant.cadence.has_schedule) == (True, False)
 
 
-def test_a_step_is_as_long_as_the_learning_rate_says():
-    # Adam's first steps are all as long as the learning rate, where the gradients are well above its epsilon.
-    for step, expected in ((0, 3e-4), (5, 1.5e-4)):
-        state, _ = update(PLAIN, begin(PLAIN), rollout(range(8)), step)
-        moved = state.parameters.log_std - begin(PLAIN).parameters.log_std
-        np.testing.assert_allclose(np.abs(moved), expected, rtol=1e-3)
-
-
 def test_a_run_shorter_than_a_rollout_begins():
     assert float(begin(SMALL, 3).total_updates) == 1.0
 

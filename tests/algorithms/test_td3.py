@@ -199,12 +199,3 @@ def test_the_policy_that_leaves_acts_as_the_algorithm_does():
     observations = jax.random.normal(jax.random.key(0), (20, 3))
     actions = jax.vmap(algorithm.act, in_axes=(None, 0, None, None))(state, observations, jax.random.key(0), False)
     np.testing.assert_allclose(policy.act(np.asarray(observations)), actions, atol=1e-6)
-
-
-def test_the_first_state_has_copies_for_targets_and_two_different_critics():
-    state = TD3(actor_hidden_sizes=(4,), critic_hidden_sizes=(4,)).init(jax.random.key(0), ONE, 1000)
-    jax.tree.map(np.testing.assert_array_equal, state.actor, state.target_actor)
-    jax.tree.map(np.testing.assert_array_equal, state.critics, state.target_critics)
-    assert not np.allclose(*(critic.layers[0].weight for critic in state.critics))
-    pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state)]
-    assert len(set(pointers)) == len(pointers)

@@ -12,7 +12,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-import trainer  # noqa: F401  (its cache of compiled programs)
 from gymnasium.envs.registration import EnvSpec
 from played import policy_for, run_of_task
 from probes import Endless

@@ -85,8 +85,6 @@ CRITICS = (linear([[1.0], [2.0]], [0.0]), linear([[0.0], [-1.0]], [3.0]))
 
 
 CLOSED_FORM: dict[str, Any] = {"relative_entropy_estimator": "closed_form"}
-PERIODIC: dict[str, Any] = {"reference_policy": "periodic", **CLOSED_FORM}
-PREVIOUS: dict[str, Any] = {"reference_policy": "average", "reference_rate": 1.0, **CLOSED_FORM}  # one update ago
 REFERENCES: dict[str, dict[str, Any]] = {
     "the actor itself": {"reference_policy": "periodic", "reference_period": 1},
     "one update ago": {"reference_policy": "average", "reference_rate": 1.0},

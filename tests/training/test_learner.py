@@ -10,7 +10,6 @@ import jax
 import numpy as np
 import pytest
 import safetensors.numpy
-import trainer  # noqa: F401  (its cache of compiled programs)
 
 from csac.algorithms import ALGORITHMS, CSAC, SAC, TD3
 from csac.algorithms.memory import row_width
