@@ -27,7 +27,8 @@ class Temperature(NamedTuple):
 
 def make_temperature(weight: float, optimiser: optax.GradientTransformation) -> Temperature:
     """Return a weight to begin with."""
-    return Temperature(logarithm(weight), init_optimiser(optimiser, logarithm(weight)))
+    log_weight = logarithm(weight)
+    return Temperature(log_weight, init_optimiser(optimiser, log_weight))
 
 
 def logarithm(weight: float) -> Scalar:
