@@ -292,9 +292,9 @@ def compared(values: np.ndarray, others: np.ndarray, repetitions: int = 2_000) -
 
 
 def _comparison_table(finals: Finals, losses: Finals, less: str) -> str:
-    """Compare each form of CSAC with each of SAC, and these with the first of them, over all tasks and on each."""
+    """Compare each form of CSAC with each of SAC, and these with the first; without SAC, all with the first of all."""
     final, loss = stacked(finals), stacked(losses)
-    forms_of_sac = [label for label in final if label.startswith("SAC")]
+    forms_of_sac = [label for label in final if label.startswith("SAC")] or list(final)[:1]
     lines = []
     for label in final:
         for other in forms_of_sac[:1] if label in forms_of_sac else forms_of_sac:
