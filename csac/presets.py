@@ -111,31 +111,26 @@ _FASTER_CRITICS: Mapping[str, Any] = {
     "actor_learning_rate": 1e-3,
     "policy_delay": 3,
     "adam_momentum": 0.5,
+    "n_steps": 2,
+    "warmup_steps": 5_000,
     "entropy_weight": "auto",
-    "initial_entropy_weight": 1.0,
+    "initial_entropy_weight": 0.01,
     "target_entropy": None,
-    "target_entropy_per_dimension": -1.0,
-    "weight_learning_rate": 3e-4,
+    "target_entropy_per_dimension": -0.5,
+    "weight_learning_rate": 1e-3,
 }
 
 _STRONG: Mapping[str, Mapping[str, Any]] = {
     "csac": {
         **_FASTER_CRITICS,
         "relative_entropy_weight": 0.5,
-        "relative_entropy_form": "actor_only",
+        "relative_entropy_form": "explicit",
         "reference_policy": "periodic",
         "reference_period": 1000,
         "relative_entropy_estimator": "closed_form",
-        "target_log_prob_bound": 0.0,
+        "target_log_prob_bound": 1.0,
     },
-    "sac": {
-        **_FASTER_CRITICS,
-        "n_steps": 2,
-        "warmup_steps": 5_000,
-        "initial_entropy_weight": 0.01,
-        "target_entropy_per_dimension": -0.5,
-        "weight_learning_rate": 1e-3,
-    },
+    "sac": _FASTER_CRITICS,
 }
 
 _ALGORITHMS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {"paper": _PAPER, "strong": _STRONG}

@@ -121,7 +121,7 @@ def as_json(algorithm: Any) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(algorithm)))
 
 
-@pytest.mark.parametrize(("algorithm", "runs"), [("csac", "csac-candidate"), ("sac", "two-steps")])
+@pytest.mark.parametrize(("algorithm", "runs"), [("csac", "csac-two-steps-bounded"), ("sac", "two-steps")])
 def test_strong_is_what_was_measured(algorithm, runs):
     strong = as_json(ALGORITHMS[algorithm](**presets.hyperparameters("strong", algorithm, "Ant-v4")))
     values = measured("strong", runs)
