@@ -6,7 +6,7 @@ import pickle
 from typing import TYPE_CHECKING
 
 from csac.evaluation.pending import Pending
-from csac.processes import Child, cores_to_use, die_with_parent, end, outlive_termination
+from csac.processes import Child, cores_to_use, end
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -76,13 +76,11 @@ class EvaluationPool:
             self._workers.remove(worker)
         while len(self._workers) < processes:
             self._evaluator.close()  # no process is sent open environments
-            self._workers.append(Child(_work, self._evaluator, daemon=False))
+            self._workers.append(Child(_work, self._evaluator))
 
 
 def _work(connection: Connection, evaluator: Evaluator) -> None:
     """Run the batches that are asked for, until there are no more or the parent is gone."""
-    die_with_parent()
-    outlive_termination()
     try:
         while work := connection.recv():
             connection.send(evaluator.answer(*work))

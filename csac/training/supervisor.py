@@ -10,7 +10,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any
 
-from csac.processes import Child, die_with_parent, end, outlive_termination
+from csac.processes import Child, end
 from csac.record.run import RunDirectory, StorageFailure
 from csac.training.callbacks import STOPPED
 from csac.training.watch import Watcher
@@ -121,7 +121,7 @@ class _Worker(Child):
     """The parent's end of one program's process."""
 
     def __init__(self, program: Program) -> None:
-        super().__init__(_work, program, daemon=False)
+        super().__init__(_work, program)
         self.program, self.is_stopping = program, False
         self.has_turn: bool | None = None  # False while it waits for one, None before it has asked
         self.step = 0
@@ -142,8 +142,6 @@ class _Worker(Child):
 
 def _work(connection: Connection, program: Program) -> None:
     """Train a program in a process of its own."""
-    die_with_parent()
-    outlive_termination()
     from csac.training.running import begin_with, train_program  # JAX
 
     begin_with(program.threads)
