@@ -42,11 +42,14 @@ class StorageFailure(Failure):
 
 
 class RunDirectory:
-    """One run on disk: one seed."""
+    """One run on disk: one seed.
+
+    `checkpoints`, `tensorboard` and `policies`, which has their contract too, are its folders.
+    """
 
     def __init__(self, path: Path, manifest: Manifest) -> None:
-        self.path = path
-        self.manifest = manifest
+        self.path, self.manifest = path, manifest
+        self.checkpoints, self.tensorboard, self.policies = path / "checkpoint", path / "tensorboard", path / "policy"
 
     def __repr__(self) -> str:
         return f"RunDirectory({str(self.path)!r})"
@@ -128,21 +131,6 @@ class RunDirectory:
         if state != "running" or is_locked(self.path / LOCK):
             return state
         return "waiting" if self.manifest.process is None else "killed"
-
-    @property
-    def checkpoints(self) -> Path:
-        """The folder of its checkpoints."""
-        return self.path / "checkpoint"
-
-    @property
-    def tensorboard(self) -> Path:
-        """The folder of its TensorBoard files."""
-        return self.path / "tensorboard"
-
-    @property
-    def policies(self) -> Path:
-        """The folder of its policies and their contract."""
-        return self.path / "policy"
 
     def policy_file(self, which: Which = "last") -> Path:
         """Return the file of the last or the best policy."""

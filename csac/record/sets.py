@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 
 
 class RunSet:
-    """The runs in one folder, `seed-<k>` each, or one run alone."""
+    """The runs in one folder, `seed-<k>` each, or one run alone; `curve` is the picture of their evaluations."""
 
     def __init__(self, path: Path, runs: Sequence[RunDirectory]) -> None:
-        self.path, self.runs = path, list(runs)
+        self.path, self.runs, self.seeds = path, list(runs), [run.seed for run in runs]
+        self.curve = path / "curve.png"
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.path)!r}, seeds {self.seeds})"
@@ -47,11 +48,6 @@ class RunSet:
         if not runs:
             RunDirectory.open(path)  # which says what is there instead
         return cls(path, runs)
-
-    @property
-    def seeds(self) -> list[int]:
-        """The seeds, in order."""
-        return [run.seed for run in self.runs]
 
     @property
     def config(self) -> RunConfig:
@@ -74,11 +70,6 @@ class RunSet:
         """The fewest steps that a seed has made that did not fail."""
         steps = [run.manifest.steps_done for run in self.runs if run.manifest.state != "failed"]
         return min(steps or [run.manifest.steps_done for run in self.runs])
-
-    @property
-    def curve(self) -> Path:
-        """The picture of the evaluations."""
-        return self.path / "curve.png"
 
     def run(self, seed: int) -> RunDirectory:
         """Return the run of one seed. Raises InputError where there is none."""
