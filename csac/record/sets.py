@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.lib.recfunctions import repack_fields
 
 from csac.checks import check_path
 from csac.record.run import MANIFEST, RunDirectory, is_run
-from csac.record.tables import COLUMNS, structured
+from csac.record.tables import joined
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -80,11 +79,7 @@ class RunSet:
 
     def rows(self, name: Table) -> np.ndarray:
         """Return the rows of a table of all runs, seed by seed, with the columns that all of them have."""
-        tables = [rows for run in self.runs if len(rows := run.rows(name))]
-        if not tables:
-            return structured(COLUMNS[name], [])
-        common = [item for item in tables[0].dtype.names or () if all(item in (t.dtype.names or ()) for t in tables)]
-        return np.concatenate([repack_fields(table[common]) for table in tables])
+        return joined(name, (run.rows(name) for run in self.runs))
 
     @property
     def evaluations(self) -> np.ndarray:

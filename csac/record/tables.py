@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 
 from csac.record.files import name_aside, write_atomically
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
 COLUMNS: dict[str, tuple[str, ...]] = {
     "evaluations": ("seed", "step", "episode", "return", "length", "success"),
@@ -122,6 +123,15 @@ def read_rows(path: str | Path) -> np.ndarray:
         return structured(header, body)
     except (OSError, csv.Error, ValueError, OverflowError) as error:
         raise InputError(f"{path} is no table of a run ({_short(error)}): restore it") from None
+
+
+def joined(name: str, tables: Iterable[np.ndarray]) -> np.ndarray:
+    """Return the rows of several tables of this name, with the columns that are in each that has rows."""
+    tables = [table for table in tables if len(table)]
+    if not tables:
+        return structured(COLUMNS[name], [])
+    common = [item for item in tables[0].dtype.names or () if all(item in (t.dtype.names or ()) for t in tables)]
+    return np.concatenate([repack_fields(table[common]) for table in tables])
 
 
 def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarray:
