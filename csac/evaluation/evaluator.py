@@ -12,7 +12,7 @@ from csac.checks import check_flag, check_whole
 from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy
 from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, Playing, start
-from csac.evaluation.pending import EvaluationStopped, Pending
+from csac.evaluation.pool import EvaluationStopped, Pending
 from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import constant_perturbations, values_at
@@ -23,7 +23,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from csac.evaluation.pending import Batch, OnProgress, Result
+    from csac.evaluation.pool import Batch, OnProgress, Result
     from csac.tasks.perturbations import Perturbation
     from csac.tasks.registry import Task
     from csac.tasks.spaces import Parts

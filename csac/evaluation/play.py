@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from csac.evaluation.episode import EvaluationEpisode
-    from csac.evaluation.pending import OnProgress
+    from csac.evaluation.pool import OnProgress
     from csac.record.run import Which
     from csac.tasks.perturbations import Perturbation
 

@@ -11,8 +11,7 @@ import numpy as np
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
-from csac.evaluation.pending import EvaluationStopped
-from csac.evaluation.pool import EvaluationPool
+from csac.evaluation.pool import EvaluationPool, EvaluationStopped
 from csac.tasks.perturbations import perturbations_of, values_at
 from csac.training.callbacks import mean_return
 
