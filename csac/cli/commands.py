@@ -136,8 +136,7 @@ def _play(options: Play, _: str) -> int:
 
 
 def _export(options: Export, _: str) -> int:
-    from csac.console.exports import export_lines
-    from csac.console.tables import make_console, print_lines
+    from csac.console.tables import export_lines, make_console, print_lines
     from csac.evaluation.export import export_run
     from csac.record.sets import RunSet
 
@@ -163,8 +162,7 @@ def _unlearnt(runs: RunSet) -> list[str]:
 def _latency(options: Latency, _: str) -> int:
     if not options.artefacts:
         raise InputError("give the folder of an artefact (csac export writes one)")
-    from csac.console.exports import latency_table
-    from csac.console.tables import make_console, print_lines
+    from csac.console.tables import latency_table, make_console, print_lines
     from csac.deploy.artefact import open_artefact
     from csac.deploy.latency import measure
 
