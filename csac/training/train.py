@@ -22,8 +22,7 @@ from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs
 from csac.training.devices import choose_device
-from csac.training.footprint import memory_needed
-from csac.training.program import Program, choose_groups, programs_of
+from csac.training.program import Program, choose_groups, memory_needed, programs_of
 from csac.training.resume import Source, as_begun, refuse_differences, refuse_lost
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
