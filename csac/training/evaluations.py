@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from csac.record.recorder import Recorder
     from csac.record.run import RunDirectory
     from csac.tasks.vector import SeedEnvironments
-    from csac.training.notifier import Notifier
+    from csac.training.callbacks import Notifier
     from csac.training.program import Program
     from csac.training.watch import Watcher
     from csac.types import PolicyNetwork

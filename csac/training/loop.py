@@ -15,12 +15,12 @@ from csac.record.run import MANIFEST, TABLES
 from csac.tasks.perturbations import by_step, perturbations_of, values_at
 from csac.tasks.vector import SeedEnvironments
 from csac.tasks.workers import choose_processes
+from csac.training.callbacks import Notifier
 from csac.training.checkpoint import Writer
 from csac.training.demonstrations import files_of, rows_of
 from csac.training.evaluations import Evaluations, is_finite
 from csac.training.hindsight import Hindsight
 from csac.training.learner import Learner
-from csac.training.notifier import Notifier
 from csac.training.resume import ResumePoint, record_inexact
 from csac.types import Snapshot
 
