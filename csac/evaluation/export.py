@@ -18,7 +18,7 @@ from csac.deploy.guards import make_guards
 from csac.deploy.policy import POLICY
 from csac.deploy.verify import compare_actions
 from csac.evaluation.evaluator import check_contract, evaluate
-from csac.record.files import write_atomically
+from csac.record.files import write_atomically, writing
 from csac.record.run import RunDirectory, Which
 from csac.record.sets import RunSet
 from csac.record.statistics import FEWEST_FOR_INTERVAL, last_evaluations, mean_and_interval
@@ -103,7 +103,7 @@ def export_run(
 @contextmanager
 def placed(place: Path) -> Iterator[Path]:
     """Yield a new folder that replaces `place` at the end, or is removed if something is raised."""
-    try:
+    with writing(place):
         _check_place(place)
         place = Path(os.path.realpath(place))  # a link stays one
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -114,8 +114,6 @@ def placed(place: Path) -> Iterator[Path]:
             if place.exists():
                 os.rename(place, Path(aside, "old"))
             os.rename(new, place)
-    except OSError as error:
-        raise InputError(f"cannot write to {place}: {error.strerror or error}; choose another place") from error
 
 
 def _check_place(place: Path) -> None:

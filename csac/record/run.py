@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from csac.checks import check_path
 from csac.record import manifest as manifests
-from csac.record.files import write_atomically
+from csac.record.files import write_atomically, writing
 from csac.record.locks import is_locked, kept_from_children, take
 from csac.record.tables import COLUMNS, append_rows, continues, read_rows, structured
 from csac.types import Failure, InputError
@@ -61,19 +61,12 @@ class RunDirectory:
     def create(cls, path: str | Path, manifest: Manifest) -> RunDirectory:
         """Start a run in a new or empty directory. Raises InputError where it is none, or cannot be written."""
         path = Path(os.path.abspath(path))
-        if is_run(path):
-            raise InputError(f"{path} already holds a run; resume it, or choose another directory")
-        if path.exists() and not path.is_dir():
-            raise InputError(f"{path} is a file; choose another directory")
-        if path.exists() and any(not entry.name.startswith(".") for entry in path.iterdir()):
-            raise InputError(f"{path} is not empty and holds no run; choose a new or an empty directory")
         content = manifests.written(dataclasses.replace(manifest, created=manifest.created or now()))
-        try:
+        with writing(path):
             path.mkdir(parents=True, exist_ok=True)
+            if any(not entry.name.startswith(".") for entry in path.iterdir()):
+                raise InputError(f"{path} is not empty; choose a new or an empty directory")
             write_atomically(path / MANIFEST, content)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise InputError(f"cannot write to {path}: {reason}; choose another directory") from None
         return cls(path, manifests.read(content))
 
     def rename(self, path: Path) -> None:

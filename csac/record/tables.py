@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
-from csac.record.files import name_aside, write_atomically
+from csac.record.files import name_aside, write_atomically, writing
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -92,10 +92,9 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
     """Write a table as `append_rows` does; the file gets its name once it is whole. Raises InputError."""
     aside = name_aside(path)
     try:
-        append_rows(aside, columns, rows)
-        aside.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}; choose another place") from error
+        with writing(path):
+            append_rows(aside, columns, rows)
+            aside.replace(path)
     finally:
         with suppress(OSError):  # what was raised is told
             aside.unlink()

@@ -18,6 +18,7 @@ import numpy as np
 from csac.checks import check_whole
 from csac.console.tables import Fitted
 from csac.record.config import differences
+from csac.record.files import writing
 from csac.record.locks import is_locked, kept_from_children, take
 from csac.record.rendering import Cell, Row, Table, number
 from csac.record.sets import RunSet
@@ -84,10 +85,8 @@ def _open(search: Search, directory: Path) -> optuna.Study:
     journal = directory / "journal.log"
     if directory.exists() and not journal.exists() and any(directory.iterdir()):
         raise InputError(f"{directory} is not empty and holds no search: choose another --directory")
-    try:
+    with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {directory}: {error.strerror}; choose another directory") from None
     backend = JournalFileBackend(str(journal), JournalFileOpenLock(str(journal)))
     unpruned = max(search.algorithm.cadence.first_update, round(SHARE_UNPRUNED * search.config.steps))
     with _alone(directory):
