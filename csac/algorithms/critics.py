@@ -64,14 +64,9 @@ def update_critics(
 ) -> tuple[Any, Critics, Metrics]:
     """Return the state after one gradient step of its critics, these critics as plain MLPs, and what to log.
 
-    Args:
-        optimiser: makes a step of a gradient.
-        state: has `critics`, `critic_optimiser` and `target_critics`; None where the critics are normalised over the
-            batch, and are their own targets.
-        batch: transitions with a leading axis.
-        noise: of the next actions.
-        critic_target: `critic_target(transition, noise, targets=...)`, for one example.
-        next_action: `next_action(next_observation, noise)`, at which the target evaluates the critics.
+    Without `target_critics` the critics are normalised over the batch, and are their own targets. Of one example are
+    `critic_target(transition, noise, targets=...)` and `next_action(next_observation, noise)`, where the target
+    evaluates the critics; `noise` is of the next actions.
     """
     critics, optimiser_state, targets = state.critics, state.critic_optimiser, state.target_critics
     if targets is not None:

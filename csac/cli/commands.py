@@ -20,12 +20,7 @@ if TYPE_CHECKING:
 
 
 def run(name: str, words: list[str]) -> int:
-    """Run a sub-command and return its exit code.
-
-    Raises:
-        InputError, Failure: a user's mistake, or what ends the command.
-        KeyboardInterrupt: a signal, where nothing is to be saved.
-    """
+    """Run a sub-command and return its exit code. Raises InputError, Failure, and on a signal KeyboardInterrupt."""
     command = shlex.join(["csac", name, *words])
     try:
         if name == "study":

@@ -45,12 +45,7 @@ class _Seed:
 
 
 class Reporter:
-    """Shows the progress of a set of runs.
-
-    Args:
-        console: where to; by default a console on standard output that outlives its reader.
-        clock: seconds, for speed and time left.
-    """
+    """Shows the progress of a set of runs, by default on standard output; `clock` gives seconds."""
 
     def __init__(self, console: Console | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self.console = console or make_console()

@@ -69,8 +69,7 @@ class Pending:
     def results(self, should_stop: Callable[[], bool] | None = None) -> list[Result]:
         """Return each policy's episodes in order, or its first failure, which does not end the others. Waits.
 
-        Raises:
-            EvaluationStopped: `should_stop` said so; it is asked every second, and before each step here.
+        Raises EvaluationStopped where `should_stop`, asked every second and before each step here, says so.
         """
         while self._busy:
             if should_stop and should_stop():
@@ -137,11 +136,8 @@ class EvaluationPool:
     """Does what `Evaluator` does, batch by batch in processes of their own; the numbers are the same to the last bit.
 
     A batch is what one evaluator steps at a time, so that nothing depends on which process takes it. The processes
-    start at the first evaluation, or at `start`, and wait for the next until `close`.
-
-    Args:
-        evaluator: what each process works with, perturbed as it is when an evaluation begins.
-        processes: how many, at least one.
+    start at the first evaluation, or at `start`, and wait for the next until `close`. Each works with the evaluator,
+    perturbed as it is when an evaluation begins.
     """
 
     def __init__(self, evaluator: Evaluator, processes: int) -> None:

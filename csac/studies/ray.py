@@ -43,9 +43,8 @@ class Cluster:
     ) -> None:
         """Run each program as a task. A task whose node is lost goes on elsewhere, from the newest checkpoint.
 
-        Raises:
-            InputError: Ray is not installed, there is no cluster, or a run cannot begin.
-            StorageFailure: a run directory can no longer be written.
+        Raises InputError where Ray is not installed, there is no cluster, or a run cannot begin, and StorageFailure
+        where a run directory can no longer be written.
         """
         ray = self._connect()
         try:

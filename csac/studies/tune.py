@@ -55,9 +55,8 @@ class Trial(NamedTuple):
 def tune(search: Search, directory: Path, trials: int, command: str | None, console: Console) -> int:
     """Run trials until the directory has so many, show the best, and return the exit code.
 
-    Raises:
-        InputError: Optuna is missing, the task cannot be made, or the directory holds another search.
-        StorageFailure: the directory can no longer be written.
+    Raises InputError where Optuna is missing, the task cannot be made, or the directory holds another search, and
+    StorageFailure where it can no longer be written.
     """
     check_whole("trials", trials, 1, 100_000)
     directory = directory.absolute()

@@ -58,14 +58,8 @@ class SeedEnvironments:
     """The environments of each seed, reset by themselves where an episode ends, each episode with its own derived seed.
 
     A seed fails alone: where one of its environments raises or gives what is not finite, it is reported once and never
-    stepped again. `alive` [seed] says which seeds still step; it turns false with the report.
-
-    Args:
-        task, environment_arguments: as of `Environment`.
-        seeds: the seeds.
-        environments: how many each seed has.
-        processes: how many share the environments; 0 steps them here. What they compute is the same.
-        events: what to keep of an episode's `info`.
+    stepped again. `alive` [seed] says which seeds still step; it turns false with the report. So many `processes` share
+    the environments; 0 steps them here. What they compute is the same.
     """
 
     def __init__(

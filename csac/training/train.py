@@ -250,9 +250,7 @@ def _create(
     """Create the run of each configuration; an existing one takes over what may differ where it goes on, such as steps.
 
     New runs are made aside and named together: who is killed before leaves none of them, not some or a half of one.
-
-    Raises:
-        InputError: an existing run is in use, or a directory cannot be written.
+    Raises InputError where an existing run is in use, or a directory cannot be written.
     """
     changed = [config for config in configs if config.seed in existing and config != existing[config.seed].config]
     _change([existing[config.seed] for config in changed], changed)
