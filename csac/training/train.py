@@ -17,7 +17,7 @@ from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
 from csac.record.wandb import import_wandb
-from csac.tasks.trust import refuse_untrusted
+from csac.tasks.trust import named_task
 from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs
@@ -167,9 +167,7 @@ def resume(
     end_if_unguarded()
     runs = TrainedRuns.open(directory)
     config = runs.config
-    if config.task_is_callable:
-        raise InputError(f"the task of {runs.path} is a Python function: call csac.train with it and resume=True")
-    refuse_untrusted(config.task, runs.path, trust_task)
+    named_task(config, runs.path, trust_task, "call csac.train with it and resume=True")
     watch = Watch(progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
