@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from csac.processes import Child, end
 from csac.record.run import RunDirectory, StorageFailure
+from csac.tasks.failures import one_line
 from csac.training.callbacks import STOPPED
 from csac.training.watch import Watcher
 from csac.types import InputError
@@ -162,7 +163,7 @@ def _work(connection: Connection, program: Program) -> None:
 
 def record_failure(program: Program, watcher: Watcher, error: Exception) -> None:
     """Write down that the runs of a program failed by an error that nobody foresaw, and tell it."""
-    reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    reason = one_line(error)
     for path in program.directories:
         run = RunDirectory.open(path)
         run.log(f"{reason}\n{''.join(traceback.format_exception(error))}")
