@@ -129,7 +129,8 @@ def read_arms(
                 continue
             seen.add(run.path)
             config = run.config
-            key: tuple[Any, ...] = label or _alike(config), config.task, config.perturbations
+            alike = json.dumps([config.algorithm, settings(config)], sort_keys=True)
+            key: tuple[Any, ...] = label or alike, config.task, config.perturbations
             if key in groups and run.seed in [other.seed for other in groups[key].runs]:
                 if label:
                     raise InputError(f"{label}: {run.path} is a second run of seed {run.seed}; label them apart")
@@ -270,7 +271,3 @@ def by_place(arms: Iterable[Arm]) -> dict[str, list[Arm]]:
     for arm in arms:
         groups.setdefault(arm.place, []).append(arm)
     return groups
-
-
-def _alike(config: RunConfig) -> str:
-    return json.dumps([config.algorithm, settings(config)], sort_keys=True)

@@ -5,6 +5,7 @@ Any number of processes may share a directory: the study is a journal in it, and
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shutil
 import sys
@@ -185,7 +186,7 @@ def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None,
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of seeds that fail: told below
             runs = train(
-                search.algorithm_with(trial.values),
+                dataclasses.replace(search.algorithm, **trial.values),  # pyright: ignore[reportArgumentType]
                 search.config.task,
                 seeds=search.seeds,
                 first_seed=search.config.seed,
