@@ -69,10 +69,8 @@ def evaluate_run(
     if not chosen:
         raise InputError(f"{runs.path} holds no {which} policies: an evaluation writes them")
     policies = {run.seed: load_run(run, which) for run in chosen}
-    environments = runs.config.evaluation_environments or 1
-    evaluator = Evaluator(
-        task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events, environments=environments
-    )
+    given = task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events
+    evaluator = Evaluator(*given, environments=runs.config.evaluation_environments or 1)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     with closing(Environment(task, arguments)) as environment:
         environment.perturb(evaluator.perturbed)

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from csac.checks import check_path
 from csac.record import manifest as manifests
-from csac.record.files import write_atomically, writing
-from csac.record.locks import is_locked, kept_from_children, take
+from csac.record.files import is_locked, kept_from_children, take, write_atomically, writing
 from csac.record.tables import COLUMNS, append_rows, continues, read_rows, structured
 from csac.types import Failure, InputError
 

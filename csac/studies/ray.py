@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from csac.record.locks import is_locked
+from csac.record.files import is_locked
 from csac.record.run import LOCK, StorageFailure
 from csac.training.signals import stop_requested
 from csac.training.supervisor import record_failure

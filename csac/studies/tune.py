@@ -19,8 +19,7 @@ import numpy as np
 from csac.checks import check_whole
 from csac.console.tables import Fitted
 from csac.record.config import differences
-from csac.record.files import writing
-from csac.record.locks import is_locked, kept_from_children, take
+from csac.record.files import is_locked, kept_from_children, take, writing
 from csac.record.rendering import Cell, Row, Table, number
 from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
