@@ -22,7 +22,8 @@ def without_controls(content: bytes) -> bytes:
 def check_whole(name: str, value: object, least: int, most: int) -> None:
     """Raise InputError for what is not a whole number between these two."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"{name} must be a whole number of {_least(least)}, not {value!r:.40}")
+        told = "at least 1" if least == 1 else f"{least} or more"
+        raise InputError(f"{name} must be a whole number of {told}, not {value!r:.40}")
     if value > most:
         raise InputError(
             f"{name} must be at most {most:,}, not {value:.3g}" if value < 1e300 else f"{name} is too large"
@@ -68,7 +69,3 @@ def closest(word: str, known: Iterable[str], most: int = 1) -> list[str]:
     begun = [name for name in names if len(word) >= 3 and name.startswith(word)]
     exact = [word] if word in names else begun if len(begun) == 1 else []
     return [names[match] for match in exact or difflib.get_close_matches(word, names, n=most)]
-
-
-def _least(least: int) -> str:
-    return "at least 1" if least == 1 else f"{least} or more"

@@ -165,16 +165,16 @@ def end_if_unguarded() -> None:
 class Child:
     """A process that runs `work(connection, *arguments)`, and this end of the pipe to it.
 
-    A daemon may not start processes of its own, and so no task that does: it is for work without one.
+    It dies with this process, and outlives a SIGTERM.
     """
 
     _at_exit: Finalize | None = None
 
-    def __init__(self, work: Callable[..., None], *arguments: Any, daemon: bool) -> None:
+    def __init__(self, work: Callable[..., None], *arguments: Any) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         before = os.environ.get(_SAFE_PATH)
-        self.process = context.Process(target=_work, args=(before, work, theirs, *arguments), daemon=daemon)
+        self.process = context.Process(target=_work, args=(before, work, theirs, *arguments))
         try:
             with safe_path(), worker_surroundings(), _without_a_script_that_is_none():
                 self.process.start()
@@ -219,6 +219,8 @@ def _work(safe_path: str | None, work: Callable[..., None], *arguments: Any) -> 
     os.environ.pop(_SAFE_PATH, None)
     if safe_path is not None:
         os.environ[_SAFE_PATH] = safe_path
+    die_with_parent()
+    outlive_termination()
     work(*arguments)
 
 

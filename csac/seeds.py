@@ -1,6 +1,8 @@
-"""The reset seed of every episode, in training and in evaluations: no two kinds share one."""
+"""The reset seed of every episode, training and evaluations apart: no two kinds share one; what seeds are called."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,3 +17,10 @@ def training_seed(seed: int, episode: int, environment: int = 0) -> int:
     """Return the reset seed of an environment's training episode: its own, and never an evaluation episode's."""
     word = int(np.random.SeedSequence([seed, episode, environment]).generate_state(1)[0])
     return FIRST_TRAINING_SEED + word % FIRST_TRAINING_SEED
+
+
+def seeds_told(seeds: Sequence[int]) -> str:
+    """Return what seeds are called in a line: seed 3; seeds 3, 5; seeds 0 to 4."""
+    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
+        return f"seeds {seeds[0]} to {seeds[-1]}"
+    return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"

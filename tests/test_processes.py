@@ -23,7 +23,6 @@ from csac.processes import (
     may_be_imported,
     memory_left,
     move_to,
-    outlive_termination,
 )
 
 
@@ -37,7 +36,7 @@ def end_as_told(_: Connection, how: str) -> None:
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_a_process_that_ended_is_not_said_to_have_been_killed():
     """Its pipe closes before it is gone: who ends it then would find the cause in himself."""
-    exits, faults = (Child(end_as_told, how, daemon=True) for how in ("sys.exit", "fault"))
+    exits, faults = (Child(end_as_told, how) for how in ("sys.exit", "fault"))
     for child, cause in (
         (exits, "ended by itself with exit code 7"),
         (faults, r"killed by SIGSEGV \(a fault in native"),
@@ -110,7 +109,6 @@ def test_processes_import_a_script_that_has_a_guard(monkeypatch, tmp_path, scrip
 
 def end_what_a_task_starts(connection: Connection) -> None:
     """Be told to end, in vain; then tell a program and a forked process to, and send how they did."""
-    outlive_termination()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.raise_signal(number)
     forked = multiprocessing.get_context("fork").Process(target=signal.pause, daemon=True)
@@ -134,7 +132,7 @@ def end_what_a_task_starts(connection: Connection) -> None:
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_a_worker_outlives_what_ends_what_its_task_starts():
     """They were blocked, and so in the task's simulator too: to end it was to wait for it for ever."""
-    worker = Child(end_what_a_task_starts, daemon=False)
+    worker = Child(end_what_a_task_starts)
     assert worker.connection.recv() == [-signal.SIGTERM, -signal.SIGTERM]
     end([worker], 30)
     assert worker.process.exitcode == 0
@@ -156,7 +154,7 @@ def stay(connection: Connection) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_who_is_to_end_has_a_moment_and_no_more(tmp_path):
-    closing, staying = Child(say_when_it_is_over, tmp_path / "said", daemon=False), Child(stay, daemon=False)
+    closing, staying = Child(say_when_it_is_over, tmp_path / "said"), Child(stay)
     assert [child.connection.recv() for child in (closing, staying)] == ["there", "there"]
     end([closing], 30)
     end([staying], 0)
@@ -166,17 +164,16 @@ def test_who_is_to_end_has_a_moment_and_no_more(tmp_path):
 
 FORGETFUL = """
 import signal
-from csac.processes import Child, outlive_termination
+from csac.processes import Child
 
 def work(connection):
-    outlive_termination()
     connection.send("there")
     while True:
         signal.pause()
 
 if __name__ == "__main__":
-    children = [Child(work, daemon=False), Child(work, daemon=True)]
-    print([child.connection.recv() for child in children])
+    child = Child(work)
+    print(child.connection.recv())
 """
 
 
@@ -185,20 +182,19 @@ def test_an_interpreter_that_ends_waits_for_no_process_that_was_forgotten(tmp_pa
     script = tmp_path / "script.py"
     script.write_text(FORGETFUL)
     ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "['there', 'there']\n", "")
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "there\n", "")
 
 
 WITH_A_CHILD = """
 import os, signal
-from csac.processes import Child, die_with_parent
+from csac.processes import Child
 
 def work(connection):
-    die_with_parent()
     print(os.getpid(), flush=True)
     signal.pause()
 
 if __name__ == "__main__":
-    Child(work, daemon=True).process.join()
+    Child(work).process.join()
 """
 
 

@@ -8,22 +8,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from csac.algorithms.networks import MLP, PLAIN, Hidden, gradient_step, make_mlp
-from csac.algorithms.normalisation import Moments, fold, normalised_pass
-from csac.algorithms.shapes import Action, Actions, Key, Observation, Scalar
-from csac.types import Metrics, Spec, Transition
+from csac.algorithms.networks import MLP, gradient_step
+from csac.algorithms.normalisation import fold, normalised_pass
+from csac.algorithms.shapes import Action, Actions, Observation, Scalar
+from csac.types import Metrics, Transition
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     import optax
 
 Critics: TypeAlias = tuple[MLP, MLP]
-
-
-def make_critic(key: Key, spec: Spec, hidden_sizes: Sequence[int], hidden: Hidden = PLAIN) -> MLP:
-    """Return one random critic, a map from [observation + action] to [1]."""
-    return make_mlp(key, spec.observation_size + spec.action_size, hidden_sizes, 1, hidden)
 
 
 def q_value(critic: MLP, observation: Observation, action: Action) -> Scalar:
@@ -64,14 +59,9 @@ def update_critics(
 ) -> tuple[Any, Critics, Metrics]:
     """Return the state after one gradient step of its critics, these critics as plain MLPs, and what to log.
 
-    Args:
-        optimiser: makes a step of a gradient.
-        state: has `critics`, `critic_optimiser` and `target_critics`; None where the critics are normalised over the
-            batch, and are their own targets.
-        batch: transitions with a leading axis.
-        noise: of the next actions.
-        critic_target: `critic_target(transition, noise, targets=...)`, for one example.
-        next_action: `next_action(next_observation, noise)`, at which the target evaluates the critics.
+    Without `target_critics` the critics are normalised over the batch, and are their own targets. Of one example are
+    `critic_target(transition, noise, targets=...)` and `next_action(next_observation, noise)`, where the target
+    evaluates the critics; `noise` is of the next actions.
     """
     critics, optimiser_state, targets = state.critics, state.critic_optimiser, state.target_critics
     if targets is not None:
@@ -83,7 +73,8 @@ def update_critics(
     else:
         loss = partial(normalised_critic_loss, critic_target=critic_target, next_action=next_action)
         critics, optimiser_state, metrics = gradient_step(optimiser, loss, critics, optimiser_state, batch, noise)
-        folded = fold_critics(critics, metrics.pop("moments"))
+        first, second = map(fold, critics, metrics.pop("moments"))
+        folded = first, second
     return state._replace(critics=critics, critic_optimiser=optimiser_state), folded, metrics
 
 
@@ -110,9 +101,3 @@ def normalised_critic_loss(
     values = first.outputs[0][0], second.outputs[0][0]
     loss, metrics = squared_errors(values, jax.lax.stop_gradient(target))
     return loss, {**metrics, "moments": (first.moments, second.moments)}
-
-
-def fold_critics(critics: Critics, moments: tuple[Sequence[Moments], Sequence[Moments]]) -> Critics:
-    """Return both critics as plain MLPs into which the normalisation by these moments is folded."""
-    first, second = (fold(critic, its) for critic, its in zip(critics, moments, strict=True))
-    return first, second

@@ -53,8 +53,7 @@ LARGEST_INTEGER, LARGEST_FLOAT = 2**31 - 1, float(np.finfo(np.float32).max)
 def check_hyperparameters(algorithm: Any) -> None:
     """Make an algorithm's fields plain Python values: NumPy's scalars, lists, and whole numbers where floats belong.
 
-    Raises:
-        InputError: the first field outside its range or its choices, with its value and what it may be.
+    Raises InputError for the first field outside its range or its choices, with its value and what it may be.
     """
     hints = get_type_hints(type(algorithm), include_extras=True)
     for field in dataclasses.fields(algorithm):

@@ -184,12 +184,8 @@ def gradient_step(
 ) -> tuple[Any, Any, Metrics]:
     """Return (parameters, optimiser state, mean metrics) after one step down the mean of a loss over examples.
 
-    Args:
-        optimiser: makes a step of a gradient.
-        loss: `loss(parameters, *example) -> (scalar, metrics)`, of one example. Examples lie along the axis `BATCH`.
-        parameters: a tree of arrays.
-        optimiser_state: that of the optimiser for these parameters.
-        examples: trees whose leaves have a leading axis of examples.
+    `loss(parameters, *example) -> (scalar, metrics)` is of one example. The leaves of `examples` have a leading axis of
+    these, in the loss the axis `BATCH`.
     """
 
     def mean_loss(parameters: Any) -> tuple[Scalar, Metrics]:

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import optax
 
 from csac.algorithms.architecture import Architecture
-from csac.algorithms.critics import make_critic
 from csac.algorithms.exploration import Noise, noise_of
 from csac.algorithms.hyperparameters import (
     COUNT,
@@ -132,7 +131,8 @@ class OffPolicy(Architecture):
 
     def make_critic(self, key: Key, spec: Spec) -> Any:
         """Return a random critic, a map from [observation + action] to [1]: override it for another network."""
-        return make_critic(key, spec, self.critic_hidden_sizes, self.critic_hidden)
+        inputs = spec.observation_size + spec.action_size
+        return make_mlp(key, inputs, self.critic_hidden_sizes, 1, self.critic_hidden)
 
     def optimiser(self, learning_rate: float, planned: int = 1) -> optax.GradientTransformation:
         """Return the networks' Adam. The number of steps `planned` counts where it begins: its state keeps it."""

@@ -20,12 +20,7 @@ if TYPE_CHECKING:
 
 
 def run(name: str, words: list[str]) -> int:
-    """Run a sub-command and return its exit code.
-
-    Raises:
-        InputError, Failure: a user's mistake, or what ends the command.
-        KeyboardInterrupt: a signal, where nothing is to be saved.
-    """
+    """Run a sub-command and return its exit code. Raises InputError, Failure, and on a signal KeyboardInterrupt."""
     command = shlex.join(["csac", name, *words])
     try:
         if name == "study":
@@ -136,8 +131,7 @@ def _play(options: Play, _: str) -> int:
 
 
 def _export(options: Export, _: str) -> int:
-    from csac.console.exports import export_lines
-    from csac.console.tables import make_console, print_lines
+    from csac.console.tables import export_lines, make_console, print_lines
     from csac.evaluation.export import export_run
     from csac.record.sets import RunSet
 
@@ -163,8 +157,7 @@ def _unlearnt(runs: RunSet) -> list[str]:
 def _latency(options: Latency, _: str) -> int:
     if not options.artefacts:
         raise InputError("give the folder of an artefact (csac export writes one)")
-    from csac.console.exports import latency_table
-    from csac.console.tables import make_console, print_lines
+    from csac.console.tables import latency_table, make_console, print_lines
     from csac.deploy.artefact import open_artefact
     from csac.deploy.latency import measure
 

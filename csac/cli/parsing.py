@@ -51,9 +51,9 @@ def parse(
         raise InputError(f"{_one_line(complaint.getvalue(), command, elsewhere)} ({program} --help)") from None
 
 
-def value_of(words: list[str], option: str, default: Any = None) -> Any:
+def value_of(words: list[str], option: str) -> Any:
     """Return the value of an option that decides which other options there are."""
-    value = default
+    value = None
     for word, following in zip_longest(words, words[1:]):
         if word == option and following is not None:
             value = following

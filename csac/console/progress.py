@@ -17,6 +17,7 @@ from rich.text import Text
 from csac.console.tables import duration, make_console, program, result_tables
 from csac.console.waiting import SECONDS_OF_SILENCE, Speed
 from csac.record.rendering import number, short
+from csac.seeds import seeds_told
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -45,12 +46,7 @@ class _Seed:
 
 
 class Reporter:
-    """Shows the progress of a set of runs.
-
-    Args:
-        console: where to; by default a console on standard output that outlives its reader.
-        clock: seconds, for speed and time left.
-    """
+    """Shows the progress of a set of runs, by default on standard output; `clock` gives seconds."""
 
     def __init__(self, console: Console | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self.console = console or make_console()
@@ -69,7 +65,7 @@ class Reporter:
         self._shown = self._passed()
         self._began = self._spoke = self._clock()
         title = Text.assemble((f"{config.algorithm} on {config.task}", "bold"))
-        self._print(title.append(f", {_labels(runs.seeds)}, {config.steps:,} steps{' each' * (len(runs.runs) > 1)}"))
+        self._print(title.append(f", {seeds_told(runs.seeds)}, {config.steps:,} steps{' each' * (len(runs.runs) > 1)}"))
         for line in (str(runs.path), *notes):
             self._print(Text(line, "dim"))
         if self.console.is_interactive:
@@ -255,12 +251,6 @@ def _outcome(runs: RunSet, time_taken: str) -> str:
     if failed == seeds:
         return f"failed at step {steps} after {time_taken}"
     return f"finished {steps} steps in {time_taken}" + (f", but {failed} of {seeds} seeds failed" if failed else "")
-
-
-def _labels(seeds: Sequence[int]) -> str:
-    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
-        return f"seeds {seeds[0]} to {seeds[-1]}"
-    return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
 
 
 def _spread(returns: Mapping[int, float]) -> str:

@@ -28,10 +28,12 @@ if TYPE_CHECKING:
 
     from rich.console import ConsoleOptions
 
+    from csac.deploy.latency import Latency
     from csac.evaluation.evaluator import EvaluationEpisode
     from csac.record.sets import RunSet
 
 STATE_STYLES = {"running": "cyan", "finished": "green", "failed": "red", "interrupted": "yellow", "killed": "red"}
+PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 WIDTH_ELSEWHERE = 200  # characters where there is no terminal: lines stay whole for grep
 
 
@@ -78,12 +80,8 @@ class Fitted:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[rich.table.Table]:
         table = self.table
         shown = rich.table.Table(box=box.SIMPLE, pad_edge=False, title=table.title or None, caption=table.note or None)
-        shown.title_justify, shown.title_style, shown.caption_justify, shown.caption_style = (
-            "left",
-            "bold",
-            "left",
-            "dim",
-        )
+        shown.title_justify = shown.caption_justify = "left"
+        shown.title_style, shown.caption_style = "bold", "dim"
         for column, heading in enumerate(table.headings):
             shown.add_column(Text(heading), justify="right" if table.is_numeric(column) else "left", overflow="fold")
         previous = "plain"
@@ -163,6 +161,35 @@ def run_lines(sets: Sequence[RunSet]) -> list[Text]:
     return lines
 
 
+def export_lines(verification: Mapping[str, Any]) -> list[str]:
+    """Return the lines that say how an artefact compares with its policy."""
+    count, largest = verification["observations"], verification["largest_difference"]
+    lines = [f"{count:,} observations: actions differ by at most {largest:.1e} of their range"]
+    if returns := verification.get("returns"):
+        through, without = (_mean(some) for some in (returns, verification["returns_of_the_run"]))
+        lines.append(f"{returns['count']} episodes: mean return {through}; the run's policy {without}")
+    return lines
+
+
+def latency_table(measured: Mapping[str, Sequence[Latency]]) -> Fitted:
+    """Return the microseconds of single calls, a row for each artefact and way to call it."""
+    headings = ("μs for one action", "calls", *PERCENTILES, "late: p99", "late: max")
+    rows = []
+    for name, several in measured.items():
+        for latency in several:
+            way = "flat out" if latency.rate is None else f"at {latency.rate:g} Hz"
+            texts = [f"{len(latency.durations):,}", *latency_cells(latency)]
+            cells = (Cell(text, float(text.replace(",", ""))) if text else EMPTY for text in texts)
+            rows.append(Row((Cell(f"{name}, {way}"), *cells)))
+    return Fitted(Table(headings, tuple(rows), note="late: how long after its time a call began"))
+
+
+def latency_cells(latency: Latency) -> list[str]:
+    """Return the percentiles of the durations, and the two of the lateness, in microseconds."""
+    late = ["", ""] if latency.lateness is None else _microseconds(latency.lateness, [99.0, 100.0])
+    return _microseconds(latency.durations, [*PERCENTILES.values()]) + late
+
+
 def _last_return(runs: RunSet) -> str:
     try:
         returns = last_evaluations(runs.sound_evaluations, points=1)
@@ -179,6 +206,16 @@ def _rows(results: Mapping[int, Sequence[EvaluationEpisode]]) -> np.ndarray:
     for name in names:
         found[name] = [np.nan if row[name] is None else row[name] for row in rows]
     return found
+
+
+def _mean(returns: Mapping[str, Any]) -> str:
+    mean = returns["mean_return"]
+    return f"{number(mean)} ± {number(returns['standard_deviation'] or 0.0, mean)}"
+
+
+def _microseconds(nanoseconds: np.ndarray, percentiles: list[float]) -> list[str]:
+    values = np.percentile(nanoseconds, percentiles, method="higher") / 1e3
+    return [f"{value:.1f}" if value < 1000 else f"{value:,.0f}" for value in values]
 
 
 class _LenientFile:

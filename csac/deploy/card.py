@@ -13,12 +13,7 @@ CURVE = "curve.png"
 
 
 def model_card(fields: dict[str, Any], has_curve: bool) -> str:
-    """Return the card of an artefact: what it does, how well, how it was made, how to run it.
-
-    Args:
-        fields: what its contract.json holds.
-        has_curve: whether `curve.png` lies beside it.
-    """
+    """Return the card of an artefact with these fields in contract.json: what it does, how well, how it was made."""
     return render(
         "card.md.jinja",
         **fields,

@@ -8,8 +8,6 @@ from numbers import Integral
 from pathlib import Path
 from typing import get_args
 
-import numpy as np
-
 from csac.checks import check_path
 from csac.deploy.contract import CONTRACT, read_json
 from csac.deploy.policy import POLICY, Policy
@@ -81,7 +79,7 @@ def choose_run(runs: RunSet, seed: int | None = None) -> RunDirectory:
         raise InputError(f"every seed of {runs.path} failed (seed {failed} at {reason}): train again, or give a seed")
     if not sound:
         raise InputError(f"{runs.path} holds no policies: an evaluation writes them")
-    scores = last_evaluations(np.concatenate([run.evaluations[["seed", "step", "return"]] for run in sound]))
+    scores = last_evaluations(RunSet(runs.path, sound).evaluations)
     scores = {seed: score for seed, score in scores.items() if not math.isnan(score)}
     if len(sound) > 1 and not scores:
         seeds = ", ".join(map(str, runs.seeds))

@@ -64,13 +64,11 @@ class Guards:
 
 
 def make_guards(contract: Contract, fallback: str | None = None, rate_limit: float | None = None) -> Guards:
-    """Return the guards for what a user asks for.
+    """Return the guards for what a user asks for. Raises InputError.
 
-    Args:
-        contract: of the policy.
-        fallback: `zero`, `middle` of the bounds, `last` action, or numbers with commas between them, one per action.
-        rate_limit: how much an action may change in a step, as a share of its range. It needs a fallback, because NaN
-            cannot be limited: `last` by default.
+    The fallback is `zero`, `middle` of the bounds, `last` action, or numbers with commas between them, one per action.
+    The limit is how much an action may change in a step, as a share of its range. It needs a fallback, because NaN
+    cannot be limited: `last` by default.
     """
     low, high, half = contract.action_low, contract.action_high, contract.bounds.half
     change = None

@@ -12,6 +12,7 @@ import safetensors.numpy
 from csac.checks import check_flag, check_path
 from csac.deploy.contract import CONTRACT, Contract, check_checksum, read_json, write_with_checksum
 from csac.deploy.parameters import copied, from_tensors, to_tensors
+from csac.record.files import writing
 from csac.types import LAYER_NORM_EPSILON, InputError, Layer, Normaliser, PolicyNetwork
 
 if TYPE_CHECKING:
@@ -140,14 +141,12 @@ class Policy:
         """
         check_path("the folder of a policy", directory)
         folder = Path(directory)
-        try:
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             names = {path.name for path in folder.iterdir()}
             if names & OCCUPIED or any(name.startswith("seed-") for name in names):
                 raise InputError(f"{folder} holds a run or an artefact: choose another folder for the policy")
             self.write(folder / POLICY)
-        except OSError as error:
-            raise InputError(f"{folder} cannot be written: {error.strerror}") from error
 
     def write(self, path: Path) -> None:
         """Write the policy's file, and its contract with the file's checksum beside it. Raises OSError."""

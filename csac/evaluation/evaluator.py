@@ -12,7 +12,7 @@ from csac.checks import check_flag, check_whole
 from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy
 from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, Playing, start
-from csac.evaluation.pending import EvaluationStopped, Pending
+from csac.evaluation.pool import EvaluationStopped, Pending
 from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import constant_perturbations, values_at
@@ -23,7 +23,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from csac.evaluation.pending import Batch, OnProgress, Result
+    from csac.evaluation.pool import Batch, OnProgress, Result
     from csac.tasks.perturbations import Perturbation
     from csac.tasks.registry import Task
     from csac.tasks.spaces import Parts
@@ -36,21 +36,15 @@ _SEED_LIMIT = 2**32
 
 
 class Evaluator:
-    """Evaluates policies on a task, always on the same episodes: episode j is reset with `first_seed + j`.
+    """Evaluates policies on a task, always on the same `episodes`: episode j is reset with `first_seed + j`.
 
     Episodes run side by side in batches of one fixed shape, so that an episode's numbers depend neither on when the
     others end nor on how many there are. The environments are made at the first batch and kept, but for tasks whose
     resets do not forget what was before: they are made anew for each batch. `perturbed` is what `perturb` was
     last given.
 
-    Args:
-        task: as `Environment`'s.
-        environment_arguments: keyword arguments for the environment.
-        episodes: how many.
-        first_seed: what episode 0 is reset with.
-        events: what to keep of each episode's `info` (`csac.tasks.events`).
-        environments: how many to step side by side, ten at most; no number depends on it.
-        lent: the one to play in instead, which stays open.
+    So many `environments` are stepped side by side, ten at most, and no number depends on it; or the one that is `lent`
+    is, and stays open. `events` are what to keep of each episode's `info` (`csac.tasks.events`).
     """
 
     def __init__(
@@ -114,11 +108,8 @@ class Evaluator:
     ) -> list[EvaluationEpisode]:
         """Return the episodes of the batch that begins with number `first`, played side by side to their ends.
 
-        `should_stop` is asked before each step.
-
-        Raises:
-            InputError, EvaluationFailure: as `run`.
-            EvaluationStopped: `should_stop` said so.
+        Raises InputError and EvaluationFailure as `run`, EvaluationStopped where `should_stop`, asked before each step,
+        says so.
         """
         self._make_environments(self._at_once)
         check_contract(policy, self._environments[0])
@@ -157,11 +148,7 @@ class Evaluator:
         perturbed: dict[str, float],
         should_stop: Callable[[], bool] | None = None,
     ) -> Result:
-        """Return the episodes of a batch on the task perturbed so, or its failure.
-
-        Raises:
-            EvaluationStopped: as `run_batch`.
-        """
+        """Return the episodes of a batch on the task perturbed so, or its failure. Raises EvaluationStopped."""
         try:
             if perturbed != self.perturbed:
                 self.perturb(perturbed)
@@ -172,8 +159,7 @@ class Evaluator:
     def play(self, policy: Any, number: int, deterministic: bool) -> EvaluationEpisode:
         """Return an episode that a policy with Stable-Baselines3's `predict` plays, on the task's raw observations.
 
-        Raises:
-            InputError, EvaluationFailure: as `run`.
+        Raises InputError and EvaluationFailure as `run`.
         """
         self._make_environments(1)
         environment = self._environments[0]
@@ -222,11 +208,7 @@ def evaluate(
     environment_arguments: dict[str, Any] | None = None,
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> np.ndarray:
-    """Return the returns [episodes] of a policy: those of `evaluate_episodes`, which has the arguments too.
-
-    Raises:
-        InputError, EvaluationFailure: as `evaluate_episodes`.
-    """
+    """Return the returns [episodes] of a policy. `evaluate_episodes` explains the arguments and what is raised."""
     given = policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed
     return np.array([episode.episode_return for episode in _played(*given)])
 

@@ -18,13 +18,13 @@ from csac.deploy.guards import make_guards
 from csac.deploy.policy import POLICY
 from csac.deploy.verify import compare_actions
 from csac.evaluation.evaluator import check_contract, evaluate
-from csac.record.files import write_atomically
+from csac.record.files import write_atomically, writing
 from csac.record.run import RunDirectory, Which
 from csac.record.sets import RunSet
 from csac.record.statistics import FEWEST_FOR_INTERVAL, last_evaluations, mean_and_interval
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import unlike_training
-from csac.tasks.trust import refuse_untrusted
+from csac.tasks.trust import named_task
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -83,7 +83,8 @@ def export_run(
     facts: dict[str, Any] = {"provenance": provenance(runs, run, policy, which)}
     arguments = run.config.environment_arguments
     if episodes:
-        task = _task(run, task, trust_task)
+        instead = "export it with --episodes 0, or in Python with csac.evaluation.export.export_run and task="
+        task = task or named_task(run.config, run.path, trust_task, instead)
         with closing(Environment(task, arguments)) as environment:
             check_contract(policy, environment)
             facts["control_rate_hz"] = control_rate(environment.raw)
@@ -103,7 +104,7 @@ def export_run(
 @contextmanager
 def placed(place: Path) -> Iterator[Path]:
     """Yield a new folder that replaces `place` at the end, or is removed if something is raised."""
-    try:
+    with writing(place):
         _check_place(place)
         place = Path(os.path.realpath(place))  # a link stays one
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -114,8 +115,6 @@ def placed(place: Path) -> Iterator[Path]:
             if place.exists():
                 os.rename(place, Path(aside, "old"))
             os.rename(new, place)
-    except OSError as error:
-        raise InputError(f"cannot write to {place}: {error.strerror or error}; choose another place") from error
 
 
 def _check_place(place: Path) -> None:
@@ -219,18 +218,6 @@ def check_returns(before: np.ndarray, after: np.ndarray) -> None:
             f"in closed loop the artefact is not the policy of the run: its mean return is {after.mean():.6g}, the "
             f"policy's {before.mean():.6g}; nothing was written"
         )
-
-
-def _task(run: RunDirectory, task: Task | None, trust_task: bool) -> Task:
-    if task is not None:
-        return task
-    if run.config.task_is_callable:
-        raise InputError(
-            f"the task of {run.path} was made by a Python function, {run.config.task}: export it with --episodes 0, "
-            "or in Python with csac.evaluation.export.export_run and task="
-        )
-    refuse_untrusted(run.config.task, run.path, trust_task)
-    return run.config.task
 
 
 def control_rate(raw: Any) -> float | None:

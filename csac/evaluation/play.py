@@ -18,18 +18,20 @@ from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.sets import RunSet
 from csac.seeds import FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
+from csac.tasks.failures import message
 from csac.tasks.perturbations import constant_perturbations, unlike_training, values_at
 from csac.tasks.registry import adapter_of
-from csac.tasks.trust import refuse_untrusted
+from csac.tasks.trust import named_task
 from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from csac.evaluation.episode import EvaluationEpisode
-    from csac.evaluation.pending import OnProgress
+    from csac.evaluation.pool import OnProgress
     from csac.record.run import Which
-    from csac.tasks.perturbations import Perturbation
+    from csac.tasks.failures import message
+from csac.tasks.perturbations import Perturbation
 
 DEFAULT_FRAMES_PER_SECOND = 30
 SECONDS_ON_SCREEN = 1.0  # that an episode has at least: its last picture stays for as long as it takes
@@ -67,10 +69,8 @@ def evaluate_run(
     if not chosen:
         raise InputError(f"{runs.path} holds no {which} policies: an evaluation writes them")
     policies = {run.seed: load_run(run, which) for run in chosen}
-    environments = runs.config.evaluation_environments or 1
-    evaluator = Evaluator(
-        task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events, environments=environments
-    )
+    given = task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events
+    evaluator = Evaluator(*given, environments=runs.config.evaluation_environments or 1)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     with closing(Environment(task, arguments)) as environment:
         environment.perturb(evaluator.perturbed)
@@ -146,12 +146,7 @@ def perturbation_notes(
 def _open(directory: str | Path, trust_task: bool) -> RunSet:
     """Open a run whose task is to be made."""
     run = RunSet.open(directory)
-    if run.config.task_is_callable:
-        raise InputError(
-            f"the task of {directory} was made by a Python function, {run.config.task}: "
-            "evaluate it in Python, with csac.load and csac.evaluate"
-        )
-    refuse_untrusted(run.config.task, run.path, trust_task)
+    named_task(run.config, run.path, trust_task, "evaluate it in Python, with csac.load and csac.evaluate")
     return run
 
 
@@ -181,7 +176,7 @@ def _drawn_environment(run: RunSet, video: str | Path | None) -> Environment:
 
 
 def _cannot_be_drawn(task: str, error: Exception) -> InputError:
-    reason, hint = " ".join(str(error).split()), ""
+    reason, hint = message(error), ""
     if os.environ.get("MUJOCO_GL") == "egl" and "egl" in reason.lower():
         hint = "; to draw without a display, MuJoCo needs the system's EGL library (on Debian: apt install libegl1)"
     return InputError(f"{task} cannot be drawn: {reason}{hint}")

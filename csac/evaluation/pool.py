@@ -1,23 +1,130 @@
-"""Evaluation in several processes, with the numbers of one. The workers run NumPy and the task; JAX is not imported."""
+"""Evaluations that are begun and whose results are asked for later: in this process, or in several, with equal numbers.
+
+The processes run NumPy and the task; JAX is not imported.
+"""
 
 from __future__ import annotations
 
 import pickle
+from collections import deque
+from multiprocessing.connection import wait
 from typing import TYPE_CHECKING
 
-from csac.evaluation.pending import Pending
-from csac.processes import Child, cores_to_use, die_with_parent, end, outlive_termination
+from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure
+from csac.processes import Child, cores_to_use, end
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from multiprocessing.connection import Connection
 
     from csac.deploy.policy import Policy
     from csac.evaluation.evaluator import Evaluator
-    from csac.evaluation.pending import OnProgress
+
+    # A policy, the number of a batch's first episode, whether deterministic, how the task is perturbed.
+    Work = tuple[Policy, int, bool, dict[str, float]]
+    OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
 
 _BATCHES_THAT_PAY = 2  # for each process: it takes as long to start as a short batch takes
+_SECONDS_BETWEEN_STOPS = 1.0
+
+Batch = tuple[int, int]  # which policy, number of the first episode
+Result = list[EvaluationEpisode] | EvaluationFailure
+
+
+class EvaluationStopped(Exception):
+    """An evaluation ended early, since `should_stop` said so."""
+
+
+class Pending:
+    """An evaluation of several policies that was begun.
+
+    `workers` have a batch each, in order, and get the next whenever somebody waits here or asks whether it is over.
+    What a process that dies leaves undone runs in this process when the results are asked for: everything without
+    workers. `notes` are lines on what happened that changes no number.
+    """
+
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        policies: Sequence[Policy],
+        deterministic: bool,
+        on_progress: OnProgress | None,
+        workers: Sequence[Child] = (),
+    ) -> None:
+        self.notes: list[str] = []
+        self._evaluator, self._policies, self._deterministic = evaluator, policies, deterministic
+        self._perturbed, self._on_progress = dict(evaluator.perturbed), on_progress
+        self._answers: dict[Batch, Result] = {}
+        self._idle, self._waiting = list(workers), deque(evaluator.batches(len(policies)))
+        self._busy: dict[Child, Batch] = {}
+        self._hand_out()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the results need not be waited for. Does not wait."""
+        self._receive(0.0)
+        return not self._busy
+
+    def results(self, should_stop: Callable[[], bool] | None = None) -> list[Result]:
+        """Return each policy's episodes in order, or its first failure, which does not end the others. Waits.
+
+        Raises EvaluationStopped where `should_stop`, asked every second and before each step here, says so.
+        """
+        while self._busy:
+            if should_stop and should_stop():
+                raise EvaluationStopped
+            self._receive(_SECONDS_BETWEEN_STOPS if should_stop else None)
+        for batch in self._evaluator.batches(len(self._policies)):
+            if batch not in self._answers and not self._is_spared(batch):
+                self._take(batch, self._evaluator.answer(*self._work(batch), should_stop))
+        return [self._result(index) for index in range(len(self._policies))]
+
+    def _receive(self, seconds: float | None) -> None:
+        """Take the answers that come within so many seconds, or the next one, and hand out what waits."""
+        ready = wait([worker.connection for worker in self._busy], seconds) if self._busy else []
+        for worker in [worker for worker in self._busy if worker.connection in ready]:
+            batch = self._busy.pop(worker)
+            try:
+                answer = worker.connection.recv()
+            except (EOFError, OSError):
+                self.notes.append(f"evaluation: {worker.cause_of_death()}; its episodes are run by this one instead")
+                continue
+            self._take(batch, answer)
+            self._idle.append(worker)
+        self._hand_out()
+
+    def _hand_out(self) -> None:
+        while self._waiting and self._idle:
+            batch = self._waiting.popleft()
+            if not self._is_spared(batch):
+                worker = self._idle.pop()
+                worker.tell(self._work(batch))
+                self._busy[worker] = batch
+
+    def _take(self, batch: Batch, answer: Result) -> None:
+        self._answers[batch] = answer
+        if self._on_progress:
+            done = sum(len(given) for given in self._answers.values() if isinstance(given, list))
+            self._on_progress(done, len(self._policies) * self._evaluator.episodes)
+
+    def _work(self, batch: Batch) -> Work:
+        index, first = batch
+        return self._policies[index], first, self._deterministic, self._perturbed
+
+    def _is_spared(self, batch: Batch) -> bool:
+        """Whether an earlier batch of the same policy has failed."""
+        failed = (other for other, answer in self._answers.items() if isinstance(answer, EvaluationFailure))
+        return any(other[0] == batch[0] and other < batch for other in failed)
+
+    def _result(self, index: int) -> Result:
+        episodes = []
+        for batch in sorted(batch for batch in self._answers if batch[0] == index):
+            answer = self._answers[batch]
+            if isinstance(answer, EvaluationFailure):
+                return answer
+            episodes += answer
+        return episodes
 
 
 def choose_processes(evaluator: Evaluator, policies: int) -> int:
@@ -29,11 +136,8 @@ class EvaluationPool:
     """Does what `Evaluator` does, batch by batch in processes of their own; the numbers are the same to the last bit.
 
     A batch is what one evaluator steps at a time, so that nothing depends on which process takes it. The processes
-    start at the first evaluation, or at `start`, and wait for the next until `close`.
-
-    Args:
-        evaluator: what each process works with, perturbed as it is when an evaluation begins.
-        processes: how many, at least one.
+    start at the first evaluation, or at `start`, and wait for the next until `close`. Each works with the evaluator,
+    perturbed as it is when an evaluation begins.
     """
 
     def __init__(self, evaluator: Evaluator, processes: int) -> None:
@@ -76,13 +180,11 @@ class EvaluationPool:
             self._workers.remove(worker)
         while len(self._workers) < processes:
             self._evaluator.close()  # no process is sent open environments
-            self._workers.append(Child(_work, self._evaluator, daemon=False))
+            self._workers.append(Child(_work, self._evaluator))
 
 
 def _work(connection: Connection, evaluator: Evaluator) -> None:
     """Run the batches that are asked for, until there are no more or the parent is gone."""
-    die_with_parent()
-    outlive_termination()
     try:
         while work := connection.recv():
             connection.send(evaluator.answer(*work))

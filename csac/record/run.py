@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from csac.checks import check_path
 from csac.record import manifest as manifests
-from csac.record.files import write_atomically
-from csac.record.locks import is_locked, kept_from_children, take
+from csac.record.files import is_locked, kept_from_children, take, write_atomically, writing
 from csac.record.tables import COLUMNS, append_rows, continues, read_rows, structured
 from csac.types import Failure, InputError
 
@@ -42,11 +41,14 @@ class StorageFailure(Failure):
 
 
 class RunDirectory:
-    """One run on disk: one seed."""
+    """One run on disk: one seed.
+
+    `checkpoints`, `tensorboard` and `policies`, which has their contract too, are its folders.
+    """
 
     def __init__(self, path: Path, manifest: Manifest) -> None:
-        self.path = path
-        self.manifest = manifest
+        self.path, self.manifest = path, manifest
+        self.checkpoints, self.tensorboard, self.policies = path / "checkpoint", path / "tensorboard", path / "policy"
 
     def __repr__(self) -> str:
         return f"RunDirectory({str(self.path)!r})"
@@ -58,19 +60,12 @@ class RunDirectory:
     def create(cls, path: str | Path, manifest: Manifest) -> RunDirectory:
         """Start a run in a new or empty directory. Raises InputError where it is none, or cannot be written."""
         path = Path(os.path.abspath(path))
-        if is_run(path):
-            raise InputError(f"{path} already holds a run; resume it, or choose another directory")
-        if path.exists() and not path.is_dir():
-            raise InputError(f"{path} is a file; choose another directory")
-        if path.exists() and any(not entry.name.startswith(".") for entry in path.iterdir()):
-            raise InputError(f"{path} is not empty and holds no run; choose a new or an empty directory")
         content = manifests.written(dataclasses.replace(manifest, created=manifest.created or now()))
-        try:
+        with writing(path):
             path.mkdir(parents=True, exist_ok=True)
+            if any(not entry.name.startswith(".") for entry in path.iterdir()):
+                raise InputError(f"{path} is not empty; choose a new or an empty directory")
             write_atomically(path / MANIFEST, content)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise InputError(f"cannot write to {path}: {reason}; choose another directory") from None
         return cls(path, manifests.read(content))
 
     def rename(self, path: Path) -> None:
@@ -128,21 +123,6 @@ class RunDirectory:
         if state != "running" or is_locked(self.path / LOCK):
             return state
         return "waiting" if self.manifest.process is None else "killed"
-
-    @property
-    def checkpoints(self) -> Path:
-        """The folder of its checkpoints."""
-        return self.path / "checkpoint"
-
-    @property
-    def tensorboard(self) -> Path:
-        """The folder of its TensorBoard files."""
-        return self.path / "tensorboard"
-
-    @property
-    def policies(self) -> Path:
-        """The folder of its policies and their contract."""
-        return self.path / "policy"
 
     def policy_file(self, which: Which = "last") -> Path:
         """Return the file of the last or the best policy."""

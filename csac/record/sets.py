@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.lib.recfunctions import repack_fields
 
 from csac.checks import check_path
 from csac.record.run import MANIFEST, RunDirectory, is_run
-from csac.record.tables import COLUMNS, structured
+from csac.record.tables import joined
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -24,10 +23,11 @@ if TYPE_CHECKING:
 
 
 class RunSet:
-    """The runs in one folder, `seed-<k>` each, or one run alone."""
+    """The runs in one folder, `seed-<k>` each, or one run alone; `curve` is the picture of their evaluations."""
 
     def __init__(self, path: Path, runs: Sequence[RunDirectory]) -> None:
-        self.path, self.runs = path, list(runs)
+        self.path, self.runs, self.seeds = path, list(runs), [run.seed for run in runs]
+        self.curve = path / "curve.png"
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.path)!r}, seeds {self.seeds})"
@@ -47,11 +47,6 @@ class RunSet:
         if not runs:
             RunDirectory.open(path)  # which says what is there instead
         return cls(path, runs)
-
-    @property
-    def seeds(self) -> list[int]:
-        """The seeds, in order."""
-        return [run.seed for run in self.runs]
 
     @property
     def config(self) -> RunConfig:
@@ -75,11 +70,6 @@ class RunSet:
         steps = [run.manifest.steps_done for run in self.runs if run.manifest.state != "failed"]
         return min(steps or [run.manifest.steps_done for run in self.runs])
 
-    @property
-    def curve(self) -> Path:
-        """The picture of the evaluations."""
-        return self.path / "curve.png"
-
     def run(self, seed: int) -> RunDirectory:
         """Return the run of one seed. Raises InputError where there is none."""
         for run in self.runs:
@@ -89,11 +79,7 @@ class RunSet:
 
     def rows(self, name: Table) -> np.ndarray:
         """Return the rows of a table of all runs, seed by seed, with the columns that all of them have."""
-        tables = [rows for run in self.runs if len(rows := run.rows(name))]
-        if not tables:
-            return structured(COLUMNS[name], [])
-        common = [item for item in tables[0].dtype.names or () if all(item in (t.dtype.names or ()) for t in tables)]
-        return np.concatenate([repack_fields(table[common]) for table in tables])
+        return joined(name, (run.rows(name) for run in self.runs))
 
     @property
     def evaluations(self) -> np.ndarray:

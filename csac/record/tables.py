@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 
-from csac.record.files import name_aside, write_atomically
+from csac.record.files import name_aside, write_atomically, writing
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
 COLUMNS: dict[str, tuple[str, ...]] = {
     "evaluations": ("seed", "step", "episode", "return", "length", "success"),
@@ -91,10 +92,9 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
     """Write a table as `append_rows` does; the file gets its name once it is whole. Raises InputError."""
     aside = name_aside(path)
     try:
-        append_rows(aside, columns, rows)
-        aside.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}; choose another place") from error
+        with writing(path):
+            append_rows(aside, columns, rows)
+            aside.replace(path)
     finally:
         with suppress(OSError):  # what was raised is told
             aside.unlink()
@@ -122,6 +122,15 @@ def read_rows(path: str | Path) -> np.ndarray:
         return structured(header, body)
     except (OSError, csv.Error, ValueError, OverflowError) as error:
         raise InputError(f"{path} is no table of a run ({_short(error)}): restore it") from None
+
+
+def joined(name: str, tables: Iterable[np.ndarray]) -> np.ndarray:
+    """Return the rows of several tables of this name, with the columns that are in each that has rows."""
+    tables = [table for table in tables if len(table)]
+    if not tables:
+        return structured(COLUMNS[name], [])
+    common = [item for item in tables[0].dtype.names or () if all(item in (t.dtype.names or ()) for t in tables)]
+    return np.concatenate([repack_fields(table[common]) for table in tables])
 
 
 def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarray:

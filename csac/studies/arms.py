@@ -14,7 +14,6 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.lib.recfunctions import repack_fields
 
 from csac.algorithms import ALGORITHMS
 from csac.presets import PRESETS, hyperparameters
@@ -22,7 +21,7 @@ from csac.record.config import RunConfig
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, find_sets
 from csac.record.statistics import evaluation_matrix, maximum_average_return
-from csac.record.tables import COLUMNS, structured
+from csac.record.tables import joined
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.tasks.registry import events_of
 from csac.types import InputError
@@ -73,7 +72,7 @@ class Arm:
     @functools.cached_property
     def rows(self) -> np.ndarray:
         """The rows of evaluations.csv of the seeds that neither failed nor are incomplete."""
-        return _joined([rows for seed, rows in self._sound.items() if seed not in self.incomplete])
+        return joined("evaluations", (rows for seed, rows in self._sound.items() if seed not in self.incomplete))
 
     @property
     def marks(self) -> list[tuple[int, str]]:
@@ -130,7 +129,8 @@ def read_arms(
                 continue
             seen.add(run.path)
             config = run.config
-            key: tuple[Any, ...] = label or _alike(config), config.task, config.perturbations
+            alike = json.dumps([config.algorithm, settings(config)], sort_keys=True)
+            key: tuple[Any, ...] = label or alike, config.task, config.perturbations
             if key in groups and run.seed in [other.seed for other in groups[key].runs]:
                 if label:
                     raise InputError(f"{label}: {run.path} is a second run of seed {run.seed}; label them apart")
@@ -271,15 +271,3 @@ def by_place(arms: Iterable[Arm]) -> dict[str, list[Arm]]:
     for arm in arms:
         groups.setdefault(arm.place, []).append(arm)
     return groups
-
-
-def _alike(config: RunConfig) -> str:
-    return json.dumps([config.algorithm, settings(config)], sort_keys=True)
-
-
-def _joined(tables: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the rows of all tables, with the columns that each of them has."""
-    if not tables:
-        return structured(COLUMNS["evaluations"], [])
-    names = [name for name in tables[0].dtype.names or () if all(name in (t.dtype.names or ()) for t in tables)]
-    return np.concatenate([repack_fields(table[names]) for table in tables])

@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from csac.record.locks import is_locked
+from csac.record.files import is_locked
 from csac.record.run import LOCK, StorageFailure
 from csac.training.signals import stop_requested
 from csac.training.supervisor import record_failure
@@ -43,9 +43,8 @@ class Cluster:
     ) -> None:
         """Run each program as a task. A task whose node is lost goes on elsewhere, from the newest checkpoint.
 
-        Raises:
-            InputError: Ray is not installed, there is no cluster, or a run cannot begin.
-            StorageFailure: a run directory can no longer be written.
+        Raises InputError where Ray is not installed, there is no cluster, or a run cannot begin, and StorageFailure
+        where a run directory can no longer be written.
         """
         ray = self._connect()
         try:

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from csac.console.tables import duration
 from csac.record import rendering, report_tables
-from csac.record.files import write_atomically
+from csac.record.files import write_atomically, writing
 from csac.record.plots import encoded, figure_of, looks_of
 from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric
 from csac.record.statistics import drawdown, evaluation_matrix, is_case, last_evaluations
@@ -72,12 +72,10 @@ def write(path: Path, title: str, parts: Sequence[Part]) -> None:
     """Write a report as `path`, an .html or an .md file. Raises InputError where it is another or cannot be written."""
     if path.suffix not in (".html", ".md"):
         raise InputError(f"a report is an .html or an .md file: name it {path.with_suffix('.html')}")
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         content = _html(title, parts) if path.suffix == ".html" else _markdown(path, title, parts)
         write_atomically(path, content.encode())
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}") from None
 
 
 def _html(title: str, parts: Sequence[Part]) -> str:

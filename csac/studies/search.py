@@ -127,10 +127,6 @@ class Search:
         if not self.config.evaluation_interval:
             raise InputError("a search goes by evaluations: evaluation_interval cannot be 0")
 
-    def algorithm_with(self, values: Mapping[str, Any]) -> Any:
-        """Return what a trial trains. Raises InputError for values that do not go with what is given."""
-        return dataclasses.replace(self.algorithm, **values)  # pyright: ignore[reportArgumentType]
-
     def told(self) -> dict[str, Any]:
         """Return it as JSON has it."""
         searched = {name: f"searched, {' '.join(map(str, dimension))}" for name, dimension in self.space.items()}

@@ -5,6 +5,7 @@ Any number of processes may share a directory: the study is a journal in it, and
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shutil
 import sys
@@ -18,7 +19,7 @@ import numpy as np
 from csac.checks import check_whole
 from csac.console.tables import Fitted
 from csac.record.config import differences
-from csac.record.locks import is_locked, kept_from_children, take
+from csac.record.files import is_locked, kept_from_children, take, writing
 from csac.record.rendering import Cell, Row, Table, number
 from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
@@ -54,9 +55,8 @@ class Trial(NamedTuple):
 def tune(search: Search, directory: Path, trials: int, command: str | None, console: Console) -> int:
     """Run trials until the directory has so many, show the best, and return the exit code.
 
-    Raises:
-        InputError: Optuna is missing, the task cannot be made, or the directory holds another search.
-        StorageFailure: the directory can no longer be written.
+    Raises InputError where Optuna is missing, the task cannot be made, or the directory holds another search, and
+    StorageFailure where it can no longer be written.
     """
     check_whole("trials", trials, 1, 100_000)
     directory = directory.absolute()
@@ -84,10 +84,8 @@ def _open(search: Search, directory: Path) -> optuna.Study:
     journal = directory / "journal.log"
     if directory.exists() and not journal.exists() and any(directory.iterdir()):
         raise InputError(f"{directory} is not empty and holds no search: choose another --directory")
-    try:
+    with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {directory}: {error.strerror}; choose another directory") from None
     backend = JournalFileBackend(str(journal), JournalFileOpenLock(str(journal)))
     unpruned = max(search.algorithm.cadence.first_update, round(SHARE_UNPRUNED * search.config.steps))
     with _alone(directory):
@@ -187,7 +185,7 @@ def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None,
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of seeds that fail: told below
             runs = train(
-                search.algorithm_with(trial.values),
+                dataclasses.replace(search.algorithm, **trial.values),  # pyright: ignore[reportArgumentType]
                 search.config.task,
                 seeds=search.seeds,
                 first_seed=search.config.seed,

@@ -27,10 +27,8 @@ _log = logging.getLogger(__name__)
 class Environment:
     """One Gymnasium environment with flat float32 observations and actions in [-1, 1].
 
-    Args:
-        task: a Gymnasium id, `module:Id` (the module is imported first), or a callable that makes an environment.
-        environment_arguments: keyword arguments for the environment.
-        render_mode: Gymnasium's; None where nothing is drawn.
+    A task is a Gymnasium id, `module:Id` (the module is imported first), or a callable that makes an environment. What
+    an environment raises, be it a panic of native code, is an EnvironmentFailure.
     """
 
     def __init__(
@@ -75,9 +73,7 @@ class Environment:
     def reset(self, seed: int) -> np.ndarray:
         """Start an episode and return its first observation, float32 [observation].
 
-        Raises:
-            EnvironmentFailure: the environment raised, gave no pair of observation and info, or an observation that is
-                not finite or misshapen, or took back the physics that `perturb` gave it.
+        Raises EnvironmentFailure also where that is not finite or misshapen, or the physics of `perturb` is taken back.
         """
         self._seed = seed
         if self._noise:
@@ -95,20 +91,14 @@ class Environment:
             raise EnvironmentFailure(f"{error} after reset") from error.__cause__
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply an action in [-1, 1], [action]: observation [observation], reward, terminated, truncated, info.
-
-        Raises:
-            EnvironmentFailure: as `step_environment_scale`.
-        """
+        """Apply an action in [-1, 1], [action]: observation [observation], reward, terminated, truncated, info."""
         return self.step_environment_scale(self.bounds.scale(action).reshape(self._action_shape))
 
     def step_environment_scale(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply an action of the environment's own shape and scale; returns the same as `step`.
 
-        `info` is a copy: PyFlyt gives the same dict at every step of an episode.
-
-        Raises:
-            EnvironmentFailure: the environment raised, or action, observation or reward is not finite or misshapen.
+        `info` is a copy: PyFlyt gives the same dict at every step of an episode. Raises EnvironmentFailure also where
+        action, observation or reward is not finite or misshapen.
         """
         action = part(action, self._action_shape, "action")
         if self._noise:
@@ -126,9 +116,6 @@ class Environment:
 
         And whether that terminates an episode, [n] bool, where the task has `compute_terminated`; else None. Both are
         asked for one pair at a time, with an empty info: not every task takes several.
-
-        Raises:
-            EnvironmentFailure: the environment raised, or a reward is not finite.
         """
         shape = dict(self._parts)["achieved_goal"]
         pairs = [(a.reshape(shape), d.reshape(shape)) for a, d in zip(achieved, desired, strict=True)]
@@ -145,8 +132,7 @@ class Environment:
     def snapshot(self) -> Snapshot | None:
         """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell.
 
-        Raises:
-            EnvironmentFailure: its `get_snapshot` raised, or gave what cannot be saved.
+        Raises EnvironmentFailure also for what cannot be saved.
         """
         try:
             saved = snapshots.snapshot(self.raw)
@@ -159,11 +145,7 @@ class Environment:
         return saved
 
     def restore(self, seed: int, saved: Snapshot) -> None:
-        """Go on where `saved` was taken, in an episode that was reset with `seed`.
-
-        Raises:
-            EnvironmentFailure: the environment does not take it.
-        """
+        """Go on where `saved` was taken, in an episode that was reset with `seed`."""
         self.reset(seed)
         try:
             snapshots.restore(self.raw, saved)

@@ -11,9 +11,7 @@ import numpy as np
 class EpisodeEvents:
     """The events of one episode: a number of its last step's `info`, or of all, as `NAME:sum` or `NAME:mean`.
 
-    Args:
-        names: those of the events.
-        sums: the sums so far, of an episode that goes on.
+    An episode that goes on has its `sums` so far.
     """
 
     def __init__(self, names: Sequence[str], sums: Mapping[str, float] | None = None) -> None:

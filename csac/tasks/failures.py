@@ -24,8 +24,7 @@ class EnvironmentFailure(Failure):
 def failure_of(call: str, error: BaseException) -> EnvironmentFailure:
     """Return the failure of an environment whose `call` raised, be it a panic of native code or `sys.exit`.
 
-    Raises:
-        KeyboardInterrupt, GeneratorExit: the error, if it is one of these.
+    Raises the error itself if it is a KeyboardInterrupt or GeneratorExit.
     """
     raise_interrupt(error)
     return EnvironmentFailure(f"{call} raised {raised(error)}")

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csac.checks import check_whole
+from csac.record.config import STEPS_LIMIT
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -40,7 +41,6 @@ KINDS = (*PHYSICS, *NOISES)
 
 _EXAMPLE = "friction=1.5@300000"
 _WRITTEN = re.compile(r"(?P<kind>[^=@]+?)\s*=(?P<value>[^=@]+)(?:@(?P<step>[^=@]+))?")
-_LAST_STEP = 2**31 - 1  # learners count their steps in 32 bits
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Perturbation:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise InputError(f"no perturbation is called {self.kind!r}: there are {', '.join(KINDS)}")
-        check_whole(f"the step of {self.kind}", self.step, 0, _LAST_STEP)
+        check_whole(f"the step of {self.kind}", self.step, 0, STEPS_LIMIT)
         object.__setattr__(self, "value", _checked(self.kind, self.value))
         object.__setattr__(self, "step", int(self.step))
 

@@ -9,12 +9,11 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from csac.deploy.contract import FLOAT32_MAX
 from csac.tasks.failures import EnvironmentFailure, one_line, raised
 from csac.types import InputError
 
 Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
-
-FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
 class ContractParts(NamedTuple):

@@ -14,9 +14,13 @@ import sys
 from contextlib import suppress
 from importlib.machinery import PathFinder
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from csac.checks import check_flag
 from csac.types import InputError
+
+if TYPE_CHECKING:
+    from csac.record.config import RunConfig
 
 
 def module_of(task: object) -> str:
@@ -58,6 +62,14 @@ def refuse_untrusted(task: object, run: str | Path, trust_task: bool = False) ->
         f"{run} wants to run the code of the module {module} in {place}, which you have not named before: "
         "look at it, and if you trust it, add --trust-task (in Python: trust_task=True)"
     )
+
+
+def named_task(config: RunConfig, run: str | Path, trust_task: bool, instead: str) -> str:
+    """Return the task of a run, which may be made here. Raises InputError, with what to do `instead`, where not."""
+    if config.task_is_callable:
+        raise InputError(f"the task of {run} was made by a Python function, {config.task}: {instead}")
+    refuse_untrusted(config.task, run, trust_task)
+    return config.task
 
 
 def _note(module: str, place: str) -> Path:

@@ -58,14 +58,8 @@ class SeedEnvironments:
     """The environments of each seed, reset by themselves where an episode ends, each episode with its own derived seed.
 
     A seed fails alone: where one of its environments raises or gives what is not finite, it is reported once and never
-    stepped again. `alive` [seed] says which seeds still step; it turns false with the report.
-
-    Args:
-        task, environment_arguments: as of `Environment`.
-        seeds: the seeds.
-        environments: how many each seed has.
-        processes: how many share the environments; 0 steps them here. What they compute is the same.
-        events: what to keep of an episode's `info`.
+    stepped again. `alive` [seed] says which seeds still step; it turns false with the report. So many `processes` share
+    the environments; 0 steps them here. What they compute is the same.
     """
 
     def __init__(
@@ -98,7 +92,7 @@ class SeedEnvironments:
         self.alive = np.ones(len(seeds), bool)
         self._running = self._places
         self._action_axes = *axes, *first.contract_parts.action_shape
-        self._observation = np.zeros((*axes, self.spec.observation_size), np.float32)
+        self.observations = np.zeros((*axes, self.spec.observation_size), np.float32)  # what to act on next
         self._reward = np.zeros(axes, np.float32)
         self._begun = dict.fromkeys(self._places, 0)
         self._returns = dict.fromkeys(self._places, 0.0)
@@ -113,9 +107,9 @@ class SeedEnvironments:
 
         A seed that fails here is reported by the next `step`.
         """
-        self._observation = self._observation.copy()
+        self.observations = self.observations.copy()
         self._reset(self._running)
-        return self._observation
+        return self.observations
 
     def perturb(self, values: Mapping[str, float]) -> None:
         """Change every seed's task, as `Environment.perturb`."""
@@ -128,7 +122,7 @@ class SeedEnvironments:
     def step(self, actions: np.ndarray) -> Steps:
         """Step every environment of the seeds that are alive with its action in [-1, 1], [seed, action]."""
         scaled = self._bounds.scale(actions).reshape(self._action_axes)
-        next_observation, reward = self._observation.copy(), self._reward.copy()
+        next_observation, reward = self.observations.copy(), self._reward.copy()
         terminated, truncated = np.zeros(reward.shape, bool), np.zeros(reward.shape, bool)
         ended: list[Place] = []
         episodes: list[FinishedEpisode] = []
@@ -150,12 +144,12 @@ class SeedEnvironments:
                 said = self._said[place].of(info, self._lengths[place])
                 episodes.append(FinishedEpisode(place[0], self._returns[place], self._lengths[place], said))
                 ended.append(place)
-        self._observation, self._reward = next_observation.copy(), reward
+        self.observations, self._reward = next_observation.copy(), reward
         self._reset([place for place in ended if place in self._running])
         failures, self._failures = self._failures, []
         for failure in failures:
             self.alive[failure.seed_index] = False
-        return Steps(next_observation, reward, terminated, truncated, self._observation, episodes, failures)
+        return Steps(next_observation, reward, terminated, truncated, self.observations, episodes, failures)
 
     def relabel(
         self, place: Place, achieved: np.ndarray, desired: np.ndarray
@@ -192,7 +186,7 @@ class SeedEnvironments:
             inner = self._at[place].snapshot() if self.alive[place[0]] else None
         except EnvironmentFailure as error:
             problem = str(error)
-        arrays = {"observation": self._observation[place].copy(), **(inner.arrays if inner else {})}
+        arrays = {"observation": self.observations[place].copy(), **(inner.arrays if inner else {})}
         values = {
             "alive": bool(self.alive[place[0]]),
             "reward": float(self._reward[place]),
@@ -231,8 +225,8 @@ class SeedEnvironments:
     def _restore(self, place: Place, saved: Snapshot, is_exact: bool) -> bool:
         arrays, values = dict(saved.arrays), saved.values
         self._begun[place] = values["episodes_begun"]
-        self._observation, self._reward = self._observation.copy(), self._reward.copy()
-        self._observation[place], self._reward[place] = arrays.pop("observation"), values["reward"]
+        self.observations, self._reward = self.observations.copy(), self._reward.copy()
+        self.observations[place], self._reward[place] = arrays.pop("observation"), values["reward"]
         if not values["alive"]:
             self.stop(place[0])
         elif is_exact and self._is_restored(place, Snapshot(arrays, values["environment"])):
@@ -259,11 +253,6 @@ class SeedEnvironments:
         """Whether a seed still steps, or its failure is yet to be reported."""
         return bool(self._running or self._failures)
 
-    @property
-    def observations(self) -> np.ndarray:
-        """What to act on next: [seed, observation]."""
-        return self._observation
-
     def close(self) -> None:
         """Close every environment."""
         for environment in self.environments:
@@ -285,7 +274,7 @@ class SeedEnvironments:
                 self._at[place].ask("reset", seed)
         for place, seed in zip(places, seeds, strict=True):
             try:
-                self._observation[place] = self._at[place].reset(seed)
+                self.observations[place] = self._at[place].reset(seed)
             except EnvironmentFailure as error:
                 self._fail(place, error)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from csac.processes import Child, die_with_parent, end, outlive_termination
+from csac.processes import Child, end
 from csac.tasks.environment import Environment
 from csac.tasks.events import info_name, numbers_in
 from csac.tasks.failures import EnvironmentFailure
@@ -43,7 +43,7 @@ class Workers:
         try:
             for index, number in enumerate(numbers):
                 work = _serve, task, environment_arguments, number, seed + index, events
-                self._workers.append(Worker(*work, daemon=False))
+                self._workers.append(Worker(*work))
             facts = [worker.answer() for worker in self._workers]
         except BaseException:
             self.close()
@@ -116,8 +116,6 @@ def _serve(
     events: Sequence[str],
 ) -> None:
     """Do what environments are asked, until there is no more or the parent is gone."""
-    die_with_parent()
-    outlive_termination()
     seed_globals(seed)
     environments: list[Environment] = []
     names = {info_name(event) for event in events}

@@ -77,14 +77,9 @@ def _is_whole(program: bytes) -> bool:
 
 
 def _is_users_choice() -> bool:
-    is_enabled, folder = _jax_settings()
-    return not is_enabled or (folder is not None and Path(folder).parent != _home())
-
-
-def _jax_settings() -> tuple[bool, str | None]:
-    """Return whether JAX keeps what it compiles, and where; its settings are no attributes that a type checker sees."""
     config: Any = jax.config
-    return config.jax_enable_compilation_cache, config.jax_compilation_cache_dir
+    folder = config.jax_compilation_cache_dir
+    return not config.jax_enable_compilation_cache or (folder is not None and Path(folder).parent != _home())
 
 
 def _home() -> Path:

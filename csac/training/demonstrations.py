@@ -14,6 +14,7 @@ import safetensors.numpy
 from csac.algorithms.memory import pack
 from csac.deploy.contract import Contract
 from csac.record.files import write_atomically
+from csac.tasks.failures import message
 from csac.training.checkpoint import REPLAY, Facts, facts_of
 from csac.types import InputError, Transition
 
@@ -119,7 +120,7 @@ def _of_minari(name: str, contract: Contract) -> dict[str, Any]:
         arrays["observations"] = np.concatenate([one[:-1] for one in seen])
         arrays["next_observations"] = np.concatenate([one[1:] for one in seen])
     except Exception as error:
-        raise InputError(f"demonstrations: Minari cannot give {name!r}: {' '.join(str(error).split())}") from None
+        raise InputError(f"demonstrations: Minari cannot give {name!r}: {message(error)}") from None
     return arrays
 
 
@@ -141,7 +142,7 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
                     raise TypeError(f"{value.dtype} is no type of numbers")
                 flat = value.astype(np.float32)
         except (InputError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"demonstrations: {name}: {' '.join(str(error).split())}") from None
+            raise InputError(f"demonstrations: {name}: {message(error)}") from None
         if flat.shape[:1] != (number,) or flat.size != number * size:
             wanted = (number, size)[: 1 + (size > 1 or flat.ndim > 1)]
             raise InputError(f"demonstrations: {name} has shape {flat.shape}, not {wanted}")

@@ -11,8 +11,7 @@ import numpy as np
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
-from csac.evaluation.pending import EvaluationStopped
-from csac.evaluation.pool import EvaluationPool
+from csac.evaluation.pool import EvaluationPool, EvaluationStopped
 from csac.tasks.perturbations import perturbations_of, values_at
 from csac.training.callbacks import mean_return
 
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from csac.record.recorder import Recorder
     from csac.record.run import RunDirectory
     from csac.tasks.vector import SeedEnvironments
-    from csac.training.notifier import Notifier
+    from csac.training.callbacks import Notifier
     from csac.training.program import Program
     from csac.training.watch import Watcher
     from csac.types import PolicyNetwork
@@ -106,18 +105,20 @@ class Evaluations:
             answers = pending.results(self._is_late)
         except EvaluationStopped:
             self.broken_off, self.wants_stop = step, True
-            self._note(self.runs[0], f"the evaluation at step {step:,} is broken off, as a stop was asked for")
+            self.watcher.note_of(
+                self.runs[0], f"the evaluation at step {step:,} is broken off, as a stop was asked for"
+            )
             return
         results: dict[int, tuple[Policy, list[EvaluationEpisode]]] = {}
         for index, policy, result in zip(indices, policies, answers, strict=True):
             run = self.runs[index]
             if isinstance(result, EvaluationFailure):
-                self._note(run, f"warning: seed {run.seed}: the evaluation at step {step:,} failed: {result}")
+                self.watcher.note_of(run, f"warning: seed {run.seed}: the evaluation at step {step:,} failed: {result}")
                 continue
             self._record(index, step, policy, result)
             results[index] = policy, result
         for text in pending.notes:
-            self._note(self.runs[0], text)
+            self.watcher.note_of(self.runs[0], text)
         if results:
             self._warn_of_missing_events([episode for _, episodes in results.values() for episode in episodes])
             means = {self.runs[index].seed: mean_return(episodes) for index, (_, episodes) in results.items()}
@@ -145,18 +146,14 @@ class Evaluations:
         run.log(f"step {step}: mean return {mean:.1f}")
         run.update_manifest(steps_done=max(step, run.manifest.steps_done))
         if any(episode.length >= LONGEST_EPISODE for episode in episodes):
-            self._note(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
+            self.watcher.note_of(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
 
     def _warn_of_missing_events(self, episodes: Sequence[EvaluationEpisode]) -> None:
         """Say which events no episode of the first evaluation has held."""
         for name in self._missing_events:
             if all(episode.events[name] is None for episode in episodes):
-                self._note(self.runs[0], f"note: no episode's last info holds a number called {name!r}")
+                self.watcher.note_of(self.runs[0], f"note: no episode's last info holds a number called {name!r}")
         self._missing_events = []
-
-    def _note(self, run: RunDirectory, text: str) -> None:
-        run.log(text)
-        self.watcher.note(text)
 
 
 def is_finite(network: PolicyNetwork) -> bool:

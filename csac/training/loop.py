@@ -15,12 +15,12 @@ from csac.record.run import MANIFEST, TABLES
 from csac.tasks.perturbations import by_step, perturbations_of, values_at
 from csac.tasks.vector import SeedEnvironments
 from csac.tasks.workers import choose_processes
+from csac.training.callbacks import Notifier
 from csac.training.checkpoint import Writer
 from csac.training.demonstrations import files_of, rows_of
 from csac.training.evaluations import Evaluations, is_finite
 from csac.training.hindsight import Hindsight
 from csac.training.learner import Learner
-from csac.training.notifier import Notifier
 from csac.training.resume import ResumePoint, record_inexact
 from csac.types import Snapshot
 
@@ -121,7 +121,7 @@ class Loop:
             restarts = bool(saved.values["environment"]["alive"]) and not saved.values["environment"]["exact"]
             if restarts and not run.manifest.restarts_episode:
                 problem = saved.values["environment"]["problem"] or "its environment cannot be saved"
-                self._note(run, f"seed {run.seed}: {problem}: a resume restarts the episode in progress")
+                self.watcher.note_of(run, f"seed {run.seed}: {problem}: a resume restarts the episode in progress")
             run.update_manifest(steps_done=self.step, restarts_episode=restarts, last_checkpoint=self.step)
             self._writers[index].write(self.step, saved, self.learner.memory(index, self.step), _tables_and_policy(run))
         self._saved_at, self._saved_time = self.step, time.monotonic()
@@ -291,12 +291,8 @@ class Loop:
         run.update_manifest(state="failed", failure=f"step {self.step}: {reason}", steps_done=self.step)
         self.watcher.failed(run.seed, self.step, reason)
 
-    def _note(self, run: RunDirectory, text: str) -> None:
-        run.log(text)
-        self.watcher.note(text)
-
     def _note_inexact(self, run: RunDirectory, text: str) -> None:
-        self._note(run, text)
+        self.watcher.note_of(run, text)
         record_inexact(run, text)
 
     def _perturb(self, step: int) -> None:

@@ -10,8 +10,10 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any
 
-from csac.processes import Child, die_with_parent, end, outlive_termination
+from csac.processes import Child, end
 from csac.record.run import RunDirectory, StorageFailure
+from csac.seeds import seeds_told
+from csac.tasks.failures import one_line
 from csac.training.callbacks import STOPPED
 from csac.training.watch import Watcher
 from csac.types import InputError
@@ -106,7 +108,7 @@ def _replace(
         restarted.add(worker.program.directories)
         for run in runs:
             run.log(f"{reason}; its process is restarted")
-        watcher.note(f"{_seeds(runs)}: {reason}; restarting from the newest checkpoint")
+        watcher.note(f"{seeds_told([run.seed for run in runs])}: {reason}; restarting from the newest checkpoint")
         return [worker.program]
     for run in runs:
         if run.manifest.state != "failed" and run.manifest.steps_done < run.config.steps:
@@ -121,7 +123,7 @@ class _Worker(Child):
     """The parent's end of one program's process."""
 
     def __init__(self, program: Program) -> None:
-        super().__init__(_work, program, daemon=False)
+        super().__init__(_work, program)
         self.program, self.is_stopping = program, False
         self.has_turn: bool | None = None  # False while it waits for one, None before it has asked
         self.step = 0
@@ -142,8 +144,6 @@ class _Worker(Child):
 
 def _work(connection: Connection, program: Program) -> None:
     """Train a program in a process of its own."""
-    die_with_parent()
-    outlive_termination()
     from csac.training.running import begin_with, train_program  # JAX
 
     begin_with(program.threads)
@@ -164,7 +164,7 @@ def _work(connection: Connection, program: Program) -> None:
 
 def record_failure(program: Program, watcher: Watcher, error: Exception) -> None:
     """Write down that the runs of a program failed by an error that nobody foresaw, and tell it."""
-    reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    reason = one_line(error)
     for path in program.directories:
         run = RunDirectory.open(path)
         run.log(f"{reason}\n{''.join(traceback.format_exception(error))}")
@@ -211,7 +211,3 @@ class _RemoteWatcher(Watcher):
                 self.stopped.set()
                 self._answers.put(STOPPED)
             self._turns.put(None)
-
-
-def _seeds(runs: list[RunDirectory]) -> str:
-    return f"seed{'s' if len(runs) > 1 else ''} {', '.join(str(run.seed) for run in runs)}"

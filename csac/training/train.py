@@ -17,13 +17,12 @@ from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
 from csac.record.wandb import import_wandb
-from csac.tasks.trust import refuse_untrusted
+from csac.tasks.trust import named_task
 from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs
 from csac.training.devices import choose_device
-from csac.training.footprint import memory_needed
-from csac.training.program import Program, choose_groups, programs_of
+from csac.training.program import Program, choose_groups, memory_needed, programs_of
 from csac.training.resume import Source, as_begun, refuse_differences, refuse_lost
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
@@ -168,9 +167,7 @@ def resume(
     end_if_unguarded()
     runs = TrainedRuns.open(directory)
     config = runs.config
-    if config.task_is_callable:
-        raise InputError(f"the task of {runs.path} is a Python function: call csac.train with it and resume=True")
-    refuse_untrusted(config.task, runs.path, trust_task)
+    named_task(config, runs.path, trust_task, "call csac.train with it and resume=True")
     watch = Watch(progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
@@ -251,9 +248,7 @@ def _create(
     """Create the run of each configuration; an existing one takes over what may differ where it goes on, such as steps.
 
     New runs are made aside and named together: who is killed before leaves none of them, not some or a half of one.
-
-    Raises:
-        InputError: an existing run is in use, or a directory cannot be written.
+    Raises InputError where an existing run is in use, or a directory cannot be written.
     """
     changed = [config for config in configs if config.seed in existing and config != existing[config.seed].config]
     _change([existing[config.seed] for config in changed], changed)

@@ -6,6 +6,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 from csac.checks import check_flag
+from csac.tasks.failures import one_line
 from csac.tasks.perturbations import by_step, perturbations_of
 from csac.training.callbacks import Answer
 
@@ -45,6 +46,11 @@ class Watcher:
     def note(self, text: str) -> None:
         """Receive a line for the user."""
         self.send("note", text)
+
+    def note_of(self, run: RunDirectory, text: str) -> None:
+        """Write a line into a run's log, and receive it."""
+        run.log(text)
+        self.note(text)
 
 
 class Watch(Watcher):
@@ -97,4 +103,4 @@ def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:
     try:
         learning_curve([(runs.config.title, rows)], runs.curve, title=runs.config.task, marks=marks)
     except Exception as error:
-        note(f"note: the curve could not be drawn ({type(error).__name__}: {' '.join(str(error).split())})")
+        note(f"note: the curve could not be drawn ({one_line(error)})")

@@ -15,7 +15,6 @@ from equations import SPEC, assert_close, batch_of, begin, linear, transition, t
 from csac.algorithms import CSAC, SAC, TD3
 from csac.algorithms.critics import (
     Critics,
-    make_critic,
     min_q,
     normalised_critic_loss,
     q_value,
@@ -23,7 +22,7 @@ from csac.algorithms.critics import (
     update_critics,
 )
 from csac.algorithms.distributions import policy_at
-from csac.algorithms.networks import BATCH, init_optimiser, make_optimiser
+from csac.algorithms.networks import BATCH, init_optimiser, make_mlp, make_optimiser
 from csac.algorithms.normalisation import EPSILON, Moments, fold, fold_layer, moments_of, normalised_pass
 from csac.types import Layer, Transition
 
@@ -41,8 +40,9 @@ FAR = transitions(16, shift=3.0, scale=2.0)
 
 
 def two_critics() -> Critics:
-    first, second = (make_critic(key, SPEC, (8, 8)) for key in jax.random.split(jax.random.key(0)))
-    return first, second
+    first, second = jax.random.split(jax.random.key(0))
+    inputs = SPEC.observation_size + SPEC.action_size
+    return make_mlp(first, inputs, (8, 8), 1), make_mlp(second, inputs, (8, 8), 1)
 
 
 def test_the_moments_are_those_of_all_inputs_of_all_examples():

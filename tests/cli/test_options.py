@@ -212,7 +212,7 @@ def test_weights_may_be_learnt_and_numbers_negative(train_call):
 
 
 @pytest.mark.parametrize(
-    ("words", "value"), [([], "a"), (["--x", "b"], "b"), (["--x=b", "--x", "c"], "c"), (["--x"], "a"), (["x"], "a")]
+    ("words", "value"), [([], None), (["--x", "b"], "b"), (["--x=b", "--x", "c"], "c"), (["--x"], None), (["x"], None)]
 )
 def test_the_last_value_of_an_option_counts(words, value):
-    assert value_of(words, "--x", "a") == value
+    assert value_of(words, "--x") == value

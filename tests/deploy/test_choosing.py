@@ -149,9 +149,9 @@ def test_a_saved_policy_has_no_seeds_and_replaces_no_run(tmp_path):
         ):
             policies[0].save(nothing)  # pyright: ignore[reportArgumentType]
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot write"):
         policies[0].save(tmp_path / "file")
-    with pytest.raises(InputError, match="cannot be written: File name too long"):
+    with pytest.raises(InputError, match=r"cannot write .*: File name too long"):
         policies[0].save(tmp_path / ("x" * 300))
 
 

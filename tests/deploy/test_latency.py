@@ -13,7 +13,7 @@ from policies import algorithm_policy
 from rich.console import Console
 
 from csac.cli import main
-from csac.console.exports import latency_cells, latency_table
+from csac.console.tables import latency_cells, latency_table
 from csac.deploy.artefact import open_artefact
 from csac.deploy.latency import Latency, measure, time_calls
 

@@ -18,9 +18,8 @@ from played import policy_for, run_of_task
 from policies import contract, random_policy
 
 from csac.evaluation.evaluator import EPISODES_AT_ONCE, EvaluationFailure, Evaluator
-from csac.evaluation.pending import EvaluationStopped
 from csac.evaluation.play import evaluate_run
-from csac.evaluation.pool import EvaluationPool, choose_processes
+from csac.evaluation.pool import EvaluationPool, EvaluationStopped, choose_processes
 from csac.seeds import EVALUATION_SEED
 from csac.types import InputError
 

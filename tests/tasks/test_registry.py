@@ -133,7 +133,7 @@ sys.path = [place for place in sys.path if place]
 from csac.processes import Child
 def work(connection): pass
 import operator
-child = Child(operator.methodcaller("send", ("done", )), daemon=True)
+child = Child(operator.methodcaller("send", ("done", )))
 try:
     print(child.connection.recv())
 finally:

@@ -23,6 +23,7 @@ from csac.training.train import train
 from csac.types import Spec
 
 HERE = Path(__file__).parent
+SETTINGS: Any = jax.config
 TINY: dict[str, Any] = {"actor_hidden_sizes": (8,), "critic_hidden_sizes": (8,)}
 CHOICES = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")
 
@@ -90,7 +91,7 @@ def test_each_number_of_cores_has_its_own_programs(tmp_path, choices, monkeypatc
     for cores in (1, 2):
         monkeypatch.setattr(compilation, "usable_cores", lambda cores=cores: list(range(cores)))
         compilation.keep_programs()
-        folders.add(compilation._jax_settings()[1])
+        folders.add(SETTINGS.jax_compilation_cache_dir)
 
     assert len(folders) == 2
     assert {Path(folder).parent for folder in folders} == {tmp_path / "csac" / "programs"}
@@ -105,7 +106,7 @@ def test_a_home_that_cannot_be_written_costs_a_note_and_nothing_else(tmp_path, c
     assert note is not None
     assert note.startswith("note: compiled programs cannot be kept")
     assert str(tmp_path / "csac") in note
-    assert compilation._jax_settings()[1] is None
+    assert SETTINGS.jax_compilation_cache_dir is None
 
 
 def test_without_a_home_nothing_is_kept(tmp_path, choices, monkeypatch):
@@ -151,7 +152,7 @@ def test_the_users_own_choice_comes_first(tmp_path, choices):
     assert compilation.tidy_programs() is None
     compilation.keep_programs()
 
-    assert compilation._jax_settings()[1] == own
+    assert SETTINGS.jax_compilation_cache_dir == own
     assert not (tmp_path / "csac").exists()
 
 
