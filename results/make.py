@@ -193,14 +193,14 @@ def cases(page: Page, data: str) -> str:
     return table(["per 1,000 rollouts", *arms], lines)
 
 
-def equal_time(page: Page, data: str, peers: list[str], own: list[str], seeds: list[int], picture: str) -> str:
-    """Return what arms have reached in the time T that the first of `own` takes for all its steps, and draw it."""
+def equal_time(page: Page, data: str, peers: list[str], own: dict[str, str], seeds: list[int], picture: str) -> str:
+    """Return what arms have reached in the same time T, and draw it; `own` are csac's, by the names in `data`."""
     plan, speeds, parts = read_csv(page.file(data)), [], []
     finals: Finals = {}
     drawn: dict[str, dict[str, np.ndarray]] = {}  # [seed, share], by task and arm
     for task in dict.fromkeys(row["task"] for row in plan):
         finals[task], drawn[task], lines = {}, {}, []
-        for label, rows in page.arms([*peers, *own], task, seeds).items():
+        for label, rows in page.arms({**dict(zip(peers, peers, strict=True)), **own}, task, seeds).items():
             told = [row for row in plan if (row["arm"], row["task"]) == (label, task)]
             reached, final = _in_time(rows, told, label in own)
             rate, seconds, steps = (float(told[-1][name]) for name in ("steps_per_second", "seconds", "steps"))
@@ -216,7 +216,7 @@ def equal_time(page: Page, data: str, peers: list[str], own: list[str], seeds: l
         }
         draw_equal_time(page.file(picture), drawn, times)
     speed = table(["task", "method", "steps per second", "T, s", "steps in T"], speeds, "How fast each is")
-    compared_with_peers = [_against(finals, label, peers, label != own[0], seeds) for label in own]
+    compared_with_peers = [_against(finals, label, peers) for label in own]
     return "\n\n".join([speed, *parts, overall_table("Equal time", finals), *compared_with_peers])
 
 
@@ -232,13 +232,13 @@ def _in_time(rows: np.ndarray, told: Rows, is_own: bool) -> tuple[dict[float, np
     return reached, measure(rows[rows["step"] <= within], within).final if is_own else np.mean(late, axis=0)
 
 
-def _against(finals: Finals, label: str, peers: list[str], is_secondary: bool, seeds: list[int]) -> str:
+def _against(finals: Finals, label: str, peers: list[str]) -> str:
     final, lines = stacked(finals), []
     for peer in peers:
         on_each = [compared(arms[label], arms[peer])[0] for arms in finals.values()]
         lines.append([peer, *compared(final[label], final[peer]), *on_each])
     headings = ["against", "P(higher return)", "so", *(f"P(higher return), {task}" for task in finals)]
-    return table(headings, lines, f"{label}{' (secondary)' * is_secondary}, against each peer: seeds {comma(seeds)}")
+    return table(headings, lines, f"{label}, against each peer")
 
 
 def mechanism(page: Page, data: str, picture: str) -> str:

@@ -21,13 +21,7 @@ def draw_equal_time(path: Path, reached: dict[str, dict[str, np.ndarray]], times
     for axes, (task, arms) in zip(figure.subplots(1, len(reached), sharey=True), reached.items(), strict=True):
         for colour, (label, values) in zip(COLOURS, arms.items(), strict=True):
             axes.fill_between(times[task], values.min(axis=0), values.max(axis=0), color=colour, alpha=0.1, linewidth=0)
-            axes.plot(
-                times[task],
-                values.mean(axis=0),
-                color=colour,
-                linewidth=2.2,
-                label=label.replace("candidate", "preset strong"),
-            )
+            axes.plot(times[task], values.mean(axis=0), color=colour, linewidth=2.2, label=label)
         _dress(axes, task, "seconds of training on two cores")
         axes.set_xlim(0, times[task][-1])
     figure.axes[0].set_ylabel("return per evaluation episode")
