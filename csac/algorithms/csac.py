@@ -22,6 +22,8 @@ from csac.algorithms.statistics import Statistics, normalise, normalise_batch
 from csac.algorithms.temperature import Temperature
 from csac.types import Metrics, PolicyNetwork, Spec, Transition
 
+LIMIT = 100.0  # of a state's relative entropy in the actor's loss, in nats: beyond, one state outweighs its batch
+
 
 class State(NamedTuple):
     """Everything that one seed of CSAC learns; what an option does without is None."""
@@ -140,7 +142,7 @@ class CSAC(MaximumEntropy):
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             observation, noise, actor=actor, reference=reference, critics=critics
         )
-        loss = -(q_value - sigma * log_prob - self.relative_entropy_weight * relative_entropy)
+        loss = -(q_value - sigma * log_prob - self.relative_entropy_weight * bounded(relative_entropy, LIMIT))
         return loss, {"actor_loss": loss, "entropy": -log_prob, "relative_entropy": relative_entropy}
 
     def reference_before(self, kept: MLP, actor: MLP, step: Count) -> MLP:
