@@ -202,7 +202,7 @@ def show(options: Show) -> int:
     _print_table(("run", "what", "steps", "state", "such runs take"), rows)
     counts = Counter(row[3] for row in rows)
     told = ", ".join(f"{count} {state}" for state, count in counts.items())
-    make_console().print(f"{len(rows)} runs in {directory}: {told}", soft_wrap=True)
+    make_console().print(f"runs in {directory}: {told}", soft_wrap=True)
     return 0
 
 
@@ -221,7 +221,7 @@ def run(options: Run) -> int:
         return 1
     states = Counter(existing.state if (existing := one.open(directory)) else "waiting" for one in runs)
     told = ", ".join(f"{count} {state}" for state, count in states.items())
-    console.print(f"{len(runs)} runs in {directory}: {told}", soft_wrap=True)
+    console.print(f"runs in {directory}: {told}", soft_wrap=True)
     for one in runs:
         if (existing := one.open(directory)) and existing.state == "failed":
             console.print(f"{one.name} failed at {existing.manifest.failure} ({existing.path})", soft_wrap=True)

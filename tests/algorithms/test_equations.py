@@ -83,6 +83,21 @@ def test_csac_actor_loss(options, expected):
     assert float(metrics["entropy"]) == pytest.approx(0.8037095, abs=1e-6)
 
 
+def test_a_relative_entropy_beyond_100_nats_no_longer_pulls_at_the_actor():
+    def gradient(shift: float, weight: float) -> tuple[float, float]:
+        def loss(mean: Any) -> Any:
+            networks = {"reference": gaussian(0.5 - shift, 0.1), "critics": CRITICS}
+            actor, algorithm = gaussian(mean, 0.1), csac(relative_entropy_weight=weight)
+            return algorithm.actor_loss(actor, jnp.ones(1), NOISE, sigma=0.2, **networks)
+
+        slope, metrics = jax.grad(loss, has_aux=True)(jnp.float32(0.5))
+        return float(slope), float(metrics["relative_entropy"])
+
+    plain = gradient(1.0, 0.0)[0]
+    assert gradient(1.0, 0.5) == pytest.approx((plain + 0.5 * 1.0 / 0.1**2, 50.0), rel=1e-4)
+    assert gradient(2.0, 0.5) == pytest.approx((plain, 200.0), rel=1e-4)  # what is logged has no limit
+
+
 @pytest.mark.parametrize(("terminated", "truncated", "expected"), [(0, 0, 3.8764787), (1, 0, 2.0), (0, 1, 3.8764787)])
 def test_sac_critic_target(terminated, truncated, expected):
     # 2 + 0.9 (1.9242343 + 0.2·0.8037095) = 2 + 0.9·2.0849762
