@@ -128,6 +128,19 @@ def finals(page: Page, tasks: list[str], steps: int, **chosen: Any) -> str:
     return table(["final return, mean ± std", *found[tasks[0]]], lines)
 
 
+def growth(page: Page, arm: str, tasks: list[str], at: list[int], picture: str, title: str) -> str:
+    """Return the returns of one arm after some steps, the final ones of its seeds, and draw its curve on each task."""
+    found = {task: page.arms([arm], task)[arm] for task in tasks}
+    if page.has_pictures:
+        learning_curve(list(found.items()), page.file(picture), title)
+    lines = []
+    for task, rows in found.items():
+        steps, _, values = evaluation_matrix(rows)
+        means = [f"{values[:, steps == step].mean():,.0f}" for step in at]
+        lines.append([task, *means, ", ".join(f"{final:,.0f}" for final in measure(rows, at[-1]).final)])
+    return table(["task", *(f"mean at {step:,}" for step in at), "final return of each seed"], lines)
+
+
 def published(page: Page, steps: dict[str, int], ours: str, others: str, seeds: list[int]) -> str:
     """Return the paper's maximum average returns of CSAC and SAC beside those of two arms, after some steps."""
     lines, finals = [], []
@@ -281,6 +294,7 @@ KINDS = {
     "returns": returns,
     "boundary": boundary,
     "finals": finals,
+    "growth": growth,
     "published": published,
     "recoveries": recoveries,
     "study": study,
