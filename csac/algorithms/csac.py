@@ -142,7 +142,8 @@ class CSAC(MaximumEntropy):
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             observation, noise, actor=actor, reference=reference, critics=critics
         )
-        loss = -(q_value - sigma * log_prob - self.relative_entropy_weight * bounded(relative_entropy, LIMIT))
+        relative_entropy = bounded(relative_entropy, LIMIT)
+        loss = -(q_value - sigma * log_prob - self.relative_entropy_weight * relative_entropy)
         return loss, {"actor_loss": loss, "entropy": -log_prob, "relative_entropy": relative_entropy}
 
     def reference_before(self, kept: MLP, actor: MLP, step: Count) -> MLP:
