@@ -129,6 +129,7 @@ _STRONG: Mapping[str, Mapping[str, Any]] = {
         "reference_period": 1000,
         "relative_entropy_estimator": "closed_form",
         "target_log_prob_bound": 1.0,
+        "relative_entropy_bound": 100.0,
     },
     "sac": _FASTER_CRITICS,
 }

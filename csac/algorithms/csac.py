@@ -22,8 +22,6 @@ from csac.algorithms.statistics import Statistics, normalise, normalise_batch
 from csac.algorithms.temperature import Temperature
 from csac.types import Metrics, PolicyNetwork, Spec, Transition
 
-LIMIT = 100.0  # of a state's relative entropy in the actor's loss, in nats: beyond, one state outweighs its batch
-
 
 class State(NamedTuple):
     """Everything that one seed of CSAC learns; what an option does without is None."""
@@ -59,6 +57,8 @@ class CSAC(MaximumEntropy):
     """Whether the relative entropy is in the critic's target and in the actor's loss, or in the actor's loss alone."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on log π and on the relative entropy of an action in the critic's target, in nats; 0 is no bound."""
+    relative_entropy_bound: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Bound on the relative entropy of a state in the actor's loss, in nats; 0 is no bound."""
 
     name: ClassVar[str] = "csac"
 
@@ -142,7 +142,7 @@ class CSAC(MaximumEntropy):
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             observation, noise, actor=actor, reference=reference, critics=critics
         )
-        relative_entropy = bounded(relative_entropy, LIMIT)
+        relative_entropy = bounded(relative_entropy, self.relative_entropy_bound)
         loss = -(q_value - sigma * log_prob - self.relative_entropy_weight * relative_entropy)
         return loss, {"actor_loss": loss, "entropy": -log_prob, "relative_entropy": relative_entropy}
 

@@ -83,11 +83,11 @@ def test_csac_actor_loss(options, expected):
     assert float(metrics["entropy"]) == pytest.approx(0.8037095, abs=1e-6)
 
 
-def test_a_relative_entropy_beyond_100_nats_no_longer_pulls_at_the_actor():
+def test_a_relative_entropy_beyond_its_bound_no_longer_pulls_at_the_actor():
     def gradient(shift: float, weight: float) -> tuple[float, float]:
         def loss(mean: Any) -> Any:
             networks = {"reference": gaussian(0.5 - shift, 0.1), "critics": CRITICS}
-            actor, algorithm = gaussian(mean, 0.1), csac(relative_entropy_weight=weight)
+            actor, algorithm = gaussian(mean, 0.1), csac(relative_entropy_weight=weight, relative_entropy_bound=100)
             return algorithm.actor_loss(actor, jnp.ones(1), NOISE, sigma=0.2, **networks)
 
         slope, metrics = jax.grad(loss, has_aux=True)(jnp.float32(0.5))
