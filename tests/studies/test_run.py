@@ -175,7 +175,7 @@ def test_a_study_from_its_beginning_to_its_report(tmp_path, capsys):
     assert main(["study", "report", *words]) == 0
     assert "<h2>Learning curves</h2>" in (runs / "report.html").read_text()
     assert main(["evaluate", str(runs / "csac" / "Pendulum-v1"), "--episodes", "1"]) == 0
-    assert "2 runs" in capsys.readouterr().out
+    assert "2 finished" in capsys.readouterr().out
 
 
 def write_study(folder: Path) -> Path:
