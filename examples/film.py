@@ -2,8 +2,8 @@
 
 The one in README is of these runs:
 
-csac train Walker2d-v4 --algorithm sac --preset strong --steps 100000 --directory runs/film/walker
-csac train HalfCheetah-v4 --algorithm sac --preset strong --steps 100000 --directory runs/film/cheetah
+csac train Walker2d-v4 --algorithm sac --preset strong --first-seed 300 --steps 300000 --directory runs/film/walker
+csac train HalfCheetah-v4 --algorithm sac --preset strong --first-seed 300 --steps 300000 --directory runs/film/cheetah
 csac train PandaReach-v3 --algorithm sac --warmup-steps 1000 --steps 40000 --directory runs/film/arm
 python examples/film.py runs/film/walker runs/film/cheetah runs/film/arm --out results/film.gif
 """
