@@ -118,6 +118,7 @@ _FASTER_CRITICS: Mapping[str, Any] = {
     "target_entropy": None,
     "target_entropy_per_dimension": -0.5,
     "weight_learning_rate": 1e-3,
+    "policy_average_rate": 1.0,
 }
 
 _STRONG: Mapping[str, Mapping[str, Any]] = {

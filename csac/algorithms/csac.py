@@ -16,7 +16,7 @@ from csac.algorithms.critics import Critics, min_q, update_critics
 from csac.algorithms.distributions import action_at, bounded, kl, log_ratio, policy_at
 from csac.algorithms.hyperparameters import COUNT, NOT_NEGATIVE, RATE
 from csac.algorithms.networks import MLP, copy_tree, gradient_step, polyak
-from csac.algorithms.off_policy import MaximumEntropy, first_metrics, improve_delayed, policy_network
+from csac.algorithms.off_policy import MaximumEntropy, evaluated_actor, first_metrics, improve_delayed, policy_network
 from csac.algorithms.shapes import Action, Actions, Count, Key, Observation, Observations, Scalar
 from csac.algorithms.statistics import Statistics, normalise, normalise_batch
 from csac.algorithms.temperature import Temperature
@@ -34,6 +34,7 @@ class State(NamedTuple):
     critic_optimiser: Any
     temperature: Temperature | None = None  # σ, where it is learnt
     observation_statistics: Statistics | None = None
+    average: MLP | None = None  # of past actors, where it is what is evaluated
     actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
 
@@ -74,12 +75,13 @@ class CSAC(MaximumEntropy):
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return ã(s, ξ) to explore (Eq. actor), else tanh(mean)."""
-        policy = policy_at(state.actor, normalise(state.observation_statistics, observation))
+        actor = state.actor if explore else evaluated_actor(state)
+        policy = policy_at(actor, normalise(state.observation_statistics, observation))
         return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the actor's layers, and what it sees observations by."""
-        return policy_network(state.actor, state.observation_statistics, "tanh_gaussian")
+        """Return the layers of the actor that is evaluated, and what it sees observations by."""
+        return policy_network(evaluated_actor(state), state.observation_statistics, "tanh_gaussian")
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Run the update phase of Algorithm 1, lines 12 to 23, on the mini-batch of line 13."""
@@ -94,14 +96,14 @@ class CSAC(MaximumEntropy):
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
         # Line 21: a step down J(φ)
-        given = (folded_critics, batch.observation, actor_noise)
+        given = (folded_critics, batch.observation, actor_noise, step)
         state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
         # Line 23: θ̂ᵢ ← ρ θᵢ + (1 - ρ) θ̂ᵢ
         state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
         return state, {**metrics, **actor_metrics, **({"entropy_weight": sigma} if state.temperature else {})}
 
     def improve(
-        self, state: State, critics: Critics, observations: Observations, noise: Actions
+        self, state: State, critics: Critics, observations: Observations, noise: Actions, step: Count
     ) -> tuple[State, Metrics]:
         """Return the state after one step on the actor, then of a running average and of σ where it is learnt."""
         loss = partial(self.actor_loss, reference=state.reference, critics=critics, sigma=self.sigma(state))
@@ -111,7 +113,7 @@ class CSAC(MaximumEntropy):
         if temperature:
             temperature = self.adapt_temperature(temperature, metrics["entropy"], noise.shape[-1])
         learnt = {"actor": actor, "actor_optimiser": optimiser, "reference": reference, "temperature": temperature}
-        return state._replace(**learnt), metrics
+        return state._replace(**learnt, average=self.average_after(state.average, actor, step)), metrics
 
     def soft_value_terms(
         self, observation: Observation, noise: Action, *, actor: MLP, reference: MLP, critics: Critics

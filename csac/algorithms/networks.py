@@ -116,7 +116,7 @@ def plain_layers(network: Any) -> tuple[Layer, ...]:
     raise InputError(f"{kind} is no MLP, and policies leave as plain layers: have `policy` give such, or use an MLP")
 
 
-def polyak(targets: Any, sources: Any, rate: float) -> Any:
+def polyak(targets: Any, sources: Any, rate: float | Scalar) -> Any:
     """Return targets + rate (sources - targets), leaf by leaf; None where there are no targets."""
     if targets is None:
         return None

@@ -34,6 +34,7 @@ from csac.algorithms.networks import (
     make_mlp,
     make_optimiser,
     plain_layers,
+    polyak,
 )
 from csac.algorithms.shapes import Action, Count, Key, Scalar
 from csac.algorithms.statistics import Statistics, normaliser_of
@@ -192,11 +193,27 @@ class MaximumEntropy(TwinCritics):
     """Entropy that `auto` aims at, in nats per action dimension."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of an entropy weight that is `auto`."""
+    policy_average_rate: Annotated[float, RATE] = 1.0
+    """Step size of the average of past actors that is evaluated and exported, larger at first; 1 is the actor."""
+
+    def first_networks(self, key: Key, spec: Spec, steps: int, actor_outputs: int) -> dict[str, Any]:
+        """Return the fields of a first state that the two share; the average is a copy of the actor."""
+        networks = super().first_networks(key, spec, steps, actor_outputs)
+        return networks | {"average": copy_tree(networks["actor"]) if self.policy_average_rate < 1 else None}
 
     def first_temperature(self, given: float | Literal["auto"]) -> Temperature:
         """Return an entropy weight that is given, or what one of `auto` begins with."""
         weight = self.initial_entropy_weight if given == "auto" else given
         return make_temperature(weight, make_optimiser(self.weight_learning_rate))
+
+    def average_after(self, average: MLP | None, actor: MLP, step: Count) -> MLP | None:
+        """Return the average with one actor more, of the update after `step` others; None where there is none.
+
+        It is of the last tenth of them (polynomial decay with η = 9, Shamir and Zhang 2013) until `policy_average_rate`
+        is the larger step.
+        """
+        actors = step // self.policy_delay + 1
+        return polyak(average, actor, jnp.maximum(self.policy_average_rate, 10 / (actors + 9)))
 
     def adapt_temperature(self, temperature: Temperature, entropy: Scalar, dimensions: int) -> Temperature:
         """Return the weight after one gradient step towards the entropy that `auto` aims at."""
@@ -206,6 +223,11 @@ class MaximumEntropy(TwinCritics):
         """Return the entropy that `auto` aims at, in nats."""
         given = self.target_entropy
         return self.target_entropy_per_dimension * dimensions if given is None else given
+
+
+def evaluated_actor(state: Any) -> MLP:
+    """Return the actor that is evaluated and exported: the average of past ones where there is one."""
+    return state.actor if state.average is None else state.average
 
 
 def first_metrics(names: Iterable[str], policy_delay: int) -> Metrics | None:

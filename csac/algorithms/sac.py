@@ -13,7 +13,7 @@ from csac.algorithms.critics import Critics, min_q, update_critics
 from csac.algorithms.distributions import action_at, policy_at
 from csac.algorithms.hyperparameters import NOT_NEGATIVE
 from csac.algorithms.networks import MLP, gradient_step, polyak
-from csac.algorithms.off_policy import MaximumEntropy, first_metrics, improve_delayed, policy_network
+from csac.algorithms.off_policy import MaximumEntropy, evaluated_actor, first_metrics, improve_delayed, policy_network
 from csac.algorithms.shapes import Action, Actions, Count, Key, Observation, Observations, Scalar
 from csac.algorithms.statistics import Statistics, normalise, normalise_batch
 from csac.algorithms.temperature import Temperature, logarithm
@@ -30,6 +30,7 @@ class State(NamedTuple):
     actor_optimiser: Any
     critic_optimiser: Any
     observation_statistics: Statistics | None = None
+    average: MLP | None = None  # of past actors, where it is what is evaluated
     actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
 
@@ -75,13 +76,13 @@ class SAC(MaximumEntropy):
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
 
-        given = (folded_critics, batch.observation, actor_noise)
+        given = (folded_critics, batch.observation, actor_noise, step)
         state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
         state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
         return state, {**metrics, **actor_metrics, "temperature": temperature}
 
     def improve(
-        self, state: State, critics: Critics, observations: Observations, noise: Actions
+        self, state: State, critics: Critics, observations: Observations, noise: Actions, step: Count
     ) -> tuple[State, Metrics]:
         """Return the state after one gradient step on the actor and the temperature, and the actor's metrics."""
         temperature = state.temperature
@@ -90,7 +91,8 @@ class SAC(MaximumEntropy):
         actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)
         if self.entropy_weight == "auto":
             temperature = self.adapt_temperature(temperature, metrics["entropy"], noise.shape[-1])
-        return state._replace(actor=actor, actor_optimiser=optimiser, temperature=temperature), metrics
+        learnt = {"actor": actor, "actor_optimiser": optimiser, "temperature": temperature}
+        return state._replace(**learnt, average=self.average_after(state.average, actor, step)), metrics
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
         """Return random networks; the targets are copies."""
@@ -102,9 +104,10 @@ class SAC(MaximumEntropy):
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
         """Return a sampled action to explore, else tanh(mean)."""
-        policy = policy_at(state.actor, normalise(state.observation_statistics, observation))
+        actor = state.actor if explore else evaluated_actor(state)
+        policy = policy_at(actor, normalise(state.observation_statistics, observation))
         return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the actor's layers, and what it sees observations by."""
-        return policy_network(state.actor, state.observation_statistics, "tanh_gaussian")
+        """Return the layers of the actor that is evaluated, and what it sees observations by."""
+        return policy_network(evaluated_actor(state), state.observation_statistics, "tanh_gaussian")

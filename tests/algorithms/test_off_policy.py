@@ -120,3 +120,24 @@ def test_periodic_references_are_renewed_while_the_actor_waits():
     found = updates(CSAC(policy_delay=3, reference_policy="periodic", reference_period=4, **SMALL), 5)
     assert differ(found[4][0].reference, found[4][0].actor)
     assert_equal(found[5][0].reference, found[3][0].actor)  # update 4 begins a period, and waits
+
+
+@pytest.mark.parametrize("kind", [CSAC, SAC])
+def test_the_average_of_past_actors_leaves_and_changes_no_training(kind):
+    plain, averaging = kind(policy_delay=2, **SMALL), kind(policy_delay=2, policy_average_rate=0.25, **SMALL)
+    found = updates(averaging, 4)
+    average = jax.tree.map(lambda one, other: one / 11 + 10 * other / 11, found[2][0].actor, found[4][0].actor)
+    state = found[4][0]
+    assert_close((found[2][0].average, state.average), (found[2][0].actor, average), rtol=1e-6, atol=1e-7)
+    assert_equal(averaging.policy(state).parameters.actors[0], state.average.layers)
+    observation, key = jnp.ones(SPEC.observation_size), jax.random.key(0)
+    for actor, explore in ((state.actor, True), (state.average, False)):
+        action = plain.act(state._replace(actor=actor, average=None), observation, key, explore)
+        assert_equal(averaging.act(state, observation, key, explore), action)
+    assert_equal(state._replace(average=None), updates(plain, 4)[-1][0])
+
+
+def test_an_average_moves_by_its_rate_once_that_is_above_a_tenth_of_the_last_actors():
+    sac, zero, one = SAC(policy_average_rate=0.25), jnp.zeros(()), jnp.ones(())
+    steps = [sac.average_after(zero, one, jnp.int32(step)) for step in (0, 10, 29, 30, 31, 10_000)]
+    np.testing.assert_allclose(steps, [1, 10 / 20, 10 / 39, 0.25, 0.25, 0.25], rtol=1e-6)

@@ -35,6 +35,7 @@ ADAPTIVE = CSAC(
     critic_normalisation="batch",
     normalise_observations=True,
     policy_delay=3,
+    policy_average_rate=0.2,
     adam_momentum=0.5,
     learning_rate_schedule="cosine",
     n_steps=3,
