@@ -34,7 +34,7 @@ from tables import (
 )
 
 from csac.record.plots import learning_curve
-from csac.record.statistics import evaluation_matrix, maximum_average_return
+from csac.record.statistics import evaluation_matrix, maximum_average_return, mean_and_interval
 from csac.studies.paper import RETURNS
 
 TABLE = re.compile(r"(<!-- table\n(.*?)-->\n).*?(<!-- end -->)", re.DOTALL)
@@ -139,6 +139,22 @@ def growth(page: Page, arm: str, tasks: list[str], at: list[int], picture: str, 
         means = [f"{values[:, steps == step].mean():,.0f}" for step in at]
         lines.append([task, *means, ", ".join(f"{final:,.0f}" for final in measure(rows, at[-1]).final)])
     return table(["task", *(f"mean at {step:,}" for step in at), "final return of each seed"], lines)
+
+
+def paired(page: Page, arms: dict[str, str], tasks: list[str], steps: int, seeds: list[int]) -> str:
+    """Return what a second arm gains on the first in runs that both are of, as a share of the first's mean return."""
+    first, second = arms
+    lines, gains = [], []
+    for task in tasks:
+        one, other = (measure(rows, steps) for rows in page.arms(arms, task, seeds, steps).values())
+        gain = (other.final - one.final) / one.final.mean()
+        means = [f"{values.mean():,.0f}" for values in (one.final, other.final, one.drawdown, other.drawdown)]
+        lines.append([task, *means[:2], f"{gain.mean():+.1%}", *means[2:]])
+        gains.extend(gain)
+    told = mean_and_interval(np.array(gains))
+    lines.append(["all", "", "", f"{told.mean:+.1%} ({told.low:+.1%} to {told.high:+.1%})", "", ""])
+    headings = [f"final return, {first}", second, "difference", f"drawdown, {first}", second]
+    return table([f"seeds {comma(seeds)}", *headings], lines)
 
 
 def published(page: Page, steps: dict[str, int], ours: str, others: str, seeds: list[int]) -> str:
@@ -295,6 +311,7 @@ KINDS = {
     "boundary": boundary,
     "finals": finals,
     "growth": growth,
+    "paired": paired,
     "published": published,
     "recoveries": recoveries,
     "study": study,
