@@ -138,6 +138,6 @@ def test_the_average_of_past_actors_leaves_and_changes_no_training(kind):
 
 
 def test_an_average_moves_by_its_rate_once_that_is_above_a_tenth_of_the_last_actors():
-    sac, zero, one = SAC(policy_average_rate=0.25), jnp.zeros(()), jnp.ones(())
-    steps = [sac.average_after(zero, one, jnp.int32(step)) for step in (0, 10, 29, 30, 31, 10_000)]
+    average_after: Any = SAC(policy_average_rate=0.25).average_after  # of numbers, for networks
+    steps = [average_after(jnp.zeros(()), jnp.ones(()), step) for step in (0, 10, 29, 30, 31, 10_000)]
     np.testing.assert_allclose(steps, [1, 10 / 20, 10 / 39, 0.25, 0.25, 0.25], rtol=1e-6)
