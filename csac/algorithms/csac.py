@@ -105,7 +105,7 @@ class CSAC(MaximumEntropy):
     def improve(
         self, state: State, critics: Critics, observations: Observations, noise: Actions, step: Count
     ) -> tuple[State, Metrics]:
-        """Return the state after one step on the actor, then of a running average and of σ where it is learnt."""
+        """Return the state after one step on the actor, then of running averages and of σ where it is learnt."""
         loss = partial(self.actor_loss, reference=state.reference, critics=critics, sigma=self.sigma(state))
         adam = self.optimiser(self.actor_learning_rate)
         actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)

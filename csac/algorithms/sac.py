@@ -84,7 +84,7 @@ class SAC(MaximumEntropy):
     def improve(
         self, state: State, critics: Critics, observations: Observations, noise: Actions, step: Count
     ) -> tuple[State, Metrics]:
-        """Return the state after one gradient step on the actor and the temperature, and the actor's metrics."""
+        """Return the state after one step on the actor, its average and the temperature, and the actor's metrics."""
         temperature = state.temperature
         loss = partial(self.actor_loss, critics=critics, temperature=jnp.exp(temperature.log_weight))
         adam = self.optimiser(self.actor_learning_rate)
