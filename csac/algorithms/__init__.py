@@ -1,4 +1,4 @@
-"""What is learnt. To add an algorithm, write its file and announce it here."""
+"""The algorithms. To add one, write its file and register it here."""
 
 from csac.algorithms.csac import CSAC
 from csac.algorithms.hyperparameters import names_checked

@@ -1,4 +1,4 @@
-"""What networks are like, in all algorithms: the hyperparameters of actor and critics beside their sizes."""
+"""Network hyperparameters that all algorithms share: activation and layer norm of actor and critics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from csac.types import Activation
 
 @dataclass(frozen=True)
 class Architecture:
-    """Options of the hidden layers of actor and critics."""
+    """Activation and layer norm of the hidden layers of actor and critics."""
 
     activation: Activation = "relu"
     """Activation of the hidden layers."""
@@ -27,12 +27,12 @@ class Architecture:
 
     @property
     def actor_hidden(self) -> Hidden:
-        """What the actor's hidden layers do."""
+        """Activation and layer norm of the actor's hidden layers."""
         return self._hidden(self.actor_activation, self.actor_layer_norm)
 
     @property
     def critic_hidden(self) -> Hidden:
-        """What each critic's hidden layers do."""
+        """Activation and layer norm of each critic's hidden layers."""
         return self._hidden(self.critic_activation, self.critic_layer_norm)
 
     def _hidden(self, activation: Activation | None, layer_norm: bool | None) -> Hidden:

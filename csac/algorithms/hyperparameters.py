@@ -1,4 +1,4 @@
-"""The ranges that hyperparameters may take, each beside its field as `Annotated[float, RATE]`, and their names."""
+"""Check the values and names of hyperparameters; a field declares its range as `Annotated[float, RATE]`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Algorithm = TypeVar("Algorithm")
 
 
 class Limit(NamedTuple):
-    """What a value must fulfil, and how to say so after "must be"."""
+    """A condition on a value, and its wording after "must be" in an error message."""
 
     accepts: Callable[[Any], bool]
     words: str
@@ -51,9 +51,9 @@ LARGEST_INTEGER, LARGEST_FLOAT = 2**31 - 1, float(np.finfo(np.float32).max)
 
 
 def check_hyperparameters(algorithm: Any) -> None:
-    """Make an algorithm's fields plain Python values: NumPy's scalars, lists, and whole numbers where floats belong.
+    """Convert an algorithm's fields to plain Python values: NumPy scalars, lists, and whole numbers in float fields.
 
-    Raises InputError for the first field outside its range or its choices, with its value and what it may be.
+    Raises InputError for the first field outside its range or choices, with its value and what is allowed.
     """
     hints = get_type_hints(type(algorithm), include_extras=True)
     for field in dataclasses.fields(algorithm):
@@ -67,7 +67,7 @@ def check_hyperparameters(algorithm: Any) -> None:
 
 
 def names_checked(algorithm: type[Algorithm]) -> type[Algorithm]:
-    """Return the algorithm, which raises InputError from now on for a hyperparameter that it does not have."""
+    """Make an algorithm class raise InputError for an unknown hyperparameter, and return it."""
     kind: Any = algorithm
     known, init = [field.name for field in dataclasses.fields(kind)], kind.__init__
 
@@ -84,12 +84,12 @@ def names_checked(algorithm: type[Algorithm]) -> type[Algorithm]:
 
 
 def _checked(value: Any, hint: Any) -> Any:
-    """Return a value as a plain one of this type. Raises ValueError with what it must be."""
+    """Return a value as a plain Python value of the hinted type. Raises ValueError with what it must be."""
     if get_origin(hint) in (Union, UnionType):
         return _one_of(value, get_args(hint))
     kind, *limits = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     value = _CONVERSIONS.get(get_origin(kind) or kind, lambda given, _: given)(value, kind)
-    # A number must keep its range in 32 bits: 1 - 1e-9 is 1 there.
+    # Limits apply to the value in 32 bits, where 1 - 1e-9 is 1.
     rounded = float(np.float32(value)) if kind is float else value
     for limit in limits:
         if not limit.accepts(rounded):

@@ -57,18 +57,18 @@ class Parameters(NamedTuple):
 
 
 class State(NamedTuple):
-    """Everything that one seed of PPO learns."""
+    """The learnt state of one PPO seed."""
 
     parameters: Parameters
     optimiser: Any
     observation_statistics: Statistics  # [observation]
     returns: Statistics  # [] of the discounted return so far in each episode
-    discounted_return: Float[Array, "..."]  # of the episode, or [environment] episodes, that the last rollout broke off
+    discounted_return: Float[Array, "..."]  # of the episode, or [environment] episodes, that the last rollout cut off
     total_updates: Scalar  # in this run
 
 
 class Sample(NamedTuple):
-    """One transition, or several with leading axes, ready to be learnt from."""
+    """A transition prepared for the loss, or several with leading axes."""
 
     observation: Float[Array, "... observation"]  # normalised
     action: Float[Array, "... action"]
@@ -137,7 +137,7 @@ class PPO(Architecture):
         return -jnp.minimum(ratio * advantage, clipped * advantage)
 
     def value_loss(self, value: Scalar, old_value: Scalar, target: Scalar) -> Scalar:
-        """Return ½ (V - target)², or if more ½ (V_old + clip(V - V_old, -ε, ε) - target)² where that is asked for."""
+        """Return ½ (V - target)²; if `clip_value_loss`, at least ½ (V_old + clip(V - V_old, -ε, ε) - target)²."""
         loss = (value - target) ** 2
         if self.clip_value_loss:
             clipped = old_value + jnp.clip(value - old_value, -self.clip_range, self.clip_range)
@@ -145,7 +145,7 @@ class PPO(Architecture):
         return 0.5 * loss
 
     def loss(self, parameters: Parameters, sample: Sample) -> tuple[Scalar, Metrics]:
-        """Return policy loss + weighted value loss - weighted entropy (PPO, Eq. 9), and what to log."""
+        """Return policy loss + weighted value loss - weighted entropy (PPO, Eq. 9), and the metrics."""
         policy = policy_at(parameters, sample.observation)
         log_ratio = policy.log_prob(sample.action) - sample.log_prob
         policy_loss = self.policy_loss(log_ratio, sample.advantage)
@@ -155,7 +155,7 @@ class PPO(Architecture):
             "actor_loss": policy_loss,
             "critic_loss": value_loss,
             "entropy": entropy,
-            "approximate_kl": jnp.expm1(log_ratio) - log_ratio,  # its mean is KL(π_old ‖ π), and it is never negative
+            "approximate_kl": jnp.expm1(log_ratio) - log_ratio,  # never negative, with mean KL(π_old ‖ π)
             "clip_fraction": jnp.abs(jnp.expm1(log_ratio)) > self.clip_range,
         }
 
@@ -189,7 +189,7 @@ class PPO(Architecture):
         }
 
     def samples(self, state: State, absorbed: State, batch: Transition) -> Sample:
-        """Return what there is to learn from: densities by the state that acted, all else by the newest statistics."""
+        """Return the samples: log-probabilities with the statistics used in acting, all else with the updated ones."""
 
         def log_prob(observation: Observation, action: Action) -> Scalar:
             return policy_at(state.parameters, self.normalise(state.observation_statistics, observation)).log_prob(
@@ -207,12 +207,12 @@ class PPO(Architecture):
         return Sample(observations, batch.action, log_probs, values, advantages, values + advantages)
 
     def normalise(self, statistics: Statistics, observation: Observation) -> Observation:
-        """Return (observation - mean) / std, clipped, or the observation as it is."""
+        """Return (observation - mean) / std, clipped, or the observation unchanged without the option."""
         seen_by = statistics if self.normalise_observations else None
         return normalise(seen_by, observation, self.normalisation_limit)
 
     def scale(self, statistics: Statistics, reward: Scalars) -> Scalars:
-        """Return reward / std of the discounted return, clipped, or the reward as it is."""
+        """Return reward / std of the discounted return, clipped, or the reward unchanged without the option."""
         if not self.normalise_rewards:
             return reward
         return jnp.clip(reward / statistics.std, -self.normalisation_limit, self.normalisation_limit)
@@ -223,18 +223,18 @@ class PPO(Architecture):
         return jax.tree.map(lambda leaf: leaf[order].reshape(self.minibatches, -1, *leaf.shape[1:]), samples)
 
     def learning_rate_at(self, step: Count, total_updates: Scalar) -> Scalar:
-        """Return the learning rate of the update after `step` others, of `total_updates` in the run."""
+        """Return the learning rate of update number `step`, from 0, of `total_updates` in the run."""
         return jnp.float32(self.learning_rate * scheduled(self.learning_rate_schedule, step / total_updates))
 
     def normal_advantages(self, advantages: Scalars) -> Scalars:
-        """Return a minibatch's advantages brought to mean 0 and standard deviation 1, or as they are."""
+        """Return a minibatch's advantages with mean 0 and standard deviation 1, or unchanged without the option."""
         if not self.normalise_advantages:
             return advantages
         return (advantages - advantages.mean()) / (advantages.std() + EPSILON)
 
     @property
     def cadence(self) -> Cadence:
-        """One update for each rollout and no warm-up: a policy can only learn from what it did itself."""
+        """One update per rollout and no warm-up, since learning is on-policy."""
         return Cadence(
             warmup_steps=0,
             update_interval=self.rollout_steps,
@@ -244,13 +244,13 @@ class PPO(Architecture):
         )
 
     def memory(self, spec: Spec, steps: int) -> Rollout:
-        """Return a rollout yet to be made. Raises InputError for environments that do not share its steps evenly."""
+        """Return an empty rollout. Raises InputError if its steps are no multiple of the environments."""
         if self.rollout_steps % spec.environments:
             raise InputError(f"environments must divide rollout_steps, {self.rollout_steps}, not {spec.environments}")
         return Rollout.create(self.rollout_steps, spec)
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
-        """Return random networks, a policy near N(0, 1) everywhere, and statistics of nothing."""
+        """Return random networks, a policy near N(0, 1) everywhere, and empty statistics."""
         actor_key, critic_key = jax.random.split(key)
         sizes = spec.observation_size, self.hidden_sizes
         parameters = Parameters(
@@ -268,14 +268,14 @@ class PPO(Architecture):
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
-        """Return an unclipped sample to explore, else the mean clipped to [-1, 1]."""
+        """Return an unclipped sample if exploring, else the mean clipped to [-1, 1]."""
         policy = policy_at(state.parameters, self.normalise(state.observation_statistics, observation))
         if explore:
             return policy.sample(jax.random.normal(key, policy.mean.shape))
         return jnp.clip(policy.mean, -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the actor's layers, its spread and the statistics that it sees observations by."""
+        """Return the actor's layers, its log standard deviation and its observation normaliser."""
         actor, statistics = state.parameters.actor, state.observation_statistics
         normaliser = Normaliser(statistics.mean, statistics.std, jnp.float32(self.normalisation_limit))
         parameters = PolicyParameters(
@@ -286,12 +286,12 @@ class PPO(Architecture):
         return PolicyNetwork(parameters, actor.activation, "clipped_gaussian")
 
     def _optimiser(self, learning_rate: float | Scalar) -> optax.GradientTransformation:
-        # As one vector: few buffers to hand over when acting, which takes longer than the networks do.
+        # The state is one vector: passing many buffers when acting takes longer than computing the networks.
         return optax.flatten(make_optimiser(learning_rate, self.max_gradient_norm, epsilon=self.adam_epsilon))
 
 
 def by_environment(rollout: Any, state: State) -> Any:
-    """Return arrays [step, ...] of a rollout as [time, environment, ...], or as they are of a single environment."""
+    """Return arrays [step, ...] of a rollout as [time, environment, ...], or unchanged for a single environment."""
     environments = state.discounted_return.shape
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *environments, *leaf.shape[1:]), rollout)
 
