@@ -32,7 +32,7 @@ class Spec(NamedTuple):
     observation_size: int
     action_size: int
     environments: int = 1
-    """Environments that a seed steps side by side: their transitions of one turn follow each other in its memory."""
+    """Environments that a seed steps in parallel; their transitions of one turn are adjacent in its memory."""
 
 
 class Transition(NamedTuple):
@@ -132,13 +132,13 @@ class Cadence(NamedTuple):
     warmup_steps: int
     """Steps with uniform random actions and no update, before learning starts."""
     update_interval: int
-    """Steps after each of which it learns: 1 in strict order, or as many as a rollout has."""
+    """Steps between rounds of updates: 1 in strict order, or the length of a rollout."""
     updates_per_interval: int
-    """Calls of `update` each time that it learns, once the warm-up is over."""
+    """Calls of `update` after each interval, once the warm-up is over."""
     transitions_per_update: int
-    """Transitions that one call of `update` is given."""
+    """Transitions in one call of `update`."""
     has_schedule: bool = False
-    """Whether what is learnt depends on how many steps the run has in all, so that it cannot be extended."""
+    """Whether learning depends on the run's total number of steps, so that the run cannot be extended."""
 
     @property
     def first_update(self) -> int:

@@ -17,13 +17,13 @@ class Architecture:
     layer_norm: bool = False
     """Whether hidden layers are normalised over their outputs before the activation."""
     actor_activation: Activation | None = None
-    """Activation of the actor, if it is another."""
+    """Activation of the actor, if it differs from `activation`."""
     critic_activation: Activation | None = None
-    """Activation of the critics, if it is another."""
+    """Activation of the critics, if it differs from `activation`."""
     actor_layer_norm: bool | None = None
-    """Whether the actor has layer norm, if the critics do otherwise."""
+    """Whether the actor has layer norm, if it differs from `layer_norm`."""
     critic_layer_norm: bool | None = None
-    """Whether the critics have layer norm, if the actor does otherwise."""
+    """Whether the critics have layer norm, if it differs from `layer_norm`."""
 
     @property
     def actor_hidden(self) -> Hidden:

@@ -43,19 +43,19 @@ class CSAC(MaximumEntropy):
     """Conservative Soft Actor-Critic; the paper's own Algorithm 1 is the preset `paper`."""
 
     entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.2
-    """Weight of the entropy (the paper's sigma); `auto` learns it, to keep the entropy at its target as SAC does."""
+    """Weight of the entropy (the paper's sigma); `auto` learns it as SAC does, to keep the entropy at its target."""
     relative_entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.5
-    """Weight of the relative entropy towards the reference (the paper's tau); 0 is SAC."""
+    """Weight of the relative entropy to the reference policy (the paper's tau); 0 is SAC."""
     reference_policy: Literal["periodic", "average"] = "average"
-    """A copy of the actor, taken every `reference_period` updates, or a running average of past actors."""
+    """`periodic` copies the actor every `reference_period` updates; `average` is a running average of past actors."""
     reference_period: Annotated[int, COUNT] = 1000
-    """Updates between copies of the actor, with `periodic`; 1 is the paper's Algorithm 1."""
+    """With `periodic`: updates between copies of the actor; 1 is the paper's Algorithm 1."""
     reference_rate: Annotated[float, RATE] = 0.05
-    """Step size of the running average towards the actor, with `average`; 1 is the actor one update ago."""
+    """With `average`: step size of the running average towards the actor; 1 is the actor one update ago."""
     relative_entropy_estimator: Literal["closed_form", "sampled"] = "closed_form"
-    """The exact KL of the two policies, or the paper's log-ratio at the sampled action."""
+    """`closed_form` is the exact KL of the two policies, `sampled` the paper's log-ratio at the sampled action."""
     relative_entropy_form: Literal["explicit", "actor_only"] = "explicit"
-    """Whether the relative entropy is in the critic's target and in the actor's loss, or in the actor's loss alone."""
+    """`explicit` has the relative entropy in the critic's target and the actor's loss, `actor_only` in the latter."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on log π and on the relative entropy of an action in the critic's target, in nats; 0 is no bound."""
     relative_entropy_bound: Annotated[float, NOT_NEGATIVE] = 0.0

@@ -56,31 +56,31 @@ class OffPolicy(Architecture):
     target_rate: Annotated[float, RATE] = 0.005
     """Soft update rate of the target networks (rho of CSAC's paper, tau of the others')."""
     n_steps: Annotated[int, COUNT] = 1
-    """Environment steps whose rewards a critic's target sums before it counts on the critics."""
+    """Environment steps whose rewards a critic's target sums before it bootstraps."""
     normalise_rewards: bool = False
-    """Whether rewards are divided, when they are drawn, by the running standard deviation of the discounted return."""
+    """Whether to divide rewards, when they are drawn, by the running standard deviation of the discounted return."""
     actor_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the actor."""
     critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the critics."""
     learning_rate_schedule: Schedule = "constant"
-    """How both fall to zero over the run: not at all, linearly or as a cosine. A learnt temperature keeps its rate."""
+    """Decay of the actor's and the critics' learning rate to zero over the run; a learnt temperature keeps its rate."""
     actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
     batch_size: Annotated[int, COUNT] = 256
-    """Transitions in one update (the paper's M); SD3 takes as many for each of its two pairs."""
+    """Transitions in one update (the paper's M); SD3 uses as many for each of its two actor-critic pairs."""
     replay_size: Annotated[int, COUNT] = 1_000_000
-    """Transitions that the replay keeps."""
+    """Capacity of the replay buffer, in transitions."""
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts (the paper's T_initial)."""
     updates_per_step: Annotated[float, UPDATES] = 1.0
-    """Updates per environment step; 0.25 is one after every fourth (rounded to a fraction of at most hundredths)."""
+    """Updates per environment step; 0.25 is one every 4 steps (rounded to a fraction with denominator up to 100)."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps between rounds of updates (whole turns of all environments); 1 is strict order."""
+    """Environment steps between rounds of updates, rounded up to a multiple of the environments; 1 is strict order."""
     exploration_noise: Noise = "white"
-    """How exploration noise goes together over steps: not at all, over all time scales (pink), over some seven (ou)."""
+    """Correlation of exploration noise over steps: none (white), on all time scales (pink), over about 7 steps (ou)."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
     """Decay of the average gradient in the networks' Adam (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
@@ -186,15 +186,15 @@ class MaximumEntropy(TwinCritics):
     """Hyperparameters that CSAC and SAC share: for a learnt (`auto`) entropy weight and an average of actors."""
 
     initial_entropy_weight: Annotated[float, POSITIVE] = 1.0
-    """What an entropy weight of `auto` begins with."""
+    """Initial value of an entropy weight that is `auto`."""
     target_entropy: float | None = None
-    """Entropy that `auto` aims at, in nats; by default `target_entropy_per_dimension` for each action dimension."""
+    """Target entropy of `auto`, in nats; by default `target_entropy_per_dimension` times the action dimensions."""
     target_entropy_per_dimension: float = -1.0
-    """Entropy that `auto` aims at, in nats per action dimension."""
+    """Target entropy of `auto`, in nats per action dimension."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of an entropy weight that is `auto`."""
     policy_average_rate: Annotated[float, RATE] = 1.0
-    """Step size of the average of past actors that is evaluated and exported, larger at first; 1 is the actor."""
+    """Step size of the evaluated and exported average of past actors, larger at first; 1 is the actor itself."""
 
     def first_networks(self, key: Key, spec: Spec, steps: int, actor_outputs: int) -> dict[str, Any]:
         """Return the initial state's fields that the two share; the average is a copy of the actor."""

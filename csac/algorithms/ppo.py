@@ -85,7 +85,7 @@ class PPO(Architecture):
     learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate, initial or constant."""
     learning_rate_schedule: Schedule = "linear"
-    """How the learning rate falls to zero over the run: not at all, linearly or as a cosine."""
+    """Decay of the learning rate to zero over the run: none, linear or cosine."""
     discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
     trace_decay: Annotated[float, SHARE] = 0.95
@@ -93,9 +93,9 @@ class PPO(Architecture):
     clip_range: Annotated[float, POSITIVE] = 0.2
     """Distance of the probability ratio from 1 beyond which its gradient stops (epsilon)."""
     clip_value_loss: bool = True
-    """Whether to clip the value loss where a value moves by more than `clip_range`, which is little for raw rewards."""
+    """Whether to clip the change of a value in its loss to `clip_range`, which is little for unnormalised rewards."""
     value_loss_weight: Annotated[float, NOT_NEGATIVE] = 0.5
-    """Weight of the value loss beside the policy's."""
+    """Weight of the value loss relative to the policy loss."""
     entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.0
     """Weight of the policy's entropy."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.5
@@ -103,7 +103,7 @@ class PPO(Architecture):
     adam_epsilon: Annotated[float, POSITIVE] = 1e-5
     """Added to the root of Adam's second moment (its epsilon)."""
     rollout_steps: Annotated[int, COUNT] = 2048
-    """Environment steps between updates, all of which are learnt from."""
+    """Environment steps in one rollout, after which one update learns from all of them."""
     minibatches: Annotated[int, COUNT] = 32
     """Number of equal parts into which each epoch divides the rollout."""
     epochs: Annotated[int, COUNT] = 10

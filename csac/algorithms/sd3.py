@@ -45,7 +45,7 @@ class SD3(OffPolicy):
     """Softmax Deep Double Deterministic policy gradients (its Algorithm 1)."""
 
     inverse_temperature: Annotated[float, NOT_NEGATIVE] = 0.05
-    """How strongly the value of a state leans to its best sampled actions (the paper's beta); 0 is the mean."""
+    """How strongly the value of a state favours its best sampled actions (the paper's beta); 0 is their mean."""
     noise_samples: Annotated[int, COUNT] = 50
     """Actions sampled around the target actor's action to value a state (the paper's K)."""
     importance_sampling: bool = False
