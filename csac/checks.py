@@ -22,8 +22,8 @@ def without_controls(content: bytes) -> bytes:
 def check_whole(name: str, value: object, least: int, most: int) -> None:
     """Raise InputError unless the value is a whole number from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        told = "at least 1" if least == 1 else f"{least} or more"
-        raise InputError(f"{name} must be a whole number of {told}, not {value!r:.40}")
+        range_words = "at least 1" if least == 1 else f"{least} or more"
+        raise InputError(f"{name} must be a whole number of {range_words}, not {value!r:.40}")
     if value > most:
         raise InputError(
             f"{name} must be at most {most:,}, not {value:.3g}" if value < 1e300 else f"{name} is too large"
@@ -39,7 +39,7 @@ def check_flag(name: str, value: object) -> None:
 def check_callable(name: str, value: object) -> None:
     """Raise InputError unless the value is None or callable."""
     if value is not None and not callable(value):
-        raise InputError(f"{name} is a function that is called, not {value!r:.40}")
+        raise InputError(f"{name} must be a function, not {value!r:.40}")
 
 
 def check_path(name: str, value: object) -> None:
@@ -66,6 +66,6 @@ def closest(word: str, known: Iterable[str], most: int = 1) -> list[str]:
     """Return the known words closest to `word`, ignoring case."""
     names = {name.lower().lstrip("-"): name for name in known}  # leading dashes would make all options similar
     word = word.lower().lstrip("-")
-    begun = [name for name in names if len(word) >= 3 and name.startswith(word)]
-    exact = [word] if word in names else begun if len(begun) == 1 else []
+    completions = [name for name in names if len(word) >= 3 and name.startswith(word)]
+    exact = [word] if word in names else completions if len(completions) == 1 else []
     return [names[match] for match in exact or difflib.get_close_matches(word, names, n=most)]

@@ -34,7 +34,7 @@ _PR_SET_PDEATHSIG = 1
 _SAFE_PATH = "PYTHONSAFEPATH"  # keeps a child from importing files of the working directory
 
 # Windows has no SIGHUP.
-_HELD_BACK = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
+_BLOCKED_SIGNALS = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
 
 
 def usable_cores() -> list[int]:
@@ -79,10 +79,10 @@ def memory_left(folders: Iterable[Path] | None = None) -> int | None:
 def control_groups(listed: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> list[Path]:
     """Return the folders of this process's control groups (Linux, version 2), from its own to the outermost."""
     try:
-        own = next(line[3:] for line in listed.read_text().splitlines() if line.startswith("0::"))
+        own = Path(next(line[3:] for line in listed.read_text().splitlines() if line.startswith("0::")))
     except (OSError, StopIteration):
         return []
-    return [root / path.relative_to("/") for path in (Path(own), *Path(own).parents) if ".." not in path.parts]
+    return [root / path.relative_to("/") for path in (own, *own.parents) if ".." not in path.parts]
 
 
 def move_to(cores: Sequence[int]) -> None:
@@ -111,34 +111,34 @@ def outlive_termination() -> None:
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows: nothing was blocked
         return
-    before = signal.signal(signal.SIGTERM, _pass_over)
+    before = signal.signal(signal.SIGTERM, _ignore_signal)
     signal.siginterrupt(signal.SIGTERM, False)  # native code may not expect interrupted system calls
     os.register_at_fork(  # for forks without an exec
-        before=_hold_back, after_in_parent=_let_through, after_in_child=lambda: _take_back(before)
+        before=_block_sigterm, after_in_parent=_restore_mask, after_in_child=lambda: _restore_sigterm(before)
     )
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
-def _pass_over(*_: Any) -> None:
+def _ignore_signal(*_: Any) -> None:
     """Handle a signal by doing nothing."""
 
 
-def _take_back(handler: Any) -> None:
+def _restore_sigterm(handler: Any) -> None:
     """Restore the SIGTERM handler from before `outlive_termination`, unless the task has set another."""
-    if signal.getsignal(signal.SIGTERM) is _pass_over:
+    if signal.getsignal(signal.SIGTERM) is _ignore_signal:
         signal.signal(signal.SIGTERM, handler)
-    _let_through()
+    _restore_mask()
 
 
 _forking = threading.local()
 
 
-def _hold_back() -> None:
+def _block_sigterm() -> None:
     """Block SIGTERM around a fork, so that it reaches the child only after its handler is restored."""
     _forking.mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 
 
-def _let_through() -> None:
+def _restore_mask() -> None:
     signal.pthread_sigmask(signal.SIG_SETMASK, _forking.mask)
 
 
@@ -172,17 +172,17 @@ class Child:
 
     def __init__(self, work: Callable[..., None], *arguments: Any) -> None:
         context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
+        self.connection, child_connection = context.Pipe()
         before = os.environ.get(_SAFE_PATH)
-        self.process = context.Process(target=_work, args=(before, work, theirs, *arguments))
+        self.process = context.Process(target=_run_child, args=(before, work, child_connection, *arguments))
         try:
-            with safe_path(), worker_surroundings(), _without_a_script_that_is_none():
+            with safe_path(), worker_surroundings(), _hide_missing_script():
                 self.process.start()
         except BaseException:  # a Ctrl-C that was blocked while the process started
             if self.process.pid:
                 self.kill()
             raise
-        theirs.close()
+        child_connection.close()
         # At exit, Python joins its child processes; one that nobody has closed would wait for messages for ever.
         self._at_exit = Finalize(None, _kill, (self.process,), exitpriority=0)
 
@@ -204,7 +204,7 @@ class Child:
                 "this script starts processes that import it, and would run anew in each of them: put what it runs "
                 'under `if __name__ == "__main__":`, or use seeds_per_process=seeds and evaluation_processes=0'
             )
-        return "its process spoke no more and was killed" if code is None else cause_of_death(code)
+        return "its process stopped responding and was killed" if code is None else cause_of_death(code)
 
     def kill(self) -> None:
         """End the process at once, and wait until it is gone."""
@@ -214,7 +214,7 @@ class Child:
             self._at_exit.cancel()
 
 
-def _work(safe_path: str | None, work: Callable[..., None], *arguments: Any) -> None:
+def _run_child(safe_path: str | None, work: Callable[..., None], *arguments: Any) -> None:
     """Run a child's work, with the parent's PYTHONSAFEPATH restored for the child's own children."""
     os.environ.pop(_SAFE_PATH, None)
     if safe_path is not None:
@@ -256,7 +256,7 @@ def worker_surroundings() -> Iterator[None]:
     resource_tracker.ensure_running()  # would otherwise start at the first spawn and unblock the signals
     has_masks = hasattr(signal, "pthread_sigmask")  # not on Windows, where a Ctrl-C reaches the workers too
     with _environment(dict.fromkeys(names, "1")):
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK) if has_masks else set()
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _BLOCKED_SIGNALS) if has_masks else set()
         try:
             yield
         finally:
@@ -265,7 +265,7 @@ def worker_surroundings() -> Iterator[None]:
 
 
 @contextmanager
-def _without_a_script_that_is_none() -> Iterator[None]:
+def _hide_missing_script() -> Iterator[None]:
     """Hide a `__file__` that is no file ("<stdin>"), which Pythons started in this block would try to run."""
     main = vars(sys.modules["__main__"])
     hidden = {"__file__": main.pop("__file__")} if "__file__" in main and script() is None else {}

@@ -48,7 +48,7 @@ NAMES: Mapping[str, str] = {
     "--out": "--video",
 }
 
-_FORMERLY: Mapping[tuple[str, str], str] = {
+_FORMER_VALUES: Mapping[tuple[str, str], str] = {
     ("reference_policy", "previous"): 'reference_policy="average", reference_rate=1',
     ("reference_policy", "algorithm1"): 'reference_policy="periodic", reference_period=1',
 }
@@ -56,8 +56,8 @@ _FORMERLY: Mapping[tuple[str, str], str] = {
 
 def called_here(option: str, known: Collection[str]) -> str:
     """Return a hint such as "it is --discount here" if `option` is another name of a `known` one, else ""."""
-    told = NAMES.get(option, "")
-    return f"it is {told} here" if {*re.findall(r"--[a-z-]+", told)} & {*known} else ""
+    names_here = NAMES.get(option, "")
+    return f"it is {names_here} here" if {*re.findall(r"--[a-z-]+", names_here)} & {*known} else ""
 
 
 def called_in_python(name: str, known: Collection[str]) -> str:
@@ -70,4 +70,4 @@ def written_in_python(name: str, value: object) -> str:
     """Return how a value of former versions is written now, or ""."""
     if name == "exploration_noise" and isinstance(value, float):
         return f"write exploration_std={value}"
-    return f"write {_FORMERLY[name, value]}" if isinstance(value, str) and (name, value) in _FORMERLY else ""
+    return f"write {_FORMER_VALUES[name, value]}" if isinstance(value, str) and (name, value) in _FORMER_VALUES else ""

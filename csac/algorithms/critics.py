@@ -65,9 +65,9 @@ def update_critics(
     """
     critics, optimiser_state, targets = state.critics, state.critic_optimiser, state.target_critics
     if targets is not None:
-        goals = jax.vmap(partial(critic_target, targets=targets))(batch, noise)
+        target_values = jax.vmap(partial(critic_target, targets=targets))(batch, noise)
         critics, optimiser_state, metrics = gradient_step(
-            optimiser, critic_loss, critics, optimiser_state, batch, goals
+            optimiser, critic_loss, critics, optimiser_state, batch, target_values
         )
         folded = critics
     else:

@@ -96,8 +96,8 @@ class CSAC(MaximumEntropy):
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
         # Line 21: a gradient step on J(φ)
-        given = (folded_critics, batch.observation, actor_noise, step)
-        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
+        arguments = (folded_critics, batch.observation, actor_noise, step)
+        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *arguments)
         # Line 23: θ̂ᵢ ← ρ θᵢ + (1 - ρ) θ̂ᵢ
         state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
         return state, {**metrics, **actor_metrics, **({"entropy_weight": sigma} if state.temperature else {})}
@@ -148,18 +148,18 @@ class CSAC(MaximumEntropy):
         loss = -(q_value - sigma * log_prob - self.relative_entropy_weight * relative_entropy)
         return loss, {"actor_loss": loss, "entropy": -log_prob, "relative_entropy": relative_entropy}
 
-    def reference_before(self, kept: MLP, actor: MLP, step: Count) -> MLP:
+    def reference_before(self, reference: MLP, actor: MLP, step: Count) -> MLP:
         """Return φ_p for update number `step`: the current one, or the actor at every `reference_period`-th update."""
         if self.reference_policy == "average":
-            return kept
+            return reference
         if self.reference_period == 1:
             return actor
         is_due = step % self.reference_period == 0
-        return jax.tree.map(partial(jnp.where, is_due), actor, kept)
+        return jax.tree.map(partial(jnp.where, is_due), actor, reference)
 
-    def reference_after(self, used: MLP, actor: MLP) -> MLP:
-        """Return φ_p after an update that used `used`; `actor` is the one before that update."""
-        return polyak(used, actor, self.reference_rate) if self.reference_policy == "average" else used
+    def reference_after(self, reference: MLP, actor: MLP) -> MLP:
+        """Return φ_p after an update that used `reference`; `actor` is the one before that update."""
+        return polyak(reference, actor, self.reference_rate) if self.reference_policy == "average" else reference
 
     def sigma(self, state: State) -> Any:
         """Return σ: the given weight or, with `auto`, the learnt one."""

@@ -28,9 +28,9 @@ def keys_at(noise: Noise, key: Key, step: Count) -> Key:
     if noise == "ou":
         return jax.vmap(jax.random.fold_in, (None, 0))(key, step - jnp.arange(WINDOW))
     lengths = 2 ** jnp.arange(OCTAVES)
-    held = (step + lengths // 2) // lengths  # offset by half a length each, so that few are redrawn at the same step
+    indices = (step + lengths // 2) // lengths  # offset by half a length each, so that few are redrawn at the same step
     octaves = jax.vmap(jax.random.fold_in, (None, 0))(key, lengths)
-    return jax.vmap(jax.random.fold_in)(octaves, held)
+    return jax.vmap(jax.random.fold_in)(octaves, indices)
 
 
 def keys_of(noise: Noise, run: Key, step: Count, environments: int) -> Key:

@@ -38,14 +38,14 @@ class Replay:
         cls,
         capacity: int,
         spec: Spec,
-        together: int = 1,
+        rows_per_add: int = 1,
         *,
         n_steps: int = 1,
         discount: float = 1.0,
         scale_rewards: bool = False,
     ) -> Replay:
-        """Return an empty buffer for adding `together` rows at a time; the capacity is rounded up to a multiple."""
-        capacity = -(-capacity // together) * together
+        """Return an empty buffer for adding `rows_per_add` rows at a time; the capacity is rounded up to a multiple."""
+        capacity = -(-capacity // rows_per_add) * rows_per_add
         returns = ReturnScale.create(spec.environments) if scale_rewards else None
         return cls(jnp.zeros((capacity, row_width(spec)), jnp.float32), n_steps, discount, returns)
 
@@ -81,27 +81,27 @@ class Replay:
         """Return the transitions that start at these rows; none extends past the newest of the `count` rows added."""
         if self.n_steps == 1:
             return jax.vmap(unpack, in_axes=(0, None))(self.rows[indices], spec)
-        capacity, ahead = self.rows.shape[0], spec.environments * jnp.arange(self.n_steps)
+        capacity, offsets = self.rows.shape[0], spec.environments * jnp.arange(self.n_steps)
         newest = (count - 1) % capacity
 
         def window(index: Count) -> Transition:
-            steps = jax.vmap(unpack, in_axes=(0, None))(self.rows[(index + ahead) % capacity], spec)
-            return summed(steps, ahead <= (newest - index) % capacity, self.discount)
+            steps = jax.vmap(unpack, in_axes=(0, None))(self.rows[(index + offsets) % capacity], spec)
+            return summed(steps, offsets <= (newest - index) % capacity, self.discount)
 
         return jax.vmap(window)(indices)
 
 
-def summed(steps: Transition, is_there: Bool[Array, " n"], discount: float) -> Transition:
+def summed(steps: Transition, is_available: Bool[Array, " n"], discount: float) -> Transition:
     """Return up to n consecutive environment steps as one: reward Σ γᵏ rₖ, next observation and flags of the last.
 
     The sum stops after a step that ended the episode, or whose next observation is not the following step's
     observation: nothing else shows an episode cut off by a resume or a fork, or lost rows.
     """
     ended = (steps.terminated[:-1] > 0) | (steps.truncated[:-1] > 0)
-    follows = jnp.all(steps.observation[1:] == steps.next_observation[:-1], axis=-1) & ~ended & is_there[1:]
-    belongs = jnp.concatenate([jnp.ones(1), jnp.cumprod(follows)])
-    length = jnp.sum(belongs)
-    reward = jnp.sum(belongs * discount ** jnp.arange(len(belongs)) * steps.reward)
+    follows = jnp.all(steps.observation[1:] == steps.next_observation[:-1], axis=-1) & ~ended & is_available[1:]
+    is_included = jnp.concatenate([jnp.ones(1), jnp.cumprod(follows)])
+    length = jnp.sum(is_included)
+    reward = jnp.sum(is_included * discount ** jnp.arange(len(is_included)) * steps.reward)
     last = jax.tree.map(lambda leaf: leaf[length.astype(int) - 1], steps)
     return last._replace(observation=steps.observation[0], action=steps.action[0], reward=reward, steps=length)
 

@@ -113,7 +113,9 @@ def plain_layers(network: Any) -> tuple[Layer, ...]:
     if isinstance(network, MLP):
         return network.layers
     kind = type(network).__name__
-    raise InputError(f"{kind} is no MLP, and policies leave as plain layers: have `policy` give such, or use an MLP")
+    raise InputError(
+        f"{kind} is not an MLP, but policies are exported as plain layers: override `policy` or use an MLP"
+    )
 
 
 def polyak(targets: Any, sources: Any, rate: float | Scalar) -> Any:
@@ -161,7 +163,7 @@ def scheduled(schedule: Schedule, progress: Scalar) -> Scalar | float:
     return 1.0
 
 
-def follow(schedule: Schedule, planned: int) -> optax.GradientTransformation:
+def apply_schedule(schedule: Schedule, planned: int) -> optax.GradientTransformation:
     """Return a transformation that scales an optimiser's steps by a schedule; its state has how many are `planned`."""
 
     def init(parameters: Any) -> Progress:

@@ -27,8 +27,8 @@ from csac.algorithms.memory import Replay
 from csac.algorithms.networks import (
     MLP,
     Schedule,
+    apply_schedule,
     copy_tree,
-    follow,
     init_optimiser,
     learnable,
     make_mlp,
@@ -116,10 +116,10 @@ class OffPolicy(Architecture):
 
     def memory(self, spec: Spec, steps: int) -> Replay:
         """Return an empty replay buffer for `replay_size` transitions, or for the whole run if that is shorter."""
-        together = self.cadence.side_by_side(spec.environments).update_interval
+        rows_per_add = self.cadence.side_by_side(spec.environments).update_interval
         capacity, scaled = min(self.replay_size, steps), self.normalise_rewards
-        returns: dict[str, Any] = {"n_steps": self.n_steps, "discount": self.discount, "scale_rewards": scaled}
-        return Replay.create(capacity, spec, together, **returns)
+        reward_options: dict[str, Any] = {"n_steps": self.n_steps, "discount": self.discount, "scale_rewards": scaled}
+        return Replay.create(capacity, spec, rows_per_add, **reward_options)
 
     def discount_after(self, transition: Transition) -> Scalar:
         """Return the discount of the next state's value: γ (1 - terminated), with γᵐ for a transition of m steps."""
@@ -140,7 +140,7 @@ class OffPolicy(Architecture):
         adam = make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)
         if self.learning_rate_schedule == "constant":
             return adam
-        return optax.chain(adam, follow(self.learning_rate_schedule, planned))
+        return optax.chain(adam, apply_schedule(self.learning_rate_schedule, planned))
 
 
 @dataclass(frozen=True)

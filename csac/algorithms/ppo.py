@@ -163,32 +163,32 @@ class PPO(Architecture):
         """Absorb the rollout into the statistics, then take `epochs` times `minibatches` gradient steps on it."""
         in_time = by_environment(batch, state)
         returns, discounted_return = discounted_returns(state.discounted_return, in_time, self.discount)
-        absorbed = state._replace(
+        new_state = state._replace(
             observation_statistics=state.observation_statistics.absorb(batch.observation),
             returns=state.returns.absorb(returns.ravel()),
             discounted_return=discounted_return,
         )
-        samples = self.samples(state, absorbed, batch)
+        samples = self.samples(state, new_state, batch)
         learning_rate = self.learning_rate_at(step, state.total_updates)
         optimiser = self._optimiser(learning_rate)
 
-        def learn(learnt: tuple[Parameters, Any], minibatch: Sample) -> tuple[tuple[Parameters, Any], Metrics]:
-            minibatch = minibatch._replace(advantage=self.normal_advantages(minibatch.advantage))
-            parameters, optimiser_state, metrics = gradient_step(optimiser, self.loss, *learnt, minibatch)
+        def learn(carry: tuple[Parameters, Any], minibatch: Sample) -> tuple[tuple[Parameters, Any], Metrics]:
+            minibatch = minibatch._replace(advantage=self.normalised_advantages(minibatch.advantage))
+            parameters, optimiser_state, metrics = gradient_step(optimiser, self.loss, *carry, minibatch)
             return (parameters, optimiser_state), metrics
 
-        def pass_over(learnt: tuple[Parameters, Any], key: Key) -> tuple[tuple[Parameters, Any], Metrics]:
-            return jax.lax.scan(learn, learnt, self.shuffled(samples, key))
+        def pass_over(carry: tuple[Parameters, Any], key: Key) -> tuple[tuple[Parameters, Any], Metrics]:
+            return jax.lax.scan(learn, carry, self.shuffled(samples, key))
 
         keys = jax.random.split(key, self.epochs)
         (parameters, optimiser_state), metrics = jax.lax.scan(pass_over, (state.parameters, state.optimiser), keys)
-        return absorbed._replace(parameters=parameters, optimiser=optimiser_state), {
+        return new_state._replace(parameters=parameters, optimiser=optimiser_state), {
             **jax.tree.map(jnp.mean, metrics),
             "explained_variance": explained_variance(samples.value, samples.target),
             "learning_rate": learning_rate,
         }
 
-    def samples(self, state: State, absorbed: State, batch: Transition) -> Sample:
+    def samples(self, state: State, new_state: State, batch: Transition) -> Sample:
         """Return the samples: log-probabilities with the statistics used in acting, all else with the updated ones."""
 
         def log_prob(observation: Observation, action: Action) -> Scalar:
@@ -196,13 +196,13 @@ class PPO(Architecture):
                 action
             )
 
-        normalise = jax.vmap(partial(self.normalise, absorbed.observation_statistics))
+        normalise = jax.vmap(partial(self.normalise, new_state.observation_statistics))
         observations, next_observations = normalise(batch.observation), normalise(batch.next_observation)
         value = jax.vmap(partial(value_at, state.parameters))
         values, next_values = value(observations), value(next_observations)
-        scaled = batch._replace(reward=self.scale(absorbed.returns, batch.reward))
-        given = by_environment((scaled, values, next_values), state)
-        advantages = advantages_of(*given, discount=self.discount, trace_decay=self.trace_decay).ravel()
+        scaled = batch._replace(reward=self.scale(new_state.returns, batch.reward))
+        arguments = by_environment((scaled, values, next_values), state)
+        advantages = advantages_of(*arguments, discount=self.discount, trace_decay=self.trace_decay).ravel()
         log_probs = jax.vmap(log_prob)(batch.observation, batch.action)
         return Sample(observations, batch.action, log_probs, values, advantages, values + advantages)
 
@@ -226,7 +226,7 @@ class PPO(Architecture):
         """Return the learning rate of update number `step`, from 0, of `total_updates` in the run."""
         return jnp.float32(self.learning_rate * scheduled(self.learning_rate_schedule, step / total_updates))
 
-    def normal_advantages(self, advantages: Scalars) -> Scalars:
+    def normalised_advantages(self, advantages: Scalars) -> Scalars:
         """Return a minibatch's advantages with mean 0 and standard deviation 1, or unchanged without the option."""
         if not self.normalise_advantages:
             return advantages

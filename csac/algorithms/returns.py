@@ -17,7 +17,7 @@ def discounted_returns(
 
     def advance(running: jax.Array, transition: Transition) -> tuple[jax.Array, jax.Array]:
         running = discount * running + transition.reward
-        return running * _goes_on(transition), running
+        return running * _continues(transition), running
 
     last, returns = jax.lax.scan(advance, start, batch)
     return returns, last
@@ -36,7 +36,7 @@ def advantages_of(
     s_{t+1}. Nothing is carried back over the end of an episode, terminated or truncated, nor from beyond the rollout.
     """
     errors = batch.reward + discount * (1.0 - batch.terminated) * next_values - values
-    decays = discount * trace_decay * _goes_on(batch)
+    decays = discount * trace_decay * _continues(batch)
 
     def step_back(advantage: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         error, decay = step
@@ -53,6 +53,6 @@ def explained_variance(values: Scalars, targets: Scalars) -> Scalar:
     return jnp.where(variance > 0, explained, 0.0)
 
 
-def _goes_on(transition: Transition) -> Float[Array, "..."]:
+def _continues(transition: Transition) -> Float[Array, "..."]:
     """Return 0 where the episode was terminated or truncated, else 1."""
     return (1.0 - transition.terminated) * (1.0 - transition.truncated)

@@ -16,7 +16,7 @@ from csac.algorithms.networks import MLP, gradient_step, polyak
 from csac.algorithms.off_policy import MaximumEntropy, evaluated_actor, first_metrics, improve_delayed, policy_network
 from csac.algorithms.shapes import Action, Actions, Count, Key, Observation, Observations, Scalar
 from csac.algorithms.statistics import Statistics, normalise, normalise_batch
-from csac.algorithms.temperature import Temperature, logarithm
+from csac.algorithms.temperature import Temperature, finite_log
 from csac.types import Metrics, PolicyNetwork, Spec, Transition
 
 
@@ -67,7 +67,7 @@ class SAC(MaximumEntropy):
         statistics, batch = normalise_batch(state.observation_statistics, batch)
         state = state._replace(observation_statistics=statistics)
         if self.entropy_weight != "auto":  # a fork may have changed it
-            log_weight = logarithm(self.entropy_weight)
+            log_weight = finite_log(self.entropy_weight)
             state = state._replace(temperature=state.temperature._replace(log_weight=log_weight))
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.temperature.log_weight)
@@ -76,8 +76,8 @@ class SAC(MaximumEntropy):
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
 
-        given = (folded_critics, batch.observation, actor_noise, step)
-        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
+        arguments = (folded_critics, batch.observation, actor_noise, step)
+        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *arguments)
         state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
         return state, {**metrics, **actor_metrics, "temperature": temperature}
 

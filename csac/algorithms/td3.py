@@ -72,8 +72,8 @@ class TD3(TwinCritics):
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(self.smoothed_action, state.target_actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, noise, critic_target, next_action)
 
-        given = (folded_critics, batch.observation)
-        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
+        arguments = (folded_critics, batch.observation)
+        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *arguments)
         return state, {**metrics, **actor_metrics}
 
     def improve(self, state: State, critics: Critics, observations: Observations) -> tuple[State, Metrics]:

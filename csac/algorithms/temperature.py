@@ -27,11 +27,11 @@ class Temperature(NamedTuple):
 
 def make_temperature(weight: float, optimiser: optax.GradientTransformation) -> Temperature:
     """Return the initial state of a learnt weight."""
-    log_weight = logarithm(weight)
+    log_weight = finite_log(weight)
     return Temperature(log_weight, init_optimiser(optimiser, log_weight))
 
 
-def logarithm(weight: float) -> Scalar:
+def finite_log(weight: float) -> Scalar:
     """Return log w; for log 0, the lowest finite float, whose exp is 0."""
     return jnp.maximum(jnp.log(jnp.float32(weight)), jnp.finfo(jnp.float32).min)
 
