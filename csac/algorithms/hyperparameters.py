@@ -117,7 +117,7 @@ def _as_float(value: Any, kind: Any) -> float:
     return float(value)
 
 
-def _as_integer(value: Any, kind: Any = int) -> int:
+def _as_integer(value: Any, kind: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise ValueError("a whole number")
     number = int(value)

@@ -113,9 +113,7 @@ def plain_layers(network: Any) -> tuple[Layer, ...]:
     if isinstance(network, MLP):
         return network.layers
     kind = type(network).__name__
-    raise InputError(
-        f"{kind} is not an MLP, but policies are exported as plain layers: override `policy` or use an MLP"
-    )
+    raise InputError(f"{kind} is no MLP, but policies are exported as plain layers: override `policy` or use an MLP")
 
 
 def polyak(targets: Any, sources: Any, rate: float | Scalar) -> Any:

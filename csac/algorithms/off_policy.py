@@ -169,15 +169,14 @@ class TwinCritics(OffPolicy):
         critics = learnable(self.make_critic(first_key, spec)), learnable(self.make_critic(second_key, spec))
         if self.critic_normalisation == "batch" and not isinstance(critics[0], MLP):
             raise InputError(f"critic_normalisation batch is for MLPs, not for {type(critics[0]).__name__}")
+        statistics = Statistics.create((spec.observation_size,)) if self.normalise_observations else None
         return {
             "actor": actor,
             "critics": critics,
             "target_critics": copy_tree(critics) if self.critic_normalisation == "none" else None,
             "actor_optimiser": init_optimiser(actor_adam, actor),
             "critic_optimiser": init_optimiser(self.optimiser(self.critic_learning_rate, planned), critics),
-            "observation_statistics": Statistics.create((spec.observation_size,))
-            if self.normalise_observations
-            else None,
+            "observation_statistics": statistics,
         }
 
 

@@ -192,9 +192,8 @@ class PPO(Architecture):
         """Return the samples: log-probabilities with the statistics used in acting, all else with the updated ones."""
 
         def log_prob(observation: Observation, action: Action) -> Scalar:
-            return policy_at(state.parameters, self.normalise(state.observation_statistics, observation)).log_prob(
-                action
-            )
+            normalised = self.normalise(state.observation_statistics, observation)
+            return policy_at(state.parameters, normalised).log_prob(action)
 
         normalise = jax.vmap(partial(self.normalise, new_state.observation_statistics))
         observations, next_observations = normalise(batch.observation), normalise(batch.next_observation)
