@@ -1,4 +1,4 @@
-"""`python -m csac` is `csac`."""
+"""Run the command `csac` as `python -m csac`."""
 
 import sys
 

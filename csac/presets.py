@@ -1,4 +1,4 @@
-"""Presets as data: (preset, algorithm, task) -> hyperparameters. `paper`: its tables; `strong`: faster critics."""
+"""Presets of hyperparameters by algorithm and task: `paper` has the paper's tables, `strong` faster critics."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _PAPER_COMMON: Mapping[str, Any] = {
     **_ALIKE,
 }
 
-# What the table does not say of TD3 and SD3, and the papers of both say alike.
+# What the table leaves out for TD3 and SD3; the papers of both have the same values.
 _NOISE: Mapping[str, Any] = {"exploration_std": 0.1, "target_noise": 0.2, "target_noise_clip": 0.5}
 
 _PAPER: Mapping[str, Mapping[str, Any]] = {
@@ -67,7 +67,7 @@ _PAPER: Mapping[str, Mapping[str, Any]] = {
         "noise_samples": 50,
         "importance_sampling": False,
     },
-    # The paper's column PPO where it says something ("batch size 32" read as 32 minibatches), else PARL's example.
+    # The paper's column PPO ("batch size 32" read as 32 minibatches), and PARL's example for what it leaves out.
     "ppo": {
         "learning_rate": 3e-4,
         "learning_rate_schedule": "linear",
@@ -101,8 +101,8 @@ _PAPER_TASKS: Mapping[tuple[str, str], Mapping[str, Any]] = {
     **{("sd3", f"{task}-v5"): {"inverse_temperature": beta} for task, beta in _SD3_TASKS},
 }
 
-# Critics that learn faster: pieces and sources in docs/algorithms/critics.md, runs in results/strong.
-# One setting for all tasks, which names all that it uses: a later default changes nothing of what was measured.
+# Critics that learn faster: parts and sources in docs/algorithms/critics.md, runs in results/strong.
+# One setting for all tasks. It names every value, so that new defaults cannot change what was measured.
 _FASTER_CRITICS: Mapping[str, Any] = {
     **_PAPER_COMMON,
     "critic_normalisation": "batch",
@@ -144,11 +144,11 @@ PRESETS: tuple[str, ...] = tuple(_ALGORITHMS)
 def hyperparameters(preset: str, algorithm: str, task: str) -> dict[str, Any]:
     """Return the hyperparameters, by field name, that `preset` gives `algorithm` on `task`.
 
-    `task` is a Gymnasium id, with or without the module in front; a task that the preset does not name gets what the
-    algorithm has in common on all tasks.
+    `task` is a Gymnasium id, with or without the module in front; a task that the preset does not name gets the
+    algorithm's values for all tasks.
 
     Raises:
-        InputError: no such preset, one that says nothing of the algorithm, or a task that is no text.
+        InputError: unknown preset, a preset without the algorithm, or a task that is not a string.
     """
     if preset not in PRESETS:
         raise InputError(f"no preset is called {preset!r}: choose {' or '.join(PRESETS)}")

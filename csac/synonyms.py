@@ -1,4 +1,4 @@
-"""What papers and other libraries call our options, and what options were called formerly."""
+"""Names of our options in papers and other libraries, and how values of former versions are written now."""
 
 from __future__ import annotations
 
@@ -48,26 +48,26 @@ NAMES: Mapping[str, str] = {
     "--out": "--video",
 }
 
-_FORMERLY: Mapping[tuple[str, str], str] = {
+_FORMER_VALUES: Mapping[tuple[str, str], str] = {
     ("reference_policy", "previous"): 'reference_policy="average", reference_rate=1',
     ("reference_policy", "algorithm1"): 'reference_policy="periodic", reference_period=1',
 }
 
 
 def called_here(option: str, known: Collection[str]) -> str:
-    """Return what the `known` options have for one of another name, as "it is --discount here", or nothing."""
-    told = NAMES.get(option, "")
-    return f"it is {told} here" if {*re.findall(r"--[a-z-]+", told)} & {*known} else ""
+    """Return a hint such as "it is --discount here" if `option` is another name of a `known` one, else ""."""
+    names_here = NAMES.get(option, "")
+    return f"it is {names_here} here" if {*re.findall(r"--[a-z-]+", names_here)} & {*known} else ""
 
 
 def called_in_python(name: str, known: Collection[str]) -> str:
-    """Return what the `known` arguments have for one of another name, as "it is discount here", or nothing."""
+    """Return a hint such as "it is discount here" if `name` is another name of a `known` one, else ""."""
     flag, *flags = ("--" + word.replace("_", "-") for word in (name, *known))
     return re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), called_here(flag, flags))
 
 
 def written_in_python(name: str, value: object) -> str:
-    """Return how a value of former versions is written now, or nothing."""
+    """Return how a value of former versions is written now, or ""."""
     if name == "exploration_noise" and isinstance(value, float):
         return f"write exploration_std={value}"
-    return f"write {_FORMERLY[name, value]}" if isinstance(value, str) and (name, value) in _FORMERLY else ""
+    return f"write {_FORMER_VALUES[name, value]}" if isinstance(value, str) and (name, value) in _FORMER_VALUES else ""

@@ -1,4 +1,4 @@
-"""The nouns that every room shares. Nothing here imports JAX."""
+"""Types that all packages share. Nothing here imports JAX."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     import jax
     import numpy as np
 
-Array: TypeAlias = Any  # a JAX array while learning, a NumPy array in what leaves
+Array: TypeAlias = Any  # a JAX array during training, a NumPy array in exported policies
 Metrics: TypeAlias = dict[str, Any]  # name -> scalar JAX array
-# gelu: with tanh, as in its paper. A new one goes into algorithms/networks.py, and where policies leave:
+# gelu is the tanh form of its paper. A new activation goes into algorithms/networks.py, and for exported policies into
 # deploy/policy.py, deploy/onnx.py and both of deploy/templates/policy.*.
 Activation: TypeAlias = Literal["relu", "tanh", "elu", "silu", "gelu"]
 
@@ -19,27 +19,27 @@ LAYER_NORM_EPSILON = 1e-5  # added to variances, as by PyTorch
 
 
 class InputError(ValueError):
-    """A user's mistake, told in one line that says what is wrong and what to do."""
+    """A user's mistake; its message is one line that says what is wrong and what to do."""
 
 
 class Failure(RuntimeError):
-    """What ends a command though nobody made a mistake: an environment or a disk failed. The message is one line."""
+    """An error that is not the user's mistake: an environment or a disk failed. The message is one line."""
 
 
 class Spec(NamedTuple):
-    """The flat sizes of a task: what a network needs to know of it."""
+    """Flat observation and action size of a task, and its number of environments."""
 
     observation_size: int
     action_size: int
     environments: int = 1
-    """Environments that a seed steps side by side: their transitions of one turn follow each other in its memory."""
+    """Environments that a seed steps in parallel; their transitions of one turn are adjacent in its memory."""
 
 
 class Transition(NamedTuple):
     """One environment step, or a batch of them. Actions are those that the algorithm chose, before any clipping.
 
-    `next_observation` is the observation that the step produced, also where the episode ended; only `terminated` means
-    that nothing follows. A `truncated` step is one after which the environment was merely stopped.
+    `next_observation` is the observation that the step produced, also at the end of an episode. Only `terminated` means
+    that there is no future return; after a `truncated` step the environment was merely stopped.
     """
 
     observation: Array  # [observation]
@@ -48,13 +48,13 @@ class Transition(NamedTuple):
     next_observation: Array  # [observation]
     terminated: Array  # [] 0 or 1
     truncated: Array  # [] 0 or 1
-    steps: Array | None = None  # [] how many environment steps it sums up, the last of which ended so; None is one
+    steps: Array | None = None  # [] environment steps that it sums up, with the end flags of the last; None is one
 
 
 class Layer(NamedTuple):
     """One affine layer, h = x @ weight + bias.
 
-    A hidden one may have layer norm before its activation (Ba et al. 2016): scale * (h - mean) / √(var + ε) + shift,
+    A hidden layer may have layer norm before its activation (Ba et al. 2016): scale * (h - mean) / √(var + ε) + shift,
     with the mean and the variance of its own outputs.
     """
 
@@ -65,7 +65,7 @@ class Layer(NamedTuple):
 
 
 class Normaliser(NamedTuple):
-    """Observations on a common scale: (observation - mean) / std, clipped to ± limit."""
+    """Normalisation of observations: (observation - mean) / std, clipped to ± limit."""
 
     mean: Array  # [observation]
     std: Array  # [observation]
@@ -75,23 +75,23 @@ class Normaliser(NamedTuple):
 class PolicyParameters(NamedTuple):
     """The arrays of a policy.
 
-    With several actors there is one critic for each, an MLP from (observation, action) to [1]: the action taken is the
-    one that its own actor's critic values most, the first of equals.
+    With several actors there is one critic for each, an MLP from (observation, action) to [1]: the policy returns the
+    action whose own actor's critic values it most, the first in a tie.
     """
 
     actors: tuple[tuple[Layer, ...], ...]
     critics: tuple[tuple[Layer, ...], ...] = ()
     normaliser: Normaliser | None = None
-    log_std: Array | None = None  # [action] of a head whose spread does not depend on the observation
+    log_std: Array | None = None  # [action] if the standard deviation does not depend on the observation
 
 
 class PolicyNetwork(NamedTuple):
-    """A policy as plain layers: what `deploy` needs to run it without the algorithm that trained it.
+    """A policy as plain layers, which `deploy` can run without the algorithm that trained it.
 
-    The head says what an actor's outputs mean and how its deterministic action comes of them:
-    `tanh_gaussian`, mean and log standard deviation side by side [2 action], tanh(mean);
-    `tanh`, [action], tanh(output), the same when asked to be stochastic;
-    `clipped_gaussian`, the mean [action] beside the parameter `log_std`, the mean clipped to [-1, 1].
+    The head says what an actor's outputs are and how the deterministic action follows from them:
+    `tanh_gaussian`: mean and log standard deviation, concatenated [2 action]; the action is tanh(mean);
+    `tanh`: [action]; the action is tanh(output), also if a stochastic one is asked for;
+    `clipped_gaussian`: the mean [action], with `log_std` a parameter; the action is the mean clipped to [-1, 1].
     """
 
     parameters: PolicyParameters
@@ -107,51 +107,51 @@ class Snapshot(NamedTuple):
     values: dict[str, Any]
 
     def part(self, name: str) -> Snapshot:
-        """Return what was saved under this name: arrays called `name.<their name>`, and one of the values."""
+        """Return the snapshot that was joined under this name: the arrays `name.*`, and the value `name`."""
         prefix = f"{name}."
         arrays = {key.removeprefix(prefix): array for key, array in self.arrays.items() if key.startswith(prefix)}
         return Snapshot(arrays, self.values[name])
 
     @classmethod
     def joined(cls, parts: dict[str, Snapshot]) -> Snapshot:
-        """Return snapshots as one, of which `part` gives each."""
+        """Return snapshots joined into one, from which `part` returns each."""
         arrays = {f"{name}.{key}": array for name, part in parts.items() for key, array in part.arrays.items()}
         return cls(arrays, {name: part.values for name, part in parts.items()})
 
 
 class Ring(NamedTuple):
-    """A seed's memory: transition number i lies in row i % capacity, as far as `added` of them were."""
+    """A seed's replay buffer: transition number i, of `added` so far, lies in row i % capacity."""
 
     rows: np.ndarray  # [capacity, width]
     added: int
 
 
 class Cadence(NamedTuple):
-    """When an algorithm learns, and from how much. Steps are environment steps of one seed, in all its environments."""
+    """When updates run, and on how many transitions. Steps are one seed's, in all its environments."""
 
     warmup_steps: int
     """Steps with uniform random actions and no update, before learning starts."""
     update_interval: int
-    """Steps after each of which it learns: 1 in strict order, or as many as a rollout has."""
+    """Steps between rounds of updates: 1 in strict order, or the length of a rollout."""
     updates_per_interval: int
-    """Calls of `update` each time that it learns, once the warm-up is over."""
+    """Calls of `update` after each interval, once the warm-up is over."""
     transitions_per_update: int
-    """Transitions that one call of `update` is given."""
+    """Transitions in one call of `update`."""
     has_schedule: bool = False
-    """Whether what is learnt depends on how many steps the run has in all, so that it cannot be extended."""
+    """Whether learning depends on the run's total number of steps, so that the run cannot be extended."""
 
     @property
     def first_update(self) -> int:
-        """The step after which it learns for the first time: the first that ends an interval, once it is warm."""
+        """The step after which the first update runs: the end of the first interval that reaches the warm-up."""
         return -(-max(self.warmup_steps, 1) // self.update_interval) * self.update_interval
 
     def updates(self, steps: int) -> int:
-        """Return how many updates a run of so many steps makes, at least 1."""
+        """Return how many updates a run of `steps` makes, at least 1."""
         rounds = (steps - self.first_update) // self.update_interval + 1
         return max(rounds * self.updates_per_interval, 1)
 
     def side_by_side(self, environments: int) -> Cadence:
-        """Return the cadence of so many environments: intervals of whole turns, with as many updates for each step."""
+        """Return the cadence for `environments`: intervals of whole turns of these, with the same updates per step."""
         turns = -(-self.update_interval // environments) * environments
         whole = self.update_interval // math.gcd(self.update_interval, self.updates_per_interval)
         interval = math.lcm(turns, whole)
@@ -160,31 +160,31 @@ class Cadence(NamedTuple):
 
 
 class Algorithm(Protocol):
-    """What the training loop asks of an algorithm: a frozen dataclass whose fields are its hyperparameters.
+    """What the training loop requires of an algorithm: a frozen dataclass whose fields are its hyperparameters.
 
-    Every method is pure and speaks of one seed; `training` adds the seed axis.
+    Every method is pure and for one seed; `training` adds the seed axis.
     """
 
     @property
     def cadence(self) -> Cadence:
-        """When it learns, and from how much."""
+        """When updates run, and on how many transitions."""
         ...
 
     def memory(self, spec: Spec, steps: int) -> Any:
-        """Return the memory that the algorithm wants for a run of `steps` environment steps: a Replay or a Rollout."""
+        """Return an empty memory for a run of `steps` environment steps: a Replay or a Rollout."""
         ...
 
     def init(self, key: jax.Array, spec: Spec, steps: int) -> Any:
-        """Return the first state of a run of `steps` environment steps.
+        """Return the initial state of a run of `steps` environment steps.
 
-        No two leaves of it share a buffer, so that it can be donated.
+        No two of its leaves share a buffer, so that it can be donated.
         """
         ...
 
     def act(self, state: Any, observation: jax.Array, key: jax.Array, explore: bool) -> jax.Array:
-        """Return the action for one observation: sampled to explore, else deterministic.
+        """Return the action for one observation: sampled if `explore`, else deterministic.
 
-        Actions lie in [-1, 1]; the environment clips what lies outside, and the memory keeps what was returned.
+        The environment clips actions to [-1, 1]; the memory keeps them as they were returned.
         """
         ...
 

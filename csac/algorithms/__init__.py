@@ -1,10 +1,10 @@
-"""What is learnt. To add an algorithm, write its file and announce it here."""
+"""The algorithms. To add one, write its file and register it here."""
 
 from csac.algorithms.csac import CSAC
-from csac.algorithms.hyperparameters import names_checked
+from csac.algorithms.hyperparameters import reject_unknown_names
 from csac.algorithms.ppo import PPO
 from csac.algorithms.sac import SAC
 from csac.algorithms.sd3 import SD3
 from csac.algorithms.td3 import TD3
 
-ALGORITHMS = {algorithm.name: names_checked(algorithm) for algorithm in (CSAC, SAC, TD3, SD3, PPO)}
+ALGORITHMS = {algorithm.name: reject_unknown_names(algorithm) for algorithm in (CSAC, SAC, TD3, SD3, PPO)}

@@ -1,4 +1,4 @@
-"""What networks are like, in all algorithms: the hyperparameters of actor and critics beside their sizes."""
+"""Network hyperparameters that all algorithms share: activation and layer norm of actor and critics."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from csac.types import Activation
 
 @dataclass(frozen=True)
 class Architecture:
-    """Options of the hidden layers of actor and critics."""
+    """Activation and layer norm of the hidden layers of actor and critics."""
 
     activation: Activation = "relu"
     """Activation of the hidden layers."""
     layer_norm: bool = False
     """Whether hidden layers are normalised over their outputs before the activation."""
     actor_activation: Activation | None = None
-    """Activation of the actor, if it is another."""
+    """Activation of the actor, if it differs from `activation`."""
     critic_activation: Activation | None = None
-    """Activation of the critics, if it is another."""
+    """Activation of the critics, if it differs from `activation`."""
     actor_layer_norm: bool | None = None
-    """Whether the actor has layer norm, if the critics do otherwise."""
+    """Whether the actor has layer norm, if it differs from `layer_norm`."""
     critic_layer_norm: bool | None = None
-    """Whether the critics have layer norm, if the actor does otherwise."""
+    """Whether the critics have layer norm, if it differs from `layer_norm`."""
 
     @property
     def actor_hidden(self) -> Hidden:
-        """What the actor's hidden layers do."""
+        """Activation and layer norm of the actor's hidden layers."""
         return self._hidden(self.actor_activation, self.actor_layer_norm)
 
     @property
     def critic_hidden(self) -> Hidden:
-        """What each critic's hidden layers do."""
+        """Activation and layer norm of each critic's hidden layers."""
         return self._hidden(self.critic_activation, self.critic_layer_norm)
 
     def _hidden(self, activation: Activation | None, layer_norm: bool | None) -> Hidden:

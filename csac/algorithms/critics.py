@@ -1,4 +1,4 @@
-"""Two critics Q(s, a) that learn side by side: how they are made, read and trained."""
+"""Twin critics Q(s, a): their values, their losses and one gradient step on both."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ Critics: TypeAlias = tuple[MLP, MLP]
 
 
 def q_value(critic: MLP, observation: Observation, action: Action) -> Scalar:
-    """Return one critic's value of one pair."""
+    """Return one critic's value of one state-action pair."""
     return critic(jnp.concatenate([observation, action]))[0]
 
 
 def q_values(critics: Critics, observation: Observation, action: Action) -> tuple[Scalar, Scalar]:
-    """Return both critics' values of one pair. Two products side by side beat one batched product on a CPU."""
+    """Return both critics' values. On a CPU two matrix products are faster than one batched product."""
     first, second = critics
     return q_value(first, observation, action), q_value(second, observation, action)
 
 
 def min_q(critics: Critics, observation: Observation, action: Action) -> Scalar:
-    """Return min(Q₁(s, a), Q₂(s, a)), which promises less than either of them where they err."""
+    """Return min(Q₁(s, a), Q₂(s, a)), which overestimates less than either critic."""
     return jnp.minimum(*q_values(critics, observation, action))
 
 
 def critic_loss(critics: Critics, transition: Transition, target: Scalar) -> tuple[Scalar, Metrics]:
-    """Return L(θ₁) + L(θ₂) with L(θᵢ) = [Qᵢ(s, a) - y]² (the paper's Eq. Q_TD_1), and what to log."""
+    """Return L(θ₁) + L(θ₂) with L(θᵢ) = [Qᵢ(s, a) - y]² (the paper's Eq. Q_TD_1), and the metrics."""
     return squared_errors(q_values(critics, transition.observation, transition.action), target)
 
 
 def squared_errors(values: tuple[Scalar, Scalar], target: Scalar) -> tuple[Scalar, Metrics]:
-    """Return [Q₁ - y]² + [Q₂ - y]², and what to log."""
+    """Return [Q₁ - y]² + [Q₂ - y]², and the metrics."""
     first, second = values
     loss = (first - target) ** 2 + (second - target) ** 2
     return loss, {"critic_loss": loss, "q_mean": (first + second) / 2.0}
@@ -57,17 +57,17 @@ def update_critics(
     critic_target: Callable[..., Scalar],
     next_action: Callable[[Observation, Action], Action],
 ) -> tuple[Any, Critics, Metrics]:
-    """Return the state after one gradient step of its critics, these critics as plain MLPs, and what to log.
+    """Return the state after one gradient step on its critics, these critics as plain MLPs, and the metrics.
 
-    Without `target_critics` the critics are normalised over the batch, and are their own targets. Of one example are
-    `critic_target(transition, noise, targets=...)` and `next_action(next_observation, noise)`, where the target
-    evaluates the critics; `noise` is of the next actions.
+    Without `target_critics` the critics are normalised over the batch, and are their own targets. For one example,
+    `critic_target(transition, noise, targets=...)` returns the target, and `next_action(next_observation, noise)` the
+    action at which it evaluates the critics; `noise` is the noise of the next actions.
     """
     critics, optimiser_state, targets = state.critics, state.critic_optimiser, state.target_critics
     if targets is not None:
-        goals = jax.vmap(partial(critic_target, targets=targets))(batch, noise)
+        target_values = jax.vmap(partial(critic_target, targets=targets))(batch, noise)
         critics, optimiser_state, metrics = gradient_step(
-            optimiser, critic_loss, critics, optimiser_state, batch, goals
+            optimiser, critic_loss, critics, optimiser_state, batch, target_values
         )
         folded = critics
     else:
@@ -86,9 +86,9 @@ def normalised_critic_loss(
     critic_target: Callable[..., Scalar],
     next_action: Callable[[Observation, Action], Action],
 ) -> tuple[Scalar, Metrics]:
-    """Return `critic_loss` of critics normalised over the batch, and what to log with the `moments` they were seen by.
+    """Return `critic_loss` of critics normalised over the batch, and the metrics with the `moments` of that batch.
 
-    The moments are those of the pairs (s, a) and (s', a') together, so that neither is strange to the critics. They are
+    The moments are taken over the pairs (s, a) and (s', a') together, so that both are in distribution. The critics are
     their own targets (CrossQ, Fig. 3), through which no gradient passes.
     """
     pairs = (
@@ -96,7 +96,7 @@ def normalised_critic_loss(
         jnp.concatenate([transition.next_observation, next_action(transition.next_observation, noise)]),
     )
     first, second = (normalised_pass(critic, pairs) for critic in critics)
-    # What the target asks these critics was computed in that pass: XLA finds the same products, and makes them once.
+    # The target needs values that this pass has computed: XLA finds the common products and computes them once.
     target = critic_target(transition, noise, targets=jax.lax.stop_gradient((first.folded, second.folded)))
     values = first.outputs[0][0], second.outputs[0][0]
     loss, metrics = squared_errors(values, jax.lax.stop_gradient(target))

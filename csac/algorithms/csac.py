@@ -1,6 +1,6 @@
-"""Conservative Soft Actor-Critic (Shang et al.): entropy and relative entropy in both the value and the policy's loss.
+"""Conservative Soft Actor-Critic (Shang et al.): entropy and relative entropy in critic target and actor loss.
 
-Lines of Algorithm 1 are counted as in docs/algorithms/csac.md.
+Lines of Algorithm 1 are numbered as in docs/algorithms/csac.md.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from csac.types import Metrics, PolicyNetwork, Spec, Transition
 
 
 class State(NamedTuple):
-    """Everything that one seed of CSAC learns; what an option does without is None."""
+    """The learnt state of one CSAC seed; fields that its options do not use are None."""
 
     actor: MLP  # φ
     reference: MLP  # φ_p
@@ -32,9 +32,9 @@ class State(NamedTuple):
     target_critics: Critics | None  # θ̂₁, θ̂₂
     actor_optimiser: Any
     critic_optimiser: Any
-    temperature: Temperature | None = None  # σ, where it is learnt
+    temperature: Temperature | None = None  # σ, if it is learnt
     observation_statistics: Statistics | None = None
-    average: MLP | None = None  # of past actors, where it is what is evaluated
+    average: MLP | None = None  # average of past actors, if it is evaluated
     actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
 
@@ -43,19 +43,19 @@ class CSAC(MaximumEntropy):
     """Conservative Soft Actor-Critic; the paper's own Algorithm 1 is the preset `paper`."""
 
     entropy_weight: Annotated[float, NOT_NEGATIVE] | Literal["auto"] = 0.2
-    """Weight of the entropy (the paper's sigma); `auto` learns it, to keep the entropy at its target as SAC does."""
+    """Weight of the entropy (the paper's sigma); `auto` learns it as SAC does, to keep the entropy at its target."""
     relative_entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.5
-    """Weight of the relative entropy towards the reference (the paper's tau); 0 is SAC."""
+    """Weight of the relative entropy to the reference policy (the paper's tau); 0 is SAC."""
     reference_policy: Literal["periodic", "average"] = "average"
-    """A copy of the actor, taken every `reference_period` updates, or a running average of past actors."""
+    """`periodic` copies the actor every `reference_period` updates; `average` is a running average of past actors."""
     reference_period: Annotated[int, COUNT] = 1000
-    """Updates between copies of the actor, with `periodic`; 1 is the paper's Algorithm 1."""
+    """With `periodic`: updates between copies of the actor; 1 is the paper's Algorithm 1."""
     reference_rate: Annotated[float, RATE] = 0.05
-    """Step size of the running average towards the actor, with `average`; 1 is the actor one update ago."""
+    """With `average`: step size of the running average towards the actor; 1 is the actor one update ago."""
     relative_entropy_estimator: Literal["closed_form", "sampled"] = "closed_form"
-    """The exact KL of the two policies, or the paper's log-ratio at the sampled action."""
+    """`closed_form` is the exact KL of the two policies, `sampled` the paper's log-ratio at the sampled action."""
     relative_entropy_form: Literal["explicit", "actor_only"] = "explicit"
-    """Whether the relative entropy is in the critic's target and in the actor's loss, or in the actor's loss alone."""
+    """`explicit` has the relative entropy in the critic's target and the actor's loss, `actor_only` in the latter."""
     target_log_prob_bound: Annotated[float, NOT_NEGATIVE] = 0.0
     """Bound on log π and on the relative entropy of an action in the critic's target, in nats; 0 is no bound."""
     relative_entropy_bound: Annotated[float, NOT_NEGATIVE] = 0.0
@@ -64,7 +64,7 @@ class CSAC(MaximumEntropy):
     name: ClassVar[str] = "csac"
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
-        """Return random networks; targets and reference are copies (Algorithm 1, line 1)."""
+        """Return random networks, with copies as targets and reference (Algorithm 1, line 1)."""
         networks = self.first_networks(key, spec, steps, 2 * spec.action_size)
         return State(
             **networks,
@@ -74,13 +74,13 @@ class CSAC(MaximumEntropy):
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
-        """Return ã(s, ξ) to explore (Eq. actor), else tanh(mean)."""
+        """Return ã(s, ξ) if exploring (Eq. actor), else tanh(mean)."""
         actor = state.actor if explore else evaluated_actor(state)
         policy = policy_at(actor, normalise(state.observation_statistics, observation))
         return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the layers of the actor that is evaluated, and what it sees observations by."""
+        """Return the evaluated actor's layers and its observation normaliser."""
         return policy_network(evaluated_actor(state), state.observation_statistics, "tanh_gaussian")
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
@@ -88,16 +88,16 @@ class CSAC(MaximumEntropy):
         statistics, batch = normalise_batch(state.observation_statistics, batch)
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         sigma = self.sigma(state)
-        # Line 12: φ_p ← φ; an average moves later, in `improve`
+        # Line 12: φ_p ← φ; a running average is updated later, in `improve`
         reference = self.reference_before(state.reference, state.actor, step)
         state = state._replace(reference=reference, observation_statistics=statistics)
-        # Lines 16 to 19: a' ~ π(·|s'), then y(s, a, s'), then a step down Σᵢ [Qᵢ(s, a) - y]²
+        # Lines 16 to 19: a' ~ π(·|s'), then y(s, a, s'), then a gradient step on Σᵢ [Qᵢ(s, a) - y]²
         critic_target = partial(self.critic_target, actor=state.actor, reference=reference, sigma=sigma)
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
-        # Line 21: a step down J(φ)
-        given = (folded_critics, batch.observation, actor_noise, step)
-        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
+        # Line 21: a gradient step on J(φ)
+        arguments = (folded_critics, batch.observation, actor_noise, step)
+        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *arguments)
         # Line 23: θ̂ᵢ ← ρ θᵢ + (1 - ρ) θ̂ᵢ
         state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
         return state, {**metrics, **actor_metrics, **({"entropy_weight": sigma} if state.temperature else {})}
@@ -105,7 +105,7 @@ class CSAC(MaximumEntropy):
     def improve(
         self, state: State, critics: Critics, observations: Observations, noise: Actions, step: Count
     ) -> tuple[State, Metrics]:
-        """Return the state after one step on the actor, then of running averages and of σ where it is learnt."""
+        """Return the state after one gradient step on the actor and updates of both averages and of a learnt σ."""
         loss = partial(self.actor_loss, reference=state.reference, critics=critics, sigma=self.sigma(state))
         adam = self.optimiser(self.actor_learning_rate)
         actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations, noise)
@@ -118,7 +118,7 @@ class CSAC(MaximumEntropy):
     def soft_value_terms(
         self, observation: Observation, noise: Action, *, actor: MLP, reference: MLP, critics: Critics
     ) -> tuple[Scalar, Scalar, Scalar]:
-        """Return min Q, log π and D at ã(s, ξ), of the bracket in Eq. Q_CSAC; D is log(π/π̃) or its mean, the KL."""
+        """Return min Q, log π and D at ã(s, ξ), the bracket of Eq. Q_CSAC; D is log(π/π̃) or its mean, the KL."""
         policy = policy_at(actor, observation)
         q_value, log_prob = min_q(critics, observation, policy.sample(noise)), policy.log_prob(noise)
         previous = policy_at(reference, observation)
@@ -128,7 +128,7 @@ class CSAC(MaximumEntropy):
     def critic_target(
         self, transition: Transition, noise: Action, *, actor: MLP, reference: MLP, targets: Critics, sigma: Any
     ) -> Scalar:
-        """Return y = r + γ [min Q - σ log π - τ D] at s' (Eq. Q_TD_2), D as below; no future after an end."""
+        """Return y = r + γ [min Q - σ log π - τ D] at s' (Eq. Q_TD_2), D if `explicit`; no bootstrap after an end."""
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             transition.next_observation, noise, actor=actor, reference=reference, critics=targets
         )
@@ -140,7 +140,7 @@ class CSAC(MaximumEntropy):
     def actor_loss(
         self, actor: MLP, observation: Observation, noise: Action, *, reference: MLP, critics: Critics, sigma: Any
     ) -> tuple[Scalar, Metrics]:
-        """Return J(φ) = σ log π + τ D - min Q at ã(s, ξ), and what to log; `sampled`, it is Eq. actor_update_2."""
+        """Return J(φ) = σ log π + τ D - min Q at ã(s, ξ), and the metrics; with `sampled` it is Eq. actor_update_2."""
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             observation, noise, actor=actor, reference=reference, critics=critics
         )
@@ -148,19 +148,19 @@ class CSAC(MaximumEntropy):
         loss = -(q_value - sigma * log_prob - self.relative_entropy_weight * relative_entropy)
         return loss, {"actor_loss": loss, "entropy": -log_prob, "relative_entropy": relative_entropy}
 
-    def reference_before(self, kept: MLP, actor: MLP, step: Count) -> MLP:
-        """Return φ_p of the update after `step` others: what was kept, or the actor at every `reference_period`-th."""
+    def reference_before(self, reference: MLP, actor: MLP, step: Count) -> MLP:
+        """Return φ_p for update number `step`: the current one, or the actor at every `reference_period`-th update."""
         if self.reference_policy == "average":
-            return kept
+            return reference
         if self.reference_period == 1:
             return actor
         is_due = step % self.reference_period == 0
-        return jax.tree.map(partial(jnp.where, is_due), actor, kept)
+        return jax.tree.map(partial(jnp.where, is_due), actor, reference)
 
-    def reference_after(self, used: MLP, actor: MLP) -> MLP:
-        """Return φ_p to keep, given that of the update and the actor before it."""
-        return polyak(used, actor, self.reference_rate) if self.reference_policy == "average" else used
+    def reference_after(self, reference: MLP, actor: MLP) -> MLP:
+        """Return φ_p after an update that used `reference`; `actor` is the one before that update."""
+        return polyak(reference, actor, self.reference_rate) if self.reference_policy == "average" else reference
 
     def sigma(self, state: State) -> Any:
-        """Return σ as it is given or, where it is `auto`, as it is learnt."""
+        """Return σ: the given weight or, with `auto`, the learnt one."""
         return self.entropy_weight if state.temperature is None else jnp.exp(state.temperature.log_weight)

@@ -1,4 +1,4 @@
-"""The distributions of policies, for one example."""
+"""Action distributions of policies, for one example."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Gaussian(NamedTuple):
 class TanhGaussian(NamedTuple):
     """The distribution of tanh(u), u ~ N(mean, exp(log_std)²) (the paper's Eq. actor).
 
-    An action is named by the noise ξ ~ N(0, I) that it comes of, u = mean + std ξ: atanh of a saturated action is
-    infinite, and of u - mean rounding leaves little where std is small.
+    Methods take the noise ξ ~ N(0, I) of an action, u = mean + std ξ, instead of the action: atanh of a saturated
+    action is infinite, and u - mean is mostly rounding error where std is small.
     """
 
     mean: Action
@@ -53,7 +53,7 @@ class TanhGaussian(NamedTuple):
 
     @classmethod
     def from_output(cls, output: Float[Array, " twice_action"]) -> TanhGaussian:
-        """Read mean and log standard deviation, side by side in a network's output [2 action], and clip the latter."""
+        """Split a network's output [2 action] into mean and log standard deviation, and clip the latter."""
         mean, log_std = jnp.split(output, 2)
         return cls(mean, jnp.clip(log_std, MINIMUM_LOG_STD, MAXIMUM_LOG_STD))
 
@@ -81,21 +81,21 @@ def log_tanh_derivative(pre_tanh: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def log_ratio(policy: TanhGaussian, reference: TanhGaussian, noise: Action) -> Scalar:
-    """Return log π(a) - log π̃(a) at π's action tanh(mean + std ξ). Its Jacobian is common to both and cancels."""
+    """Return log π(a) - log π̃(a) at π's action tanh(mean + std ξ). The Jacobian of tanh cancels."""
     log_scale = policy.log_std - reference.log_std
     reference_noise = (policy.mean - reference.mean) * jnp.exp(-reference.log_std) + jnp.exp(log_scale) * noise
     return jnp.sum(0.5 * (reference_noise**2 - noise**2) - log_scale)
 
 
 def kl(policy: TanhGaussian, reference: TanhGaussian) -> Scalar:
-    """Return KL(π ‖ π̃) in closed form: that of the Gaussians beneath, since tanh is invertible."""
+    """Return KL(π ‖ π̃) in closed form: that of the Gaussians before tanh, which is invertible."""
     log_scale = policy.log_std - reference.log_std
     shift = (policy.mean - reference.mean) * jnp.exp(-reference.log_std)
     return jnp.sum(0.5 * (jnp.exp(2.0 * log_scale) + shift**2 - 1.0) - log_scale)
 
 
 def bounded(value: Scalar, bound: float) -> Scalar:
-    """Return a log-density, KL or log-ratio of a whole action, clipped to ± bound nats where that is more than 0."""
+    """Return a log-density, KL or log-ratio of a whole action, clipped to ± bound nats if `bound` is positive."""
     return jnp.clip(value, -bound, bound) if bound > 0 else value
 
 

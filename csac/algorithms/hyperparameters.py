@@ -1,4 +1,4 @@
-"""The ranges that hyperparameters may take, each beside its field as `Annotated[float, RATE]`, and their names."""
+"""Check the values and names of hyperparameters; a field declares its range as `Annotated[float, RATE]`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Algorithm = TypeVar("Algorithm")
 
 
 class Limit(NamedTuple):
-    """What a value must fulfil, and how to say so after "must be"."""
+    """A condition on a value, and its wording after "must be" in an error message."""
 
     accepts: Callable[[Any], bool]
     words: str
@@ -51,23 +51,23 @@ LARGEST_INTEGER, LARGEST_FLOAT = 2**31 - 1, float(np.finfo(np.float32).max)
 
 
 def check_hyperparameters(algorithm: Any) -> None:
-    """Make an algorithm's fields plain Python values: NumPy's scalars, lists, and whole numbers where floats belong.
+    """Convert an algorithm's fields to plain Python values: NumPy scalars, lists, and whole numbers in float fields.
 
-    Raises InputError for the first field outside its range or its choices, with its value and what it may be.
+    Raises InputError for the first field outside its range or choices, with its value and what is allowed.
     """
     hints = get_type_hints(type(algorithm), include_extras=True)
     for field in dataclasses.fields(algorithm):
-        given = getattr(algorithm, field.name)
-        given = given.item() if isinstance(given, np.generic) else given
+        value = getattr(algorithm, field.name)
+        value = value.item() if isinstance(value, np.generic) else value
         try:
-            object.__setattr__(algorithm, field.name, _checked(given, hints[field.name]))
+            object.__setattr__(algorithm, field.name, _convert(value, hints[field.name]))
         except ValueError as error:
-            hint = written_in_python(field.name, given)
-            raise InputError(f"{field.name} must be {error}, not {given!r}{hint and f': {hint}'}") from None
+            hint = written_in_python(field.name, value)
+            raise InputError(f"{field.name} must be {error}, not {value!r}{hint and f': {hint}'}") from None
 
 
-def names_checked(algorithm: type[Algorithm]) -> type[Algorithm]:
-    """Return the algorithm, which raises InputError from now on for a hyperparameter that it does not have."""
+def reject_unknown_names(algorithm: type[Algorithm]) -> type[Algorithm]:
+    """Make an algorithm class raise InputError for an unknown hyperparameter, and return it."""
     kind: Any = algorithm
     known, init = [field.name for field in dataclasses.fields(kind)], kind.__init__
 
@@ -83,13 +83,13 @@ def names_checked(algorithm: type[Algorithm]) -> type[Algorithm]:
     return algorithm
 
 
-def _checked(value: Any, hint: Any) -> Any:
-    """Return a value as a plain one of this type. Raises ValueError with what it must be."""
+def _convert(value: Any, hint: Any) -> Any:
+    """Return a value as a plain Python value of the hinted type. Raises ValueError with what it must be."""
     if get_origin(hint) in (Union, UnionType):
-        return _one_of(value, get_args(hint))
+        return _convert_union(value, get_args(hint))
     kind, *limits = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    value = _CONVERSIONS.get(get_origin(kind) or kind, lambda given, _: given)(value, kind)
-    # A number must keep its range in 32 bits: 1 - 1e-9 is 1 there.
+    value = _CONVERSIONS.get(get_origin(kind) or kind, lambda value, _: value)(value, kind)
+    # Limits apply to the value in 32 bits, where 1 - 1e-9 is 1.
     rounded = float(np.float32(value)) if kind is float else value
     for limit in limits:
         if not limit.accepts(rounded):
@@ -97,27 +97,27 @@ def _checked(value: Any, hint: Any) -> Any:
     return value
 
 
-def _one_of(value: Any, kinds: tuple[Any, ...]) -> Any:
+def _convert_union(value: Any, kinds: tuple[Any, ...]) -> Any:
     if value is None and NoneType in kinds:
         return None
     problems = []
     for kind in kinds:
         if kind is not NoneType:
             try:
-                return _checked(value, kind)
+                return _convert(value, kind)
             except ValueError as error:
                 problems.append(str(error))
     raise ValueError(", or ".join(problems))
 
 
-def _number(value: Any, kind: Any) -> float:
+def _as_float(value: Any, kind: Any) -> float:
     is_number = isinstance(value, Real) and not isinstance(value, bool)
     if not (is_number and -LARGEST_FLOAT <= value <= LARGEST_FLOAT):  # pyright: ignore[reportOperatorIssue]
         raise ValueError("a finite number")
     return float(value)
 
 
-def _whole(value: Any, kind: Any = int) -> int:
+def _as_integer(value: Any, kind: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise ValueError("a whole number")
     number = int(value)
@@ -126,29 +126,29 @@ def _whole(value: Any, kind: Any = int) -> int:
     return number
 
 
-def _switch(value: Any, kind: Any) -> bool:
+def _as_boolean(value: Any, kind: Any) -> bool:
     if not isinstance(value, bool):
         raise ValueError("true or false")
     return value
 
 
-def _choice(value: Any, kind: Any) -> str:
+def _as_literal(value: Any, kind: Any) -> str:
     choices = get_args(kind)
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{'one of ' * (len(choices) > 1)}{', '.join(choices)}")
     return value
 
 
-def _several(value: Any, kind: Any) -> tuple[Any, ...]:
+def _as_tuple(value: Any, kind: Any) -> tuple[Any, ...]:
     if not isinstance(value, tuple | list):
         raise ValueError("a tuple of whole numbers" if get_args(kind)[:1] == (int,) else "a tuple")
-    return tuple(_checked(one, get_args(kind)[0]) for one in value)
+    return tuple(_convert(one, get_args(kind)[0]) for one in value)
 
 
 _CONVERSIONS: dict[Any, Callable[[Any, Any], Any]] = {
-    float: _number,
-    int: _whole,
-    bool: _switch,
-    Literal: _choice,
-    tuple: _several,
+    float: _as_float,
+    int: _as_integer,
+    bool: _as_boolean,
+    Literal: _as_literal,
+    tuple: _as_tuple,
 }

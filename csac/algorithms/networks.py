@@ -1,4 +1,4 @@
-"""Multilayer perceptrons, and the few things that every algorithm does with parameters."""
+"""Multilayer perceptrons, and the optimiser, schedules and gradient step that all algorithms use."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from csac.types import LAYER_NORM_EPSILON, Activation, InputError, Layer, Metric
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-BATCH = "batch"  # the axis of examples, for losses that look at a whole batch
+BATCH = "batch"  # name of the batch axis, for losses that use statistics of the whole batch
 
 ACTIVATIONS = {
     "relu": jax.nn.relu,
@@ -31,7 +31,7 @@ Schedule: TypeAlias = Literal["constant", "linear", "cosine"]
 
 
 class Hidden(NamedTuple):
-    """What a hidden layer does with its affine outputs."""
+    """What a hidden layer applies to its affine outputs: layer norm, if any, then the activation."""
 
     activation: Activation = "relu"
     layer_norm: bool = False
@@ -53,7 +53,7 @@ class MLP(eqx.Module):
         return inputs @ self.layers[-1].weight + self.layers[-1].bias
 
     def activate(self, layer: Layer, values: Float[Array, " width"]) -> Float[Array, " width"]:
-        """Return what a hidden layer passes on of its affine outputs."""
+        """Return a hidden layer's outputs, given its affine ones: layer norm, if it has one, then the activation."""
         if layer.scale is not None:
             centred = values - jnp.mean(values)
             values = centred / jnp.sqrt(jnp.mean(centred**2) + LAYER_NORM_EPSILON) * layer.scale + layer.shift
@@ -76,7 +76,7 @@ def _make_layer(key: Key, n_in: int, n_out: int) -> Layer:
 
 
 def _normed(layers: Sequence[Layer], hidden: Hidden) -> tuple[Layer, ...]:
-    """Return the layers, the hidden ones with layer norm where that is asked for."""
+    """Return the layers, with layer norm added to the hidden ones if `hidden` has it."""
     if not hidden.layer_norm:
         return tuple(layers)
     normed = (
@@ -88,7 +88,7 @@ def _normed(layers: Sequence[Layer], hidden: Hidden) -> tuple[Layer, ...]:
 def make_orthogonal_mlp(
     key: Key, input_size: int, hidden_sizes: Sequence[int], output_size: int, hidden: Hidden, output_gain: float
 ) -> MLP:
-    """Return an MLP with orthogonal weights of gain √2 (`output_gain` in the last layer) and no biases yet."""
+    """Return an MLP with orthogonal weights of gain √2 (`output_gain` in the last layer) and zero biases."""
     sizes = (input_size, *hidden_sizes, output_size)
     gains = (2.0**0.5,) * len(hidden_sizes) + (output_gain,)
     keys = jax.random.split(key, len(gains))
@@ -100,7 +100,7 @@ def make_orthogonal_mlp(
 
 
 def learnable(network: Any) -> Any:
-    """Return a network, all of whose leaves are arrays. Raises InputError where one is not."""
+    """Return the network. Raises InputError if one of its leaves is not an array."""
     for leaf in jax.tree.leaves(network):
         if not eqx.is_array(leaf):
             kind = type(network).__name__
@@ -109,31 +109,31 @@ def learnable(network: Any) -> Any:
 
 
 def plain_layers(network: Any) -> tuple[Layer, ...]:
-    """Return the layers by which an MLP leaves as part of a policy. Raises InputError for any other network."""
+    """Return an MLP's layers for the exported policy. Raises InputError for any other network."""
     if isinstance(network, MLP):
         return network.layers
     kind = type(network).__name__
-    raise InputError(f"{kind} is no MLP, and policies leave as plain layers: have `policy` give such, or use an MLP")
+    raise InputError(f"{kind} is no MLP, but policies are exported as plain layers: override `policy` or use an MLP")
 
 
 def polyak(targets: Any, sources: Any, rate: float | Scalar) -> Any:
-    """Return targets + rate (sources - targets), leaf by leaf; None where there are no targets."""
+    """Return targets + rate (sources - targets), leaf by leaf; None if `targets` is None."""
     if targets is None:
         return None
     return jax.tree.map(lambda target, source: target + rate * (source - target), targets, sources)
 
 
 def copy_tree(tree: Any) -> Any:
-    """Return the same values in buffers of their own: donated buffers may not alias."""
+    """Return a copy in separate buffers: donated buffers must not alias."""
     return jax.tree.map(jnp.copy, tree)
 
 
 def make_optimiser(
     learning_rate: float | Scalar, max_gradient_norm: float = 0.0, *, epsilon: float = 1e-8, momentum: float = 0.9
 ) -> optax.GradientTransformation:
-    """Return Adam, after clipping by the global norm of the gradient where a positive bound is given.
+    """Return Adam, preceded by clipping of the gradient's global norm if `max_gradient_norm` is positive.
 
-    `momentum` is Adam's β₁, the share of its average gradient that it keeps at each update.
+    `momentum` is Adam's β₁, the decay of its average gradient.
     """
     adam = optax.adam(learning_rate, b1=momentum, eps=epsilon)
     if max_gradient_norm > 0:
@@ -142,14 +142,14 @@ def make_optimiser(
 
 
 class Progress(NamedTuple):
-    """How many steps an optimiser has made, and how many its schedule is for."""
+    """Number of steps an optimiser has made, and number of steps its schedule is for."""
 
     done: Count
     planned: Scalar
 
 
 def scheduled(schedule: Schedule, progress: Scalar) -> Scalar | float:
-    """Return the share of the first learning rate that is left at this share p of the run: 1, 1 - p or ½ (1 + cos πp).
+    """Return the factor of the initial learning rate after a fraction p of the run: 1, 1 - p or ½ (1 + cos πp).
 
     The cosine is that of SGDR without restarts (Loshchilov and Hutter 2017, Eq. 5).
     """
@@ -161,8 +161,8 @@ def scheduled(schedule: Schedule, progress: Scalar) -> Scalar | float:
     return 1.0
 
 
-def follow(schedule: Schedule, planned: int) -> optax.GradientTransformation:
-    """Return what shortens an optimiser's steps by a schedule; its state has how many are `planned`."""
+def apply_schedule(schedule: Schedule, planned: int) -> optax.GradientTransformation:
+    """Return a transformation that scales an optimiser's steps by a schedule; its state has how many are `planned`."""
 
     def init(parameters: Any) -> Progress:
         return Progress(jnp.int32(0), jnp.float32(max(planned, 1)))
@@ -175,17 +175,17 @@ def follow(schedule: Schedule, planned: int) -> optax.GradientTransformation:
 
 
 def init_optimiser(optimiser: optax.GradientTransformation, parameters: Any) -> Any:
-    """Return the optimiser's first state for these parameters. Optax's types know no modules; ours need not."""
+    """Return the optimiser's initial state for these parameters, typed Any: Optax's types exclude Equinox modules."""
     return optimiser.init(parameters)
 
 
 def gradient_step(
     optimiser: optax.GradientTransformation, loss: Callable, parameters: Any, optimiser_state: Any, *examples: Any
 ) -> tuple[Any, Any, Metrics]:
-    """Return (parameters, optimiser state, mean metrics) after one step down the mean of a loss over examples.
+    """Return (parameters, optimiser state, mean metrics) after one gradient step on the mean loss over examples.
 
-    `loss(parameters, *example) -> (scalar, metrics)` is of one example. The leaves of `examples` have a leading axis of
-    these, in the loss the axis `BATCH`.
+    `loss(parameters, *example) -> (scalar, metrics)` takes one example. The leaves of `examples` have a leading batch
+    axis, which the loss may use by its name, `BATCH`.
     """
 
     def mean_loss(parameters: Any) -> tuple[Scalar, Metrics]:

@@ -1,7 +1,7 @@
 """Batch normalisation of a network's layers: Ioffe and Szegedy 2015, placed as CrossQ does (Bhatt et al. 2024).
 
-A layer that sees its inputs normalised is an affine layer still, so a normalised network is a plain MLP: the moments
-are folded into its weights. No scale and shift are learnt beside, which the layer that follows can express.
+A layer with normalised inputs is still affine, so a normalised network is a plain MLP once the moments are folded into
+its weights. No scale and shift are learnt, since the layer's weights can express them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from csac.types import Layer
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-# Added to variances, as by CrossQ's authors: a unit that is silent in the batch is not blown up where it fires.
+# Added to variances, as by CrossQ's authors: a unit that is silent in the batch must not be scaled up when it fires.
 EPSILON = 1e-3
 
 
@@ -30,9 +30,9 @@ class Moments(NamedTuple):
 
 
 def moments_of(inputs: Sequence[Float[Array, " in"]], centred: bool = True) -> Moments:
-    """Return the moments of a layer's inputs over all examples of the axis `BATCH`, each of which has these.
+    """Return the moments of a layer's inputs over the axis `BATCH`; each example has one or several `inputs`.
 
-    Those that are not `centred` are the moments about 0.
+    If not `centred`, they are moments about 0.
     """
     mean = jax.lax.pmean(sum(inputs) / len(inputs), BATCH) * centred
     return Moments(mean, jax.lax.pmean(sum((values - mean) ** 2 for values in inputs) / len(inputs), BATCH))
@@ -45,24 +45,24 @@ def fold_layer(layer: Layer, moments: Moments) -> Layer:
 
 
 def fold(network: MLP, moments: Sequence[Moments]) -> MLP:
-    """Return the network whose layers see their inputs normalised by these moments, one for each layer."""
+    """Return the network whose layers normalise their inputs by these moments, one for each layer."""
     return MLP(tuple(map(fold_layer, network.layers, moments)), network.activation)
 
 
 class Pass(NamedTuple):
-    """What one pass through a normalised network gives."""
+    """The result of one pass through a normalised network."""
 
     outputs: Sequence[Float[Array, " out"]]
     moments: tuple[Moments, ...]  # of each layer's inputs
-    folded: MLP  # the network as it was seen: its normalisation by these moments folded in
+    folded: MLP  # the network with its normalisation by these moments folded in
 
 
 def normalised_pass(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> Pass:
-    """Return what a network says of `inputs` where each layer sees its own normalised by their moments.
+    """Return a network's outputs for `inputs`, with each layer's inputs normalised by their moments over the batch.
 
-    It is a function of one example, mapped over the axis `BATCH` by `jax.vmap`; an example has one or several `inputs`.
-    Gradients pass through the moments, as batch normalisation has it. The last layer's inputs are not centred: the mean
-    of what the network says would be its one bias, which Adam moves by no more than the learning rate in an update.
+    It takes one example, which has one or several `inputs`, and is mapped over the axis `BATCH` by `jax.vmap`.
+    Gradients pass through the moments, as in batch normalisation. The last layer's inputs are not centred: otherwise
+    the mean output would be its bias alone, which Adam moves by no more than the learning rate per update.
     """
     moments, folded = [], []
     for layer in network.layers:

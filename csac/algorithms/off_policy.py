@@ -1,4 +1,4 @@
-"""What off-policy algorithms share: hyperparameters, and the cadence, memory and optimisers that follow from them."""
+"""Base classes of the off-policy algorithms: hyperparameters, and the cadence, replay and optimisers they imply."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from csac.algorithms.memory import Replay
 from csac.algorithms.networks import (
     MLP,
     Schedule,
+    apply_schedule,
     copy_tree,
-    follow,
     init_optimiser,
     learnable,
     make_mlp,
@@ -49,38 +49,38 @@ UPDATES = Limit(lambda value: 0.01 <= value <= 1_000, "from 0.01 to 1,000")
 
 @dataclass(frozen=True)
 class OffPolicy(Architecture):
-    """What CSAC, SAC, TD3 and SD3 share."""
+    """Hyperparameters that CSAC, SAC, TD3 and SD3 share."""
 
     discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
     target_rate: Annotated[float, RATE] = 0.005
     """Soft update rate of the target networks (rho of CSAC's paper, tau of the others')."""
     n_steps: Annotated[int, COUNT] = 1
-    """Environment steps whose rewards a critic's target sums before it counts on the critics."""
+    """Environment steps whose rewards a critic's target sums before it bootstraps."""
     normalise_rewards: bool = False
-    """Whether rewards are divided, when they are drawn, by the running standard deviation of the discounted return."""
+    """Whether to divide rewards, when they are drawn, by the running standard deviation of the discounted return."""
     actor_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the actor."""
     critic_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of the critics."""
     learning_rate_schedule: Schedule = "constant"
-    """How both fall to zero over the run: not at all, linearly or as a cosine. A learnt temperature keeps its rate."""
+    """Decay of the actor's and the critics' learning rate to zero over the run; a learnt temperature keeps its rate."""
     actor_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of the actor's hidden layers."""
     critic_hidden_sizes: Annotated[tuple[int, ...], WIDTHS] = (256, 256)
     """Widths of each critic's hidden layers."""
     batch_size: Annotated[int, COUNT] = 256
-    """Transitions in one update (the paper's M); SD3 takes as many for each of its two pairs."""
+    """Transitions in one update (the paper's M); SD3 uses as many for each of its two actor-critic pairs."""
     replay_size: Annotated[int, COUNT] = 1_000_000
-    """Transitions that the replay keeps."""
+    """Capacity of the replay buffer, in transitions."""
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts (the paper's T_initial)."""
     updates_per_step: Annotated[float, UPDATES] = 1.0
-    """Updates per environment step; 0.25 is one after every fourth (rounded to a fraction of at most hundredths)."""
+    """Updates per environment step; 0.25 is one every 4 steps (rounded to a fraction with denominator up to 100)."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps between rounds of updates (whole turns of all environments); 1 is strict order."""
+    """Environment steps between rounds of updates, rounded up to a multiple of the environments; 1 is strict order."""
     exploration_noise: Noise = "white"
-    """How exploration noise goes together over steps: not at all, over all time scales (pink), over some seven (ou)."""
+    """Correlation of exploration noise over steps: none (white), on all time scales (pink), over about 7 steps (ou)."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9
     """Decay of the average gradient in the networks' Adam (its beta1)."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.0
@@ -95,7 +95,7 @@ class OffPolicy(Architecture):
 
     @property
     def cadence(self) -> Cadence:
-        """When it learns, and from how much."""
+        """When updates run, and on how many transitions."""
         updates = Fraction(self.updates_per_step).limit_denominator(100)
         interval = math.lcm(self.update_interval, updates.denominator)
         return Cadence(
@@ -107,7 +107,7 @@ class OffPolicy(Architecture):
         )
 
     def updates(self, spec: Spec, steps: int) -> int:
-        """Return how many updates a run of so many steps makes, which its schedule is for."""
+        """Return how many updates a run of `steps` makes: the length of its learning-rate schedule."""
         return self.cadence.side_by_side(spec.environments).updates(steps)
 
     def noise(self, key: Key, size: int) -> Action:
@@ -115,37 +115,37 @@ class OffPolicy(Architecture):
         return noise_of(self.exploration_noise, key, size)
 
     def memory(self, spec: Spec, steps: int) -> Replay:
-        """Return an empty replay that holds `replay_size` transitions, or the whole run where that is shorter."""
-        together = self.cadence.side_by_side(spec.environments).update_interval
+        """Return an empty replay buffer for `replay_size` transitions, or for the whole run if that is shorter."""
+        rows_per_add = self.cadence.side_by_side(spec.environments).update_interval
         capacity, scaled = min(self.replay_size, steps), self.normalise_rewards
-        returns: dict[str, Any] = {"n_steps": self.n_steps, "discount": self.discount, "scale_rewards": scaled}
-        return Replay.create(capacity, spec, together, **returns)
+        reward_options: dict[str, Any] = {"n_steps": self.n_steps, "discount": self.discount, "scale_rewards": scaled}
+        return Replay.create(capacity, spec, rows_per_add, **reward_options)
 
     def discount_after(self, transition: Transition) -> Scalar:
-        """Return γ (1 - terminated), by which what follows a transition counts; γᵐ for γ where it sums up m steps."""
+        """Return the discount of the next state's value: γ (1 - terminated), with γᵐ for a transition of m steps."""
         discount = self.discount if transition.steps is None else self.discount**transition.steps
         return discount * (1.0 - transition.terminated)
 
     def make_actor(self, key: Key, spec: Spec, outputs: int) -> Any:
-        """Return a random actor, a map from [observation] to [outputs]: override it for another network."""
+        """Return a random actor, a map from [observation] to [outputs]; override this for another network."""
         return make_mlp(key, spec.observation_size, self.actor_hidden_sizes, outputs, self.actor_hidden)
 
     def make_critic(self, key: Key, spec: Spec) -> Any:
-        """Return a random critic, a map from [observation + action] to [1]: override it for another network."""
+        """Return a random critic, a map from [observation + action] to [1]; override this for another network."""
         inputs = spec.observation_size + spec.action_size
         return make_mlp(key, inputs, self.critic_hidden_sizes, 1, self.critic_hidden)
 
     def optimiser(self, learning_rate: float, planned: int = 1) -> optax.GradientTransformation:
-        """Return the networks' Adam. The number of steps `planned` counts where it begins: its state keeps it."""
+        """Return the networks' Adam. `planned`, the schedule's length, only matters when its state is created."""
         adam = make_optimiser(learning_rate, self.max_gradient_norm, momentum=self.adam_momentum)
         if self.learning_rate_schedule == "constant":
             return adam
-        return optax.chain(adam, follow(self.learning_rate_schedule, planned))
+        return optax.chain(adam, apply_schedule(self.learning_rate_schedule, planned))
 
 
 @dataclass(frozen=True)
 class TwinCritics(OffPolicy):
-    """What CSAC, SAC and TD3 share besides: options of one actor and two critics (docs/algorithms/critics.md)."""
+    """Hyperparameters that CSAC, SAC and TD3 share, with one actor and two critics (docs/algorithms/critics.md)."""
 
     critic_normalisation: Literal["none", "batch"] = "none"
     """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
@@ -160,7 +160,7 @@ class TwinCritics(OffPolicy):
             raise InputError("critic_normalisation batch needs a batch_size of at least 2")
 
     def first_networks(self, key: Key, spec: Spec, steps: int, actor_outputs: int) -> dict[str, Any]:
-        """Return the fields of a first state that the three share: random networks, targets that are copies."""
+        """Return the initial state's fields that the three share: random networks, with copies as targets."""
         planned = self.updates(spec, steps)
         actor_adam = self.optimiser(self.actor_learning_rate, planned // self.policy_delay)
         actor_key, critics_key = jax.random.split(key)
@@ -169,78 +169,77 @@ class TwinCritics(OffPolicy):
         critics = learnable(self.make_critic(first_key, spec)), learnable(self.make_critic(second_key, spec))
         if self.critic_normalisation == "batch" and not isinstance(critics[0], MLP):
             raise InputError(f"critic_normalisation batch is for MLPs, not for {type(critics[0]).__name__}")
+        statistics = Statistics.create((spec.observation_size,)) if self.normalise_observations else None
         return {
             "actor": actor,
             "critics": critics,
             "target_critics": copy_tree(critics) if self.critic_normalisation == "none" else None,
             "actor_optimiser": init_optimiser(actor_adam, actor),
             "critic_optimiser": init_optimiser(self.optimiser(self.critic_learning_rate, planned), critics),
-            "observation_statistics": Statistics.create((spec.observation_size,))
-            if self.normalise_observations
-            else None,
+            "observation_statistics": statistics,
         }
 
 
 @dataclass(frozen=True)
 class MaximumEntropy(TwinCritics):
-    """What CSAC and SAC share besides: options of a weight of the entropy that is learnt, `auto`."""
+    """Hyperparameters that CSAC and SAC share: for a learnt (`auto`) entropy weight and an average of actors."""
 
     initial_entropy_weight: Annotated[float, POSITIVE] = 1.0
-    """What an entropy weight of `auto` begins with."""
+    """Initial value of an entropy weight that is `auto`."""
     target_entropy: float | None = None
-    """Entropy that `auto` aims at, in nats; by default `target_entropy_per_dimension` for each action dimension."""
+    """Target entropy of `auto`, in nats; by default `target_entropy_per_dimension` times the action dimensions."""
     target_entropy_per_dimension: float = -1.0
-    """Entropy that `auto` aims at, in nats per action dimension."""
+    """Target entropy of `auto`, in nats per action dimension."""
     weight_learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate of an entropy weight that is `auto`."""
     policy_average_rate: Annotated[float, RATE] = 1.0
-    """Step size of the average of past actors that is evaluated and exported, larger at first; 1 is the actor."""
+    """Step size of the evaluated and exported average of past actors, larger at first; 1 is the actor itself."""
 
     def first_networks(self, key: Key, spec: Spec, steps: int, actor_outputs: int) -> dict[str, Any]:
-        """Return the fields of a first state that the two share; the average is a copy of the actor."""
+        """Return the initial state's fields that the two share; the average is a copy of the actor."""
         networks = super().first_networks(key, spec, steps, actor_outputs)
         return networks | {"average": copy_tree(networks["actor"]) if self.policy_average_rate < 1 else None}
 
     def first_temperature(self, given: float | Literal["auto"]) -> Temperature:
-        """Return an entropy weight that is given, or what one of `auto` begins with."""
+        """Return the initial temperature: the given weight, or `initial_entropy_weight` for `auto`."""
         weight = self.initial_entropy_weight if given == "auto" else given
         return make_temperature(weight, make_optimiser(self.weight_learning_rate))
 
     def average_after(self, average: MLP | None, actor: MLP, step: Count) -> MLP | None:
-        """Return the average with one actor more, of the update after `step` others; None where there is none.
+        """Return the average after adding the actor of update number `step`; None if there is no average.
 
-        It is of the last tenth of them (polynomial decay with η = 9, Shamir and Zhang 2013) until `policy_average_rate`
-        is the larger step.
+        It averages over the last tenth of the actors (polynomial decay with η = 9, Shamir and Zhang 2013) until
+        `policy_average_rate` is the larger step size.
         """
         actors = step // self.policy_delay + 1
         return polyak(average, actor, jnp.maximum(self.policy_average_rate, 10 / (actors + 9)))
 
     def adapt_temperature(self, temperature: Temperature, entropy: Scalar, dimensions: int) -> Temperature:
-        """Return the weight after one gradient step towards the entropy that `auto` aims at."""
+        """Return the temperature after one gradient step towards the target entropy of `auto`."""
         return adapt(temperature, entropy, self.entropy_target(dimensions), make_optimiser(self.weight_learning_rate))
 
     def entropy_target(self, dimensions: int) -> float:
-        """Return the entropy that `auto` aims at, in nats."""
+        """Return the target entropy of `auto`, in nats."""
         given = self.target_entropy
         return self.target_entropy_per_dimension * dimensions if given is None else given
 
 
 def evaluated_actor(state: Any) -> MLP:
-    """Return the actor that is evaluated and exported: the average of past ones where there is one."""
+    """Return the actor that is evaluated and exported: the average of past ones, if there is one."""
     return state.actor if state.average is None else state.average
 
 
 def first_metrics(names: Iterable[str], policy_delay: int) -> Metrics | None:
-    """Return the metrics of an actor that waits and has not moved yet, 0 each; None where it moves at every update."""
+    """Return zeros as the metrics of a delayed actor before its first update; None without a delay."""
     return None if policy_delay == 1 else {name: jnp.zeros(()) for name in names}
 
 
 def improve_delayed(
     policy_delay: int, step: Count, improve: Callable[..., tuple[Any, Metrics]], state: Any, *given: Any
 ) -> tuple[Any, Metrics]:
-    """Return `improve(state, *given)` at every `policy_delay`-th update, the last of each (TD3's Algorithm 1).
+    """Return `improve(state, *given)` at the last of every `policy_delay` updates (TD3's Algorithm 1).
 
-    Any other update computes nothing: it returns the state as it is and `state.actor_metrics`, those of the last
+    Any other update computes nothing: it returns the state unchanged and `state.actor_metrics`, those of the last
     improvement. `step` counts the updates before this one.
     """
     if policy_delay == 1:
@@ -251,7 +250,7 @@ def improve_delayed(
 
 
 def policy_network(actor: MLP, statistics: Statistics | None, head: Literal["tanh_gaussian", "tanh"]) -> PolicyNetwork:
-    """Return the actor's layers, and what it sees observations by."""
+    """Return the actor's layers and its observation normaliser."""
     return PolicyNetwork(
         PolicyParameters((plain_layers(actor),), normaliser=normaliser_of(statistics)), actor.activation, head
     )

@@ -57,18 +57,18 @@ class Parameters(NamedTuple):
 
 
 class State(NamedTuple):
-    """Everything that one seed of PPO learns."""
+    """The learnt state of one PPO seed."""
 
     parameters: Parameters
     optimiser: Any
     observation_statistics: Statistics  # [observation]
     returns: Statistics  # [] of the discounted return so far in each episode
-    discounted_return: Float[Array, "..."]  # of the episode, or [environment] episodes, that the last rollout broke off
+    discounted_return: Float[Array, "..."]  # of the episode, or [environment] episodes, that the last rollout cut off
     total_updates: Scalar  # in this run
 
 
 class Sample(NamedTuple):
-    """One transition, or several with leading axes, ready to be learnt from."""
+    """A transition prepared for the loss, or several with leading axes."""
 
     observation: Float[Array, "... observation"]  # normalised
     action: Float[Array, "... action"]
@@ -85,7 +85,7 @@ class PPO(Architecture):
     learning_rate: Annotated[float, POSITIVE] = 3e-4
     """Learning rate, initial or constant."""
     learning_rate_schedule: Schedule = "linear"
-    """How the learning rate falls to zero over the run: not at all, linearly or as a cosine."""
+    """Decay of the learning rate to zero over the run: none, linear or cosine."""
     discount: Annotated[float, DISCOUNT] = 0.99
     """Discount factor (gamma)."""
     trace_decay: Annotated[float, SHARE] = 0.95
@@ -93,9 +93,9 @@ class PPO(Architecture):
     clip_range: Annotated[float, POSITIVE] = 0.2
     """Distance of the probability ratio from 1 beyond which its gradient stops (epsilon)."""
     clip_value_loss: bool = True
-    """Whether to clip the value loss where a value moves by more than `clip_range`, which is little for raw rewards."""
+    """Whether to clip the change of a value in its loss to `clip_range`, which is little for unnormalised rewards."""
     value_loss_weight: Annotated[float, NOT_NEGATIVE] = 0.5
-    """Weight of the value loss beside the policy's."""
+    """Weight of the value loss relative to the policy loss."""
     entropy_weight: Annotated[float, NOT_NEGATIVE] = 0.0
     """Weight of the policy's entropy."""
     max_gradient_norm: Annotated[float, NOT_NEGATIVE] = 0.5
@@ -103,7 +103,7 @@ class PPO(Architecture):
     adam_epsilon: Annotated[float, POSITIVE] = 1e-5
     """Added to the root of Adam's second moment (its epsilon)."""
     rollout_steps: Annotated[int, COUNT] = 2048
-    """Environment steps between updates, all of which are learnt from."""
+    """Environment steps in one rollout, after which one update learns from all of them."""
     minibatches: Annotated[int, COUNT] = 32
     """Number of equal parts into which each epoch divides the rollout."""
     epochs: Annotated[int, COUNT] = 10
@@ -137,7 +137,7 @@ class PPO(Architecture):
         return -jnp.minimum(ratio * advantage, clipped * advantage)
 
     def value_loss(self, value: Scalar, old_value: Scalar, target: Scalar) -> Scalar:
-        """Return ½ (V - target)², or if more ½ (V_old + clip(V - V_old, -ε, ε) - target)² where that is asked for."""
+        """Return ½ (V - target)²; if `clip_value_loss`, at least ½ (V_old + clip(V - V_old, -ε, ε) - target)²."""
         loss = (value - target) ** 2
         if self.clip_value_loss:
             clipped = old_value + jnp.clip(value - old_value, -self.clip_range, self.clip_range)
@@ -145,7 +145,7 @@ class PPO(Architecture):
         return 0.5 * loss
 
     def loss(self, parameters: Parameters, sample: Sample) -> tuple[Scalar, Metrics]:
-        """Return policy loss + weighted value loss - weighted entropy (PPO, Eq. 9), and what to log."""
+        """Return policy loss + weighted value loss - weighted entropy (PPO, Eq. 9), and the metrics."""
         policy = policy_at(parameters, sample.observation)
         log_ratio = policy.log_prob(sample.action) - sample.log_prob
         policy_loss = self.policy_loss(log_ratio, sample.advantage)
@@ -155,7 +155,7 @@ class PPO(Architecture):
             "actor_loss": policy_loss,
             "critic_loss": value_loss,
             "entropy": entropy,
-            "approximate_kl": jnp.expm1(log_ratio) - log_ratio,  # its mean is KL(π_old ‖ π), and it is never negative
+            "approximate_kl": jnp.expm1(log_ratio) - log_ratio,  # never negative, with mean KL(π_old ‖ π)
             "clip_fraction": jnp.abs(jnp.expm1(log_ratio)) > self.clip_range,
         }
 
@@ -163,56 +163,55 @@ class PPO(Architecture):
         """Absorb the rollout into the statistics, then take `epochs` times `minibatches` gradient steps on it."""
         in_time = by_environment(batch, state)
         returns, discounted_return = discounted_returns(state.discounted_return, in_time, self.discount)
-        absorbed = state._replace(
+        new_state = state._replace(
             observation_statistics=state.observation_statistics.absorb(batch.observation),
             returns=state.returns.absorb(returns.ravel()),
             discounted_return=discounted_return,
         )
-        samples = self.samples(state, absorbed, batch)
+        samples = self.samples(state, new_state, batch)
         learning_rate = self.learning_rate_at(step, state.total_updates)
         optimiser = self._optimiser(learning_rate)
 
-        def learn(learnt: tuple[Parameters, Any], minibatch: Sample) -> tuple[tuple[Parameters, Any], Metrics]:
-            minibatch = minibatch._replace(advantage=self.normal_advantages(minibatch.advantage))
-            parameters, optimiser_state, metrics = gradient_step(optimiser, self.loss, *learnt, minibatch)
+        def learn(carry: tuple[Parameters, Any], minibatch: Sample) -> tuple[tuple[Parameters, Any], Metrics]:
+            minibatch = minibatch._replace(advantage=self.normalised_advantages(minibatch.advantage))
+            parameters, optimiser_state, metrics = gradient_step(optimiser, self.loss, *carry, minibatch)
             return (parameters, optimiser_state), metrics
 
-        def pass_over(learnt: tuple[Parameters, Any], key: Key) -> tuple[tuple[Parameters, Any], Metrics]:
-            return jax.lax.scan(learn, learnt, self.shuffled(samples, key))
+        def pass_over(carry: tuple[Parameters, Any], key: Key) -> tuple[tuple[Parameters, Any], Metrics]:
+            return jax.lax.scan(learn, carry, self.shuffled(samples, key))
 
         keys = jax.random.split(key, self.epochs)
         (parameters, optimiser_state), metrics = jax.lax.scan(pass_over, (state.parameters, state.optimiser), keys)
-        return absorbed._replace(parameters=parameters, optimiser=optimiser_state), {
+        return new_state._replace(parameters=parameters, optimiser=optimiser_state), {
             **jax.tree.map(jnp.mean, metrics),
             "explained_variance": explained_variance(samples.value, samples.target),
             "learning_rate": learning_rate,
         }
 
-    def samples(self, state: State, absorbed: State, batch: Transition) -> Sample:
-        """Return what there is to learn from: densities by the state that acted, all else by the newest statistics."""
+    def samples(self, state: State, new_state: State, batch: Transition) -> Sample:
+        """Return the samples: log-probabilities with the statistics used in acting, all else with the updated ones."""
 
         def log_prob(observation: Observation, action: Action) -> Scalar:
-            return policy_at(state.parameters, self.normalise(state.observation_statistics, observation)).log_prob(
-                action
-            )
+            normalised = self.normalise(state.observation_statistics, observation)
+            return policy_at(state.parameters, normalised).log_prob(action)
 
-        normalise = jax.vmap(partial(self.normalise, absorbed.observation_statistics))
+        normalise = jax.vmap(partial(self.normalise, new_state.observation_statistics))
         observations, next_observations = normalise(batch.observation), normalise(batch.next_observation)
         value = jax.vmap(partial(value_at, state.parameters))
         values, next_values = value(observations), value(next_observations)
-        scaled = batch._replace(reward=self.scale(absorbed.returns, batch.reward))
-        given = by_environment((scaled, values, next_values), state)
-        advantages = advantages_of(*given, discount=self.discount, trace_decay=self.trace_decay).ravel()
+        scaled = batch._replace(reward=self.scale(new_state.returns, batch.reward))
+        arguments = by_environment((scaled, values, next_values), state)
+        advantages = advantages_of(*arguments, discount=self.discount, trace_decay=self.trace_decay).ravel()
         log_probs = jax.vmap(log_prob)(batch.observation, batch.action)
         return Sample(observations, batch.action, log_probs, values, advantages, values + advantages)
 
     def normalise(self, statistics: Statistics, observation: Observation) -> Observation:
-        """Return (observation - mean) / std, clipped, or the observation as it is."""
+        """Return (observation - mean) / std, clipped, or the observation unchanged without the option."""
         seen_by = statistics if self.normalise_observations else None
         return normalise(seen_by, observation, self.normalisation_limit)
 
     def scale(self, statistics: Statistics, reward: Scalars) -> Scalars:
-        """Return reward / std of the discounted return, clipped, or the reward as it is."""
+        """Return reward / std of the discounted return, clipped, or the reward unchanged without the option."""
         if not self.normalise_rewards:
             return reward
         return jnp.clip(reward / statistics.std, -self.normalisation_limit, self.normalisation_limit)
@@ -223,18 +222,18 @@ class PPO(Architecture):
         return jax.tree.map(lambda leaf: leaf[order].reshape(self.minibatches, -1, *leaf.shape[1:]), samples)
 
     def learning_rate_at(self, step: Count, total_updates: Scalar) -> Scalar:
-        """Return the learning rate of the update after `step` others, of `total_updates` in the run."""
+        """Return the learning rate of update number `step`, from 0, of `total_updates` in the run."""
         return jnp.float32(self.learning_rate * scheduled(self.learning_rate_schedule, step / total_updates))
 
-    def normal_advantages(self, advantages: Scalars) -> Scalars:
-        """Return a minibatch's advantages brought to mean 0 and standard deviation 1, or as they are."""
+    def normalised_advantages(self, advantages: Scalars) -> Scalars:
+        """Return a minibatch's advantages with mean 0 and standard deviation 1, or unchanged without the option."""
         if not self.normalise_advantages:
             return advantages
         return (advantages - advantages.mean()) / (advantages.std() + EPSILON)
 
     @property
     def cadence(self) -> Cadence:
-        """One update for each rollout and no warm-up: a policy can only learn from what it did itself."""
+        """One update per rollout and no warm-up, since learning is on-policy."""
         return Cadence(
             warmup_steps=0,
             update_interval=self.rollout_steps,
@@ -244,13 +243,13 @@ class PPO(Architecture):
         )
 
     def memory(self, spec: Spec, steps: int) -> Rollout:
-        """Return a rollout yet to be made. Raises InputError for environments that do not share its steps evenly."""
+        """Return an empty rollout. Raises InputError if its steps are no multiple of the environments."""
         if self.rollout_steps % spec.environments:
             raise InputError(f"environments must divide rollout_steps, {self.rollout_steps}, not {spec.environments}")
         return Rollout.create(self.rollout_steps, spec)
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
-        """Return random networks, a policy near N(0, 1) everywhere, and statistics of nothing."""
+        """Return random networks, a policy near N(0, 1) everywhere, and empty statistics."""
         actor_key, critic_key = jax.random.split(key)
         sizes = spec.observation_size, self.hidden_sizes
         parameters = Parameters(
@@ -268,14 +267,14 @@ class PPO(Architecture):
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
-        """Return an unclipped sample to explore, else the mean clipped to [-1, 1]."""
+        """Return an unclipped sample if exploring, else the mean clipped to [-1, 1]."""
         policy = policy_at(state.parameters, self.normalise(state.observation_statistics, observation))
         if explore:
             return policy.sample(jax.random.normal(key, policy.mean.shape))
         return jnp.clip(policy.mean, -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the actor's layers, its spread and the statistics that it sees observations by."""
+        """Return the actor's layers, its log standard deviation and its observation normaliser."""
         actor, statistics = state.parameters.actor, state.observation_statistics
         normaliser = Normaliser(statistics.mean, statistics.std, jnp.float32(self.normalisation_limit))
         parameters = PolicyParameters(
@@ -286,12 +285,12 @@ class PPO(Architecture):
         return PolicyNetwork(parameters, actor.activation, "clipped_gaussian")
 
     def _optimiser(self, learning_rate: float | Scalar) -> optax.GradientTransformation:
-        # As one vector: few buffers to hand over when acting, which takes longer than the networks do.
+        # The state is one vector: passing many buffers when acting takes longer than computing the networks.
         return optax.flatten(make_optimiser(learning_rate, self.max_gradient_norm, epsilon=self.adam_epsilon))
 
 
 def by_environment(rollout: Any, state: State) -> Any:
-    """Return arrays [step, ...] of a rollout as [time, environment, ...], or as they are of a single environment."""
+    """Return arrays [step, ...] of a rollout as [time, environment, ...], or unchanged for a single environment."""
     environments = state.discounted_return.shape
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *environments, *leaf.shape[1:]), rollout)
 

@@ -1,4 +1,4 @@
-"""Soft Actor-Critic (Haarnoja et al. 2018), with the learnt temperature of its second paper or a fixed one."""
+"""Soft Actor-Critic (Haarnoja et al. 2018), with a fixed temperature or the learnt one of its second paper."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from csac.algorithms.networks import MLP, gradient_step, polyak
 from csac.algorithms.off_policy import MaximumEntropy, evaluated_actor, first_metrics, improve_delayed, policy_network
 from csac.algorithms.shapes import Action, Actions, Count, Key, Observation, Observations, Scalar
 from csac.algorithms.statistics import Statistics, normalise, normalise_batch
-from csac.algorithms.temperature import Temperature, logarithm
+from csac.algorithms.temperature import Temperature, finite_log
 from csac.types import Metrics, PolicyNetwork, Spec, Transition
 
 
 class State(NamedTuple):
-    """Everything that one seed of SAC learns."""
+    """The learnt state of one SAC seed."""
 
     actor: MLP
     critics: Critics
     target_critics: Critics | None
-    temperature: Temperature  # a fixed one as well
+    temperature: Temperature  # learnt or fixed
     actor_optimiser: Any
     critic_optimiser: Any
     observation_statistics: Statistics | None = None
-    average: MLP | None = None  # of past actors, where it is what is evaluated
+    average: MLP | None = None  # average of past actors, if it is evaluated
     actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
 
@@ -55,7 +55,7 @@ class SAC(MaximumEntropy):
     def actor_loss(
         self, actor: MLP, observation: Observation, noise: Action, *, critics: Critics, temperature: Scalar
     ) -> tuple[Scalar, Metrics]:
-        """Return α log π - min Q at the reparameterised action (second paper, Eq. 9), and what to log."""
+        """Return α log π - min Q at the reparameterised action (second paper, Eq. 9), and the metrics."""
         policy = policy_at(actor, observation)
         q_value = min_q(critics, observation, policy.sample(noise))
         log_prob = policy.log_prob(noise)
@@ -66,8 +66,8 @@ class SAC(MaximumEntropy):
         """Take one gradient step on the critics, then on the actor and the temperature; move the target critics."""
         statistics, batch = normalise_batch(state.observation_statistics, batch)
         state = state._replace(observation_statistics=statistics)
-        if self.entropy_weight != "auto":  # a fork may have another
-            log_weight = logarithm(self.entropy_weight)
+        if self.entropy_weight != "auto":  # a fork may have changed it
+            log_weight = finite_log(self.entropy_weight)
             state = state._replace(temperature=state.temperature._replace(log_weight=log_weight))
         target_noise, actor_noise = jax.random.normal(key, (2, *batch.action.shape))
         temperature = jnp.exp(state.temperature.log_weight)
@@ -76,8 +76,8 @@ class SAC(MaximumEntropy):
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
 
-        given = (folded_critics, batch.observation, actor_noise, step)
-        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
+        arguments = (folded_critics, batch.observation, actor_noise, step)
+        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *arguments)
         state = state._replace(target_critics=polyak(state.target_critics, state.critics, self.target_rate))
         return state, {**metrics, **actor_metrics, "temperature": temperature}
 
@@ -95,7 +95,7 @@ class SAC(MaximumEntropy):
         return state._replace(**learnt, average=self.average_after(state.average, actor, step)), metrics
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
-        """Return random networks; the targets are copies."""
+        """Return random networks, with copies as targets."""
         return State(
             **self.first_networks(key, spec, steps, 2 * spec.action_size),
             temperature=self.first_temperature(self.entropy_weight),
@@ -103,11 +103,11 @@ class SAC(MaximumEntropy):
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
-        """Return a sampled action to explore, else tanh(mean)."""
+        """Return a sampled action if exploring, else tanh(mean)."""
         actor = state.actor if explore else evaluated_actor(state)
         policy = policy_at(actor, normalise(state.observation_statistics, observation))
         return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the layers of the actor that is evaluated, and what it sees observations by."""
+        """Return the evaluated actor's layers and its observation normaliser."""
         return policy_network(evaluated_actor(state), state.observation_statistics, "tanh_gaussian")

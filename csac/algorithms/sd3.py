@@ -17,13 +17,13 @@ from csac.algorithms.off_policy import OffPolicy
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.types import Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
-# Targets computed at once. The activations of a whole batch's samples leave the processor's caches: in groups of this
-# many examples an update takes 40 % less time on a CPU.
+# Examples whose targets are computed at once. The activations of a whole batch exceed a CPU's caches: in groups of this
+# size an update takes 40 % less time there.
 EXAMPLES_AT_ONCE = 32
 
 
 class Pair(NamedTuple):
-    """An actor, the critic that it climbs, and the targets of both."""
+    """An actor, the critic that it maximises, and the targets of both."""
 
     actor: MLP
     critic: MLP
@@ -34,7 +34,7 @@ class Pair(NamedTuple):
 
 
 class State(NamedTuple):
-    """Everything that one seed of SD3 learns."""
+    """The learnt state of one SD3 seed."""
 
     first: Pair
     second: Pair
@@ -45,7 +45,7 @@ class SD3(OffPolicy):
     """Softmax Deep Double Deterministic policy gradients (its Algorithm 1)."""
 
     inverse_temperature: Annotated[float, NOT_NEGATIVE] = 0.05
-    """How strongly the value of a state leans to its best sampled actions (the paper's beta); 0 is the mean."""
+    """How strongly the value of a state favours its best sampled actions (the paper's beta); 0 is their mean."""
     noise_samples: Annotated[int, COUNT] = 50
     """Actions sampled around the target actor's action to value a state (the paper's K)."""
     importance_sampling: bool = False
@@ -74,7 +74,7 @@ class SD3(OffPolicy):
     ) -> Scalar:
         """Return y = r + γ softmax of min Q'(s', ãₖ) at ãₖ = clip(π'(s') + clip(σ ξₖ, -c, c), -1, 1) (Algorithm 1).
 
-        The `noise` are the ξₖ ~ N(0, I); nothing follows a terminal step.
+        `noise` holds the ξₖ ~ N(0, I). There is no bootstrap after a terminal step.
         """
         observation = transition.next_observation
         mean = jnp.tanh(target_actor(observation))
@@ -88,7 +88,7 @@ class SD3(OffPolicy):
         return transition.reward + self.discount_after(transition) * softmax_value
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
-        """Update the first pair on half of the batch, then the second, which sees its new target, on the rest."""
+        """Update the first pair on half of the batch, then the second, given the first's new target, on the rest."""
         first_key, second_key = jax.random.split(key)
         first_batch = jax.tree.map(lambda leaf: leaf[: self.batch_size], batch)
         second_batch = jax.tree.map(lambda leaf: leaf[self.batch_size :], batch)
@@ -124,7 +124,7 @@ class SD3(OffPolicy):
         return new_pair, {**critic_metrics, **actor_metrics}
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
-        """Return two pairs of random networks; the targets are copies."""
+        """Return two pairs of random networks, with copies as targets."""
         first_key, second_key = jax.random.split(key)
         return State(self._make_pair(first_key, spec, steps), self._make_pair(second_key, spec, steps))
 
@@ -143,7 +143,7 @@ class SD3(OffPolicy):
         )
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
-        """Return the action of the actor whose own critic values it more, with noise and clipped to explore."""
+        """Return the action of the actor whose own critic values it more; if exploring, with noise and clipped."""
         first, second = (jnp.tanh(pair.actor(observation)) for pair in state)
         first_value, second_value = (
             q_value(pair.critic, observation, action) for pair, action in zip(state, (first, second), strict=True)
@@ -154,7 +154,7 @@ class SD3(OffPolicy):
         return jnp.clip(action + self.exploration_std * self.noise(key, action.size), -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return both actors' and both critics' layers: the critics choose the actor."""
+        """Return both actors' and both critics' layers: the critics decide which actor acts."""
         actors, critics = (state.first.actor, state.second.actor), (state.first.critic, state.second.critic)
         parameters = PolicyParameters(tuple(map(plain_layers, actors)), tuple(map(plain_layers, critics)))
         return PolicyNetwork(parameters, actors[0].activation, "tanh", critics[0].activation)
@@ -168,18 +168,18 @@ def softmax_operator(
 
 
 def log_density(noise: Float[Array, "sample action"]) -> Float[Array, " sample"]:
-    """Return the log-density of unclipped standard noise, but for what all samples share."""
+    """Return the log-density of unclipped standard noise, up to a constant."""
     return -0.5 * jnp.sum(noise**2, axis=-1)
 
 
 def critic_loss(critic: MLP, transition: Transition, target: Scalar) -> tuple[Scalar, Metrics]:
-    """Return [Qᵢ(s, a) - y]² (Algorithm 1), and what to log."""
+    """Return [Qᵢ(s, a) - y]² (Algorithm 1), and the metrics."""
     value = q_value(critic, transition.observation, transition.action)
     loss = (value - target) ** 2
     return loss, {"critic_loss": loss, "q_mean": value}
 
 
 def actor_loss(actor: MLP, observation: Observation, *, critic: MLP) -> tuple[Scalar, Metrics]:
-    """Return -Qᵢ(s, πᵢ(s)), whose gradient is the deterministic policy gradient against its sign (Algorithm 1)."""
+    """Return -Qᵢ(s, πᵢ(s)), whose gradient is minus the deterministic policy gradient (Algorithm 1)."""
     loss = -q_value(critic, observation, jnp.tanh(actor(observation)))
     return loss, {"actor_loss": loss}

@@ -1,4 +1,4 @@
-"""The shapes that equations speak of, for one example and one seed; a name stands for a size."""
+"""Array types of the equations, for one example and one seed; a name in a shape is the size of an axis."""
 
 from __future__ import annotations
 

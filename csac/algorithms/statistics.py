@@ -1,4 +1,4 @@
-"""Running statistics, by which observations and rewards are brought to a common scale."""
+"""Running statistics to normalise observations and rewards."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from csac.algorithms.returns import discounted_returns
 from csac.algorithms.shapes import Observation, Scalar
 from csac.types import Normaliser, Transition
 
-# Added to variances and to the spread of advantages, as in SB3 and CleanRL: what never varies is divided by little.
+# Added to variances and to the standard deviation of advantages, as in SB3 and CleanRL: either may be 0.
 EPSILON = 1e-8
-LIMIT = 10.0  # of normalised observations, in standard deviations
+LIMIT = 10.0  # bound on normalised observations, in standard deviations
 
 
 class Statistics(NamedTuple):
-    """Mean and spread of everything absorbed so far; the identity, 0 and 1, before there is any."""
+    """Mean and standard deviation of all values absorbed so far; 0 and 1 before the first."""
 
     total: Scalar
     mean: Float[Array, "..."]
     variance: Float[Array, "..."]
-    std: Float[Array, "..."]  # sqrt(variance + epsilon), kept because it is needed at every step and changes at few
+    std: Float[Array, "..."]  # sqrt(variance + epsilon), stored: every step needs it, few change it
 
     @classmethod
     def create(cls, shape: tuple[int, ...]) -> Statistics:
-        """Return the statistics of nothing."""
+        """Return empty statistics."""
         return cls(jnp.zeros(()), jnp.zeros(shape), jnp.ones(shape), jnp.ones(shape))
 
     def absorb(self, values: Float[Array, "n ..."]) -> Statistics:
-        """Return the statistics of all values so far and of these (Chan, Golub, LeVeque 1979)."""
+        """Return the statistics with these values added (Chan, Golub, LeVeque 1979)."""
         count = self.total + len(values)
         shares = self.total / count, len(values) / count
-        # Differences to the old mean, because they are small: little is rounded away where the mean itself is large.
+        # Differences to the old mean are small, so that rounding loses little even where the mean is large.
         differences = jax.vmap(jnp.subtract, in_axes=(0, None))(values, self.mean)
         shift = jnp.mean(differences, axis=0)
         within = shares[0] * self.variance + shares[1] * jnp.var(differences, axis=0)
@@ -44,32 +44,32 @@ class Statistics(NamedTuple):
 
 
 class ReturnScale(NamedTuple):
-    """Statistics of the discounted return so far in each episode, R_t = r_t + γ R_{t-1}: the scale of rewards."""
+    """Statistics of the discounted return so far in each episode, R_t = r_t + γ R_{t-1}, which scale rewards."""
 
     statistics: Statistics  # []
     running: Float[Array, " environment"]  # R of the newest step of each environment
 
     @classmethod
     def create(cls, environments: int) -> ReturnScale:
-        """Return the scale of nothing, 1."""
+        """Return the initial scale, 1."""
         return cls(Statistics.create(()), jnp.zeros(environments))
 
     def absorb(self, steps: Transition, discount: float) -> ReturnScale:
-        """Return the scale after these steps [time * environment] as well, in order."""
+        """Return the scale with these steps [time * environment] added, in order."""
         in_time = jax.tree.map(lambda leaf: leaf.reshape(-1, *self.running.shape, *leaf.shape[1:]), steps)
         returns, running = discounted_returns(self.running, in_time, discount)
         return ReturnScale(self.statistics.absorb(returns.ravel()), running)
 
 
 def normalise(statistics: Statistics | None, observation: Observation, limit: float = LIMIT) -> Observation:
-    """Return (observation - mean) / std within ± limit, or the observation as it is where there are no statistics."""
+    """Return (observation - mean) / std within ± limit, or the observation unchanged if there are no statistics."""
     if statistics is None:
         return observation
     return jnp.clip((observation - statistics.mean) / statistics.std, -limit, limit)
 
 
 def normalise_batch(statistics: Statistics | None, batch: Transition) -> tuple[Statistics | None, Transition]:
-    """Return the statistics with a batch's observations absorbed, and the batch as it is seen by these."""
+    """Return the statistics with a batch's observations absorbed, and the batch normalised by these."""
     if statistics is None:
         return None, batch
     statistics = statistics.absorb(batch.observation)
@@ -78,5 +78,5 @@ def normalise_batch(statistics: Statistics | None, batch: Transition) -> tuple[S
 
 
 def normaliser_of(statistics: Statistics | None) -> Normaliser | None:
-    """Return what `normalise` does, as part of the policy that leaves."""
+    """Return the normaliser of the exported policy, which does what `normalise` does."""
     return None if statistics is None else Normaliser(statistics.mean, statistics.std, jnp.float32(LIMIT))

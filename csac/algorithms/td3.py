@@ -19,7 +19,7 @@ from csac.types import Metrics, PolicyNetwork, Spec, Transition
 
 
 class State(NamedTuple):
-    """Everything that one seed of TD3 learns."""
+    """The learnt state of one TD3 seed."""
 
     actor: MLP
     target_actor: MLP
@@ -28,7 +28,7 @@ class State(NamedTuple):
     actor_optimiser: Any
     critic_optimiser: Any
     observation_statistics: Statistics | None = None
-    actor_metrics: Metrics | None = None  # those of the actor's last step, where it waits
+    actor_metrics: Metrics | None = None  # with a policy delay: the metrics of the actor's last step
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class TD3(TwinCritics):
     name: ClassVar[str] = "td3"
 
     def critic_target(self, transition: Transition, noise: Action, *, target_actor: MLP, targets: Critics) -> Scalar:
-        """Return y = r + γ min Q'(s', ã) at the smoothed action (Algorithm 1), and no future after a terminal step."""
+        """Return y = r + γ min Q'(s', ã) at the smoothed action (Algorithm 1), no bootstrap after a terminal step."""
         action = self.smoothed_action(target_actor, transition.next_observation, noise)
         value = min_q(targets, transition.next_observation, action)
         return transition.reward + self.discount_after(transition) * value
@@ -58,12 +58,12 @@ class TD3(TwinCritics):
         return jnp.clip(jnp.tanh(target_actor(observation)) + noise, -1.0, 1.0)
 
     def actor_loss(self, actor: MLP, observation: Observation, *, critics: Critics) -> tuple[Scalar, Metrics]:
-        """Return -Q₁(s, π(s)): its gradient is minus the deterministic policy gradient (Algorithm 1)."""
+        """Return -Q₁(s, π(s)), whose gradient is minus the deterministic policy gradient (Algorithm 1)."""
         loss = -q_value(critics[0], observation, jnp.tanh(actor(observation)))
         return loss, {"actor_loss": loss}
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
-        """Take one gradient step on the critics; every `policy_delay`-th time move the actor, then the targets."""
+        """Take one gradient step on the critics; every `policy_delay`-th time, update the actor, then the targets."""
         statistics, batch = normalise_batch(state.observation_statistics, batch)
         state = state._replace(observation_statistics=statistics)
         noise = jax.random.normal(key, batch.action.shape)
@@ -72,12 +72,12 @@ class TD3(TwinCritics):
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(self.smoothed_action, state.target_actor)
         state, folded_critics, metrics = update_critics(adam, state, batch, noise, critic_target, next_action)
 
-        given = (folded_critics, batch.observation)
-        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *given)
+        arguments = (folded_critics, batch.observation)
+        state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *arguments)
         return state, {**metrics, **actor_metrics}
 
     def improve(self, state: State, critics: Critics, observations: Observations) -> tuple[State, Metrics]:
-        """Return the state after one gradient step on the actor, against the new critics, and one of the targets."""
+        """Return the state after one gradient step on the actor, with the new critics, and on the targets."""
         loss, adam = partial(self.actor_loss, critics=critics), self.optimiser(self.actor_learning_rate)
         actor, optimiser, metrics = gradient_step(adam, loss, state.actor, state.actor_optimiser, observations)
         state = state._replace(
@@ -89,18 +89,18 @@ class TD3(TwinCritics):
         return state, metrics
 
     def init(self, key: Key, spec: Spec, steps: int) -> State:
-        """Return random networks; the targets are copies."""
+        """Return random networks, with copies as targets."""
         networks = self.first_networks(key, spec, steps, spec.action_size)
         metrics = first_metrics(("actor_loss",), self.policy_delay)
         return State(**networks, target_actor=copy_tree(networks["actor"]), actor_metrics=metrics)
 
     def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
-        """Return tanh(actor), with noise and clipped to [-1, 1] to explore."""
+        """Return tanh(actor); if exploring, with noise and clipped to [-1, 1]."""
         action = jnp.tanh(state.actor(normalise(state.observation_statistics, observation)))
         if not explore:
             return action
         return jnp.clip(action + self.exploration_std * self.noise(key, action.size), -1.0, 1.0)
 
     def policy(self, state: State) -> PolicyNetwork:
-        """Return the actor's layers, and what it sees observations by."""
+        """Return the actor's layers and its observation normaliser."""
         return policy_network(state.actor, state.observation_statistics, "tanh")

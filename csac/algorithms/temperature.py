@@ -1,4 +1,4 @@
-"""The weight of the entropy, SAC's temperature, learnt as the dual variable of a bound on the entropy from below."""
+"""The entropy weight, SAC's temperature, learnt as the dual variable of a lower bound on the entropy."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from csac.types import Metrics
 if TYPE_CHECKING:
     import optax
 
-FLOOR = math.log(1e-8)  # from here a weight can rise again: one that was fixed at 0 may go on as a learnt one
+FLOOR = math.log(1e-8)  # from here gradient steps can raise a weight that was fixed at 0 and is now learnt
 
 
 class Temperature(NamedTuple):
-    """A weight as its logarithm, so that it stays positive, and its optimiser's state."""
+    """The logarithm of a weight, so that the weight stays positive, and its optimiser's state."""
 
     log_weight: Scalar
     optimiser: Any
 
 
 def make_temperature(weight: float, optimiser: optax.GradientTransformation) -> Temperature:
-    """Return a weight to begin with."""
-    log_weight = logarithm(weight)
+    """Return the initial state of a learnt weight."""
+    log_weight = finite_log(weight)
     return Temperature(log_weight, init_optimiser(optimiser, log_weight))
 
 
-def logarithm(weight: float) -> Scalar:
-    """Return log w. Instead of log 0, which is no number, it has the lowest float, whose exp is 0."""
+def finite_log(weight: float) -> Scalar:
+    """Return log w; for log 0, the lowest finite float, whose exp is 0."""
     return jnp.maximum(jnp.log(jnp.float32(weight)), jnp.finfo(jnp.float32).min)
 
 
@@ -44,7 +44,7 @@ def temperature_loss(log_weight: Scalar, entropy: Scalar, *, target: float) -> t
 def adapt(
     temperature: Temperature, entropy: Scalar, target: float, optimiser: optax.GradientTransformation
 ) -> Temperature:
-    """Return the weight after one gradient step: down where the entropy, a mean in nats, is above its target."""
+    """Return the temperature after one gradient step, lower if `entropy`, a mean in nats, is above `target`."""
     loss, log_weight = partial(temperature_loss, target=target), jnp.maximum(temperature.log_weight, FLOOR)
     log_weight, state, _ = gradient_step(optimiser, loss, log_weight, temperature.optimiser, entropy[None])
     return Temperature(log_weight, state)

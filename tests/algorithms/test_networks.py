@@ -131,7 +131,7 @@ def test_an_actor_of_another_kind_leaves_by_the_layers_that_it_gives():
     ("learner", "message"),
     [
         (with_networks(SAC, critic=Halved)(**TINY), "Halved has 'halved', which cannot be learnt"),
-        (with_networks(SAC, actor=OneName)(**TINY), "OneName is no MLP, and policies leave as plain layers"),
+        (with_networks(SAC, actor=OneName)(**TINY), "OneName is no MLP, but policies are exported as plain layers"),
         (with_networks(SD3, critic=OneName)(**TINY), "OneName is no MLP"),
         (
             with_networks(CSAC, critic=OneName)(critic_normalisation="batch", **TINY),
