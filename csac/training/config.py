@@ -1,4 +1,4 @@
-"""From what a user gives to the configurations of runs: names resolved, values checked, the task tried once."""
+"""Build the configurations of runs from a user's options: resolve names, check values, try the task once."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class TrainOptions(TypedDict, total=False):
-    """The keyword arguments of `train` that say what a run computes, as `RunConfig` explains them."""
+    """The keyword arguments of `train` that define what a run computes; `RunConfig` documents them."""
 
     steps: int
     environments: int
@@ -57,10 +57,10 @@ PROTOCOL = ("cadence", "memory", "init", "act", "update", "policy")  # `csac.typ
 def make_configs(
     algorithm: Algorithm, task: Task, seeds: Sequence[int], given: TrainOptions, source: Source | None
 ) -> tuple[list[RunConfig], Demonstrations | None, Spec, list[str]]:
-    """Return each seed's configuration, what their replays begin with, the task's sizes, and notes for the user.
+    """Return each seed's configuration, the demonstrations, the task's sizes, and notes for the user.
 
-    The task is made, stepped and perturbed once. Raises InputError for a mistake in the options, or a task that csac
-    cannot learn.
+    The task is created, stepped and perturbed once. Raises InputError for invalid options, or a task that csac cannot
+    learn.
     """
     _refuse_unknown(given, algorithm)
     options: Any = dict(given)
@@ -116,22 +116,22 @@ def make_configs(
 
 
 def labels(seeds: int, first_seed: int) -> list[int]:
-    """Return the seeds from `first_seed` on. Raises InputError where there are none or too many."""
+    """Return the seeds from `first_seed` on. Raises InputError if there are none or too many."""
     check_whole("seeds", seeds, 1, MOST_SEEDS)
     check_whole("first_seed", first_seed, 0, SEED_LIMIT - seeds)
     return list(range(first_seed, first_seed + seeds))
 
 
 def name_of(algorithm: Algorithm) -> str:
-    """Return what the manifest calls an algorithm: a name of `ALGORITHMS`, or `module:Class` of one from elsewhere."""
+    """Return an algorithm's name in the manifest: a key of `ALGORITHMS`, or `module:Class` if it is user-defined."""
     kind = type(algorithm)
     return next((name for name, own in ALGORITHMS.items() if own is kind), f"{kind.__module__}:{kind.__qualname__}")
 
 
 def class_named(name: str) -> Any:
-    """Return the algorithm of this name, or the class `module:Class`, whose module it imports: ask `trust` first.
+    """Return the algorithm class of a name; imports the module of `module:Class`, so check that it is trusted first.
 
-    Raises InputError where there is none, or nothing can import it.
+    Raises InputError if there is no such class, or it cannot be imported.
     """
     if name in ALGORITHMS:
         return ALGORITHMS[name]
@@ -147,7 +147,7 @@ def class_named(name: str) -> Any:
 
 
 def class_typed(name: str) -> Any:
-    """Return the class `module:Class` that the user has typed. Raises InputError also where it has no defaults."""
+    """Return the class `module:Class` that the user typed. Raises InputError too if a field has no default."""
     kind = class_named(name)
     for item in dataclasses.fields(kind):
         if item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING:
@@ -157,10 +157,10 @@ def class_typed(name: str) -> Any:
 
 
 def algorithm_of(config: RunConfig, run: str | Path = "the run", trust_task: bool = False) -> Algorithm:
-    """Return the algorithm of a run with its hyperparameters; one from elsewhere if its module is trusted.
+    """Return the algorithm of a run with its hyperparameters; a user-defined one only if its module is trusted.
 
-    Raises InputError where this csac does not know them, or nobody here has named the module, which is not imported
-    then.
+    Raises InputError if this csac does not know them, or if nobody on this machine has named the module, which is then
+    not imported.
     """
     refuse_untrusted(config.algorithm if config.algorithm not in ALGORITHMS else "", run, trust_task)
     make = class_named(config.algorithm)
@@ -173,7 +173,7 @@ def algorithm_of(config: RunConfig, run: str | Path = "the run", trust_task: boo
 
 
 def check_algorithm(algorithm: Any) -> None:
-    """Raise InputError for what is no algorithm with its hyperparameters: a name, a class, something else."""
+    """Raise InputError unless this is an instance of a valid algorithm, rather than a name or a class."""
     if isinstance(algorithm, type) or not (dataclasses.is_dataclass(algorithm) and hasattr(algorithm, "update")):
         given = algorithm.__name__ if isinstance(algorithm, type) else str(algorithm)
         names = {name: kind.__name__ for name, kind in ALGORITHMS.items()}

@@ -1,4 +1,4 @@
-"""Demonstrations: transitions of one's own, which a replay begins with, as the first file of its checkpoints."""
+"""Demonstrations: the user's own transitions, which a replay buffer starts with, kept as its first replay file."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
     from csac.tasks.spaces import ContractParts
     from csac.types import Algorithm
 
-Given = str | Path | Mapping[str, Any]  # a .npz file, a Minari data set's id, or arrays by name
+Given = str | Path | Mapping[str, Any]  # a .npz file, the id of a Minari data set, or arrays by name
 
-OTHER_NAMES = {"terminations": "terminated", "truncations": "truncated"}  # in `load_checkpoint(run).replay()`
-OUTSIDE = 1e-3  # of half an action's range: more than rounding
+OTHER_NAMES = {"terminations": "terminated", "truncations": "truncated"}  # names in `load_checkpoint(run).replay()`
+OUTSIDE = 1e-3  # tolerance beyond the bounds, of half an action's range: more than rounding
 
 
 class Demonstrations(NamedTuple):
-    """The transitions as a run keeps them, and what its manifest tells of them."""
+    """The content of a run's replay file of transitions, and the facts about it in the configuration."""
 
     content: bytes
     facts: dict[str, Any]
 
     @classmethod
     def read(cls, given: Given, algorithm: Algorithm, parts: ContractParts) -> Demonstrations:
-        """Read transitions for a task with these parts. Raises InputError for what is none of such a task's."""
+        """Read transitions for a task with these parts. Raises InputError if they do not fit the task."""
         if (most := getattr(algorithm, "replay_size", None)) is None:
             raise InputError(
                 f"demonstrations are for algorithms with a replay, and {type(algorithm).__name__} has none"
@@ -53,25 +53,25 @@ class Demonstrations(NamedTuple):
         return cls(content, {"source": source, "transitions": len(rows), **facts_of(content)})
 
     def write(self, run: RunDirectory) -> None:
-        """Give them to a new run. Raises OSError."""
+        """Write them into a new run. Raises OSError."""
         name = next(iter(files_of(self.facts)))
         (run.checkpoints / REPLAY).mkdir(parents=True, exist_ok=True)
         write_atomically(run.checkpoints / name, self.content)
 
 
 def is_told(given: object) -> bool:
-    """Return whether this is what a run's configuration tells of its demonstrations."""
+    """Return whether these are the facts about demonstrations in a run's configuration."""
     return isinstance(given, dict) and "sha256" in given
 
 
 def files_of(facts: dict[str, Any]) -> dict[str, Facts]:
-    """Return the file of demonstrations among those of a checkpoint; none where there are none."""
+    """Return the replay file of the demonstrations, by name; empty if there are none."""
     own = {name: facts[name] for name in ("bytes", "sha256") if facts}
     return {f"{REPLAY}/0-{facts['transitions']}.safetensors": own} if facts else {}
 
 
 def rows_of(run: RunDirectory) -> np.ndarray:
-    """Return the packed transitions [n, width] that a run begins with. Raises InputError where they are lost."""
+    """Return the packed transitions [n, width] that a run starts with. Raises InputError if they are lost."""
     ((name, facts),) = files_of(run.config.demonstrations).items()
     path = run.checkpoints / name
     if not path.is_file() or facts_of(content := path.read_bytes()) != facts:
@@ -80,7 +80,7 @@ def rows_of(run: RunDirectory) -> np.ndarray:
 
 
 def _arrays(given: Given, contract: Contract) -> tuple[dict[str, Any], list[str]]:
-    """Return what was given as arrays by our names, and the names that it has."""
+    """Return the given arrays under csac's names, and the names that they came with."""
     if isinstance(given, Mapping):
         arrays = dict(given)
     elif _is_file(given):
@@ -136,7 +136,7 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
 
     def field(name: str, size: int) -> np.ndarray:
         try:
-            with np.errstate(over="ignore"):  # becomes infinite, which is refused
+            with np.errstate(over="ignore"):  # an overflow becomes infinite, which is refused
                 value = contract.flatten(arrays[name]) if "observations" in name else np.asarray(arrays[name])
                 if value.dtype.kind not in "biuf":
                     raise TypeError(f"{value.dtype} is no type of numbers")

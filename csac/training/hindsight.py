@@ -1,4 +1,4 @@
-"""Hindsight: transitions once more, with goals that their episode reached later (HER, Andrychowicz et al. 2017)."""
+"""Hindsight: copy transitions with goals that their episode achieved later (HER, Andrychowicz et al. 2017)."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ ACHIEVED, DESIRED = "achieved_goal", "desired_goal"
 
 
 class Hindsight:
-    """Keeps the episodes in progress, and at the end of each gives its seed's replay `copies` of each transition."""
+    """Keeps the episodes in progress; at an episode's end, adds `copies` of each transition to its seed's replay."""
 
     def __init__(self, copies: int, environments: SeedEnvironments, learner: Learner) -> None:
         self._copies, self._environments, self._learner = copies, environments, learner
         self._goals = places_of(environments.contract_parts.observation_parts)
-        self._episodes: dict[tuple[int, ...], list[np.ndarray]] = {}  # packed transitions by place
+        self._episodes: dict[tuple[int, ...], list[np.ndarray]] = {}  # packed transitions by (seed index, environment)
 
     def after_step(self, observations: np.ndarray, actions: np.ndarray, outcome: Steps, step: int) -> None:
-        """Take a step of each environment, the last of which is number `step`, before the learner does."""
+        """Store one transition of each environment, up to `step` in all, before the learner does."""
         ends = outcome.terminated, outcome.truncated
         rows = pack(Transition(observations, actions, outcome.reward, outcome.next_observation, *ends))
         given: dict[int, list[np.ndarray]] = {}
@@ -54,12 +54,12 @@ class Hindsight:
             self._learner.extend(several, step - self._environments.spec.environments)
 
     def save(self, index: int) -> Snapshot:
-        """Return the episodes in progress of the seed at this place."""
+        """Return the episodes in progress of the seed at this index."""
         own = {place: rows for place, rows in self._episodes.items() if place[0] == index and rows}
         return Snapshot({str(place[-1]): np.stack(rows) for place, rows in own.items()}, {})
 
     def restore(self, index: int, saved: Snapshot) -> None:
-        """Go on with what `save` returned; an episode that restarts is left out instead."""
+        """Restore the episodes that `save` returned; not for a seed whose episode restarts."""
         for name, rows in saved.arrays.items():
             own = (int(name),) if self._environments.spec.environments > 1 else ()
             self._episodes[(index, *own)] = [*rows]
@@ -75,7 +75,7 @@ def relabelled(
 ) -> np.ndarray:
     """Return `copies` of each transition of an episode [steps, width], with goals achieved in that step or a later one.
 
-    Rewards are computed for the new goals, and so is `terminated` where the task can; else it is what it was.
+    Rewards are recomputed for the new goals, and so is `terminated` if the task can; otherwise it is unchanged.
     """
     achieved, desired = goals
     reward = spec.observation_size + spec.action_size
@@ -95,7 +95,7 @@ def relabelled(
 
 
 def places_of(parts: Parts) -> tuple[slice, slice]:
-    """Return where the achieved and the desired goal lie in a flat observation. Raises InputError without them."""
+    """Return the slices of the achieved and the desired goal in a flat observation. Raises InputError without them."""
     ends = np.cumsum([0, *(math.prod(shape) for _, shape in parts)]).tolist()
     places = {name: slice(*ends[i : i + 2]) for i, (name, _) in enumerate(parts)}
     shapes = dict(parts)
@@ -106,7 +106,7 @@ def places_of(parts: Parts) -> tuple[slice, slice]:
 
 
 def check_goals(algorithm: Algorithm, environment: Environment) -> None:
-    """Raise InputError where an algorithm or a task has no use for hindsight. The task makes a step."""
+    """Raise InputError if an algorithm or a task does not support hindsight. Steps the environment once."""
     if not hasattr(algorithm, "replay_size"):
         raise InputError(f"hindsight is for algorithms with a replay, and {type(algorithm).__name__} has none")
     if getattr(algorithm, "n_steps", 1) > 1:
