@@ -42,11 +42,11 @@ class Moment:
     directory: Path
     """The run's directory."""
     policy: Policy | None = None
-    """The policy of now, for a callback with `needs_policy`."""
+    """The current policy, if a callback has `needs_policy`."""
     scalars: dict[str, float] = field(default_factory=dict)
-    """What was logged so far."""
+    """The scalars logged so far."""
     metrics: tuple[str, ...] = ()
-    """The metrics of the algorithm, whose names are taken."""
+    """The algorithm's metrics, whose names cannot be logged."""
 
     @property
     def run(self) -> RunDirectory:
@@ -73,7 +73,7 @@ class Callback:
     interval: int = 1_000
     """Environment steps of a seed between two calls of `on_step`."""
     needs_policy: bool = False
-    """Whether moments hold the policy, which takes a copy of it each time."""
+    """Whether moments hold the policy, which is copied for each one."""
 
     def on_step(self, moment: Moment) -> bool | None:
         """Handle `interval` further steps, after their updates."""
@@ -148,12 +148,12 @@ class Event(NamedTuple):
     """A training event to pass to callbacks, with one moment for each seed of a program that it concerns."""
 
     method: str
-    """Of `Callback`."""
+    """The method of `Callback` to call."""
     moments: list[Moment]
     arguments: list[tuple[Any, ...]]
-    """What the method is given beside the moment, for each."""
+    """The method's further arguments, for each moment."""
     intervals: tuple[int, ...] = ()
-    """Those that are over, of `on_step`."""
+    """The intervals of `on_step` that have passed."""
 
 
 class Answer(NamedTuple):
@@ -162,7 +162,7 @@ class Answer(NamedTuple):
     stopped_by: str = ""
     scalars: tuple[dict[str, float], ...] = ()
     failed: bool = False
-    """Whether one of them raised, now or before."""
+    """Whether a callback has raised, in this event or before."""
 
 
 STOPPED = Answer("a stop of all runs")

@@ -50,9 +50,9 @@ class Checkpoint(NamedTuple):
     """The run's `checkpoint/`."""
     step: int
     files: dict[str, Facts]
-    """Its own files, by name, and those of its transitions, as `replay/<a>-<b>.safetensors`."""
+    """The checkpoint's own files, by name, and its replay files, as `replay/<a>-<b>.safetensors`."""
     transitions: tuple[int, int]
-    """The first transition that the memory held, and the one after the last."""
+    """The first transition in the replay buffer, and one past the last."""
     values: dict[str, Any]
 
     @classmethod
