@@ -197,32 +197,32 @@ class Callbacks:
     def hears(self) -> Hears:
         """The events that they handle."""
 
-        def hearing(method: str) -> list[Callback]:
+        def overriding(method: str) -> list[Callback]:
             return [one for one in self.callbacks if getattr(type(one), method) is not getattr(Callback, method)]
 
         has_function = self.on_evaluation is not None or self.stop_when is not None
         return Hears(
-            tuple(sorted({callback.interval for callback in hearing("on_step")})),
-            bool(hearing("on_episode")),
-            bool(hearing("on_evaluation")) or has_function,
+            tuple(sorted({callback.interval for callback in overriding("on_step")})),
+            bool(overriding("on_episode")),
+            bool(overriding("on_evaluation")) or has_function,
             any(callback.needs_policy for callback in self.callbacks),
         )
 
     def call(self, event: Event) -> Answer:
         """Pass an event to all of them, and return their answer."""
         due = [one for one in self.callbacks if event.method != "on_step" or one.interval in event.intervals]
-        stopped_by = [self._tell(callback, event) for callback in due]
+        stoppers = [self._call_one(callback, event) for callback in due]
         if event.method == "on_evaluation":
             moments = zip(event.moments, event.arguments, strict=True)
             returns = {moment.seed: mean_return(episodes) for moment, (episodes,) in moments}
             step = event.moments[0].step
             self._guarded("on_evaluation", self.on_evaluation, step, dict(returns))
             if self._guarded("stop_when", self.stop_when, step, dict(returns)):
-                stopped_by.append("stop_when")
-        stopper = str(self.failure) if self.failure else next(filter(None, stopped_by), "")
+                stoppers.append("stop_when")
+        stopper = str(self.failure) if self.failure else next(filter(None, stoppers), "")
         return Answer(stopper, tuple(moment.scalars for moment in event.moments), self.failure is not None)
 
-    def still_stop(self, run: RunDirectory) -> bool:
+    def would_stop_again(self, run: RunDirectory) -> bool:
         """Return whether the callbacks would end a run at its last evaluation, as they did before."""
         if run.manifest.state != "finished" or not self.hears.evaluations or not len(run.evaluations):
             return False
@@ -235,12 +235,12 @@ class Callbacks:
         moment = Moment(run.seed, int(rows["step"][-1]), run.path)
         return bool(callbacks.call(Event("on_evaluation", [moment], [(episodes,)])).stopped_by)
 
-    def _tell(self, callback: Callback, event: Event) -> str:
+    def _call_one(self, callback: Callback, event: Event) -> str:
         """Return the callback's name if it ends the runs, else an empty string."""
         name, goes_on = type(callback).__name__, True
         for moment, arguments in zip(event.moments, event.arguments, strict=True):
-            told = self._guarded(f"{name}.{event.method}", getattr(callback, event.method), moment, *arguments)
-            goes_on = goes_on and (told is None or bool(told))
+            returned = self._guarded(f"{name}.{event.method}", getattr(callback, event.method), moment, *arguments)
+            goes_on = goes_on and (returned is None or bool(returned))
         return "" if goes_on else name
 
     def _guarded(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
@@ -277,22 +277,22 @@ class Notifier:
     def after_step(self, step: int, stride: int, alive: np.ndarray, episodes: Sequence[FinishedEpisode]) -> bool:
         """Report the last `stride` steps and the episodes that ended; return whether to stop."""
         if episodes and self._hears.episodes:
-            told = [episode.seed_index for episode in episodes]
-            self._tell("on_episode", step, told, [(episode,) for episode in episodes])
+            indices = [episode.seed_index for episode in episodes]
+            self._notify("on_episode", step, indices, [(episode,) for episode in episodes])
         due = tuple(interval for interval in self._hears.intervals if step % interval < stride)
         if due:
             indices = np.flatnonzero(alive).tolist()
-            self._tell("on_step", step, indices, [()] * len(indices), due)
+            self._notify("on_step", step, indices, [()] * len(indices), due)
         return bool(self.stopped_by)
 
     def evaluated(self, step: int, results: Mapping[int, tuple[Policy, Any]]) -> bool:
         """Report an evaluation: each seed's policy and episodes, by seed index; return whether to stop."""
         if results and self._hears.evaluations:
             policies = {index: policy for index, (policy, _) in results.items()}
-            self._tell("on_evaluation", step, [*results], [(e,) for _, e in results.values()], policies=policies)
+            self._notify("on_evaluation", step, [*results], [(e,) for _, e in results.values()], policies=policies)
         return bool(self.stopped_by)
 
-    def _tell(
+    def _notify(
         self,
         method: str,
         step: int,

@@ -36,7 +36,7 @@ LIST, STATE, REPLAY = "checkpoint.json", "state.safetensors", "replay"
 
 Facts = dict[str, Any]  # of a file: {"bytes": size, "sha256": checksum}
 
-_LOST = (errno.ENOENT, errno.EIO, errno.ENOTDIR, errno.EISDIR)
+_LOST_FILE_ERRORS = (errno.ENOENT, errno.EIO, errno.ENOTDIR, errno.EISDIR)
 
 
 class Damaged(InputError):
@@ -84,8 +84,8 @@ class Checkpoint(NamedTuple):
                 raise Damaged(f"{path} has changed since it was written")
             return content
         except Damaged:
-            own = self.folder.parent / ("policy" if name.endswith(".safetensors") else "") / name
-            if own.is_file() and facts_of(content := own.read_bytes()[: facts["bytes"]]) == facts:
+            run_file = self.folder.parent / ("policy" if name.endswith(".safetensors") else "") / name
+            if run_file.is_file() and facts_of(content := run_file.read_bytes()[: facts["bytes"]]) == facts:
                 return content
             raise
 
@@ -115,11 +115,11 @@ class Checkpoint(NamedTuple):
             numbers = np.arange(max(begin, first), min(end, last))
             rows[numbers % len(rows)] = shard[numbers - begin]
             known[numbers - first] = True
-        missing, there = first + np.flatnonzero(~known), first + np.flatnonzero(known)
-        if len(missing) and not len(there):
+        missing, present = first + np.flatnonzero(~known), first + np.flatnonzero(known)
+        if len(missing) and not len(present):
             raise Damaged(f"{self.folder / REPLAY} has none of the transitions of step {self.step}")
         if len(missing):
-            rows[missing % len(rows)] = rows[there[np.arange(len(missing)) % len(there)] % len(rows)]
+            rows[missing % len(rows)] = rows[present[np.arange(len(missing)) % len(present)] % len(rows)]
             lost = lost or [f"{self.folder / REPLAY} lacks {len(missing):,} transitions: others stand in for them"]
         return lost
 
@@ -253,7 +253,7 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        kind = Damaged if error.errno in _LOST else InputError
+        kind = Damaged if error.errno in _LOST_FILE_ERRORS else InputError
         raise kind(f"{path} cannot be read: {error.strerror}") from error
 
 

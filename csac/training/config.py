@@ -16,7 +16,7 @@ from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.preflight import limit_warning, seed_warning, try_task, wrapper_warnings
 from csac.tasks.registry import check_events, events_of, import_module_of
 from csac.tasks.trust import refuse_untrusted, remember
-from csac.training.demonstrations import Demonstrations, is_told
+from csac.training.demonstrations import Demonstrations, are_facts
 from csac.training.hindsight import check_goals
 from csac.types import InputError
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from csac.tasks.registry import Task
-    from csac.training.demonstrations import Given
+    from csac.training.demonstrations import DemonstrationData
     from csac.training.resume import Source
     from csac.types import Algorithm, Spec
 
@@ -46,7 +46,7 @@ class TrainOptions(TypedDict, total=False):
     perturbations: str | Perturbation | Iterable[str | Perturbation] | None
     events: Sequence[str] | None
     hindsight: int
-    demonstrations: Given | None
+    demonstrations: DemonstrationData | None
 
 
 RUN_OPTIONS = tuple(TrainOptions.__annotations__)
@@ -67,29 +67,29 @@ def make_configs(
     arguments = options.pop("environment_arguments", None)
     check_arguments("environment_arguments", arguments)
     arguments = as_json("environment_arguments", dict(arguments or {}))
-    asked, events = options.pop("perturbations", None), options.pop("events", None)
+    perturbations, events = options.pop("perturbations", None), options.pop("events", None)
     if events is not None:
         check_events(events)
     if source and events is None:
         events = next(iter(source.runs.values())).config.events
     else:
         events = events_of(task, events or ())
-    offered, read = options.pop("demonstrations", None), None
+    data, demonstrations = options.pop("demonstrations", None), None
     hyperparameters = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
     with closing(Environment(task, arguments)) as environment:
         spec, name = environment.spec, environment.task_name
         try_task(environment, arguments)
-        facts = offered if is_told(offered) else {}
-        if offered and not facts:
+        facts = data if are_facts(data) else {}
+        if data and not facts:
             if source:
                 raise InputError("demonstrations are for a new run: a fork has the replay that it begins with")
-            read = Demonstrations.read(offered, algorithm, environment.contract_parts)
-            facts = read.facts
-        told = seed_warning(environment), limit_warning(environment, task, LONGEST_EPISODE)
-        notes = [*wrapper_warnings(environment), *filter(None, told)]
+            demonstrations = Demonstrations.read(data, algorithm, environment.contract_parts)
+            facts = demonstrations.facts
+        task_warnings = seed_warning(environment), limit_warning(environment, task, LONGEST_EPISODE)
+        notes = [*wrapper_warnings(environment), *filter(None, task_warnings)]
         remember(task)
         remember(name_of(algorithm))
-        asked_for = tuple(map(str, perturbations_of(asked or ())))
+        perturbation_texts = tuple(map(str, perturbations_of(perturbations or ())))
         configs = [
             RunConfig(
                 task=name,
@@ -97,7 +97,7 @@ def make_configs(
                 hyperparameters=hyperparameters,
                 seed=seed,
                 environment_arguments=arguments,
-                perturbations=source.perturbations(seed, asked) if source else asked_for,
+                perturbations=source.perturbations(seed, perturbations) if source else perturbation_texts,
                 demonstrations=source.runs[seed].config.demonstrations if source else facts,
                 events=tuple(events),
                 task_is_callable=not isinstance(task, str),
@@ -108,11 +108,11 @@ def make_configs(
         if configs[0].hindsight:
             check_goals(algorithm, environment)
         changes = perturbations_of(configs[0].perturbations)
-        refuse_late(changes, configs[0].steps, planned=source is not None and asked is None)
+        refuse_late(changes, configs[0].steps, planned=source is not None and perturbations is None)
         for item in changes:
             environment.perturb({item.kind: item.value})
     spec = spec._replace(environments=configs[0].environments)
-    return configs, read, spec, [f"note: {line}" for line in notes]
+    return configs, demonstrations, spec, [f"note: {line}" for line in notes]
 
 
 def labels(seeds: int, first_seed: int) -> list[int]:
@@ -175,9 +175,9 @@ def algorithm_of(config: RunConfig, run: str | Path = "the run", trust_task: boo
 def check_algorithm(algorithm: Any) -> None:
     """Raise InputError unless this is an instance of a valid algorithm, rather than a name or a class."""
     if isinstance(algorithm, type) or not (dataclasses.is_dataclass(algorithm) and hasattr(algorithm, "update")):
-        given = algorithm.__name__ if isinstance(algorithm, type) else str(algorithm)
+        text = algorithm.__name__ if isinstance(algorithm, type) else str(algorithm)
         names = {name: kind.__name__ for name, kind in ALGORITHMS.items()}
-        raise InputError(f"{given:.60} is no algorithm with hyperparameters: give {names.get(given.lower(), 'CSAC')}()")
+        raise InputError(f"{text:.60} is no algorithm with hyperparameters: give {names.get(text.lower(), 'CSAC')}()")
     kind: Any = type(algorithm)
     if not kind.__dataclass_params__.frozen:
         raise InputError(f"{kind.__name__} is to be a frozen dataclass: write @dataclass(frozen=True)")

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from csac.tasks.spaces import ContractParts
     from csac.types import Algorithm
 
-Given = str | Path | Mapping[str, Any]  # a .npz file, the id of a Minari data set, or arrays by name
+DemonstrationData = str | Path | Mapping[str, Any]  # a .npz file, the id of a Minari data set, or arrays by name
 
 OTHER_NAMES = {"terminations": "terminated", "truncations": "truncated"}  # names in `load_checkpoint(run).replay()`
-OUTSIDE = 1e-3  # tolerance beyond the bounds, of half an action's range: more than rounding
+BOUNDS_TOLERANCE = 1e-3  # as a fraction of half an action's range: more than rounding
 
 
 class Demonstrations(NamedTuple):
@@ -38,18 +38,18 @@ class Demonstrations(NamedTuple):
     facts: dict[str, Any]
 
     @classmethod
-    def read(cls, given: Given, algorithm: Algorithm, parts: ContractParts) -> Demonstrations:
+    def read(cls, data: DemonstrationData, algorithm: Algorithm, parts: ContractParts) -> Demonstrations:
         """Read transitions for a task with these parts. Raises InputError if they do not fit the task."""
-        if (most := getattr(algorithm, "replay_size", None)) is None:
+        if (capacity := getattr(algorithm, "replay_size", None)) is None:
             raise InputError(
                 f"demonstrations are for algorithms with a replay, and {type(algorithm).__name__} has none"
             )
         contract = Contract(None, "", "relu", "tanh", *parts)
-        rows = _rows(*_arrays(given, contract), contract)
-        if len(rows) > most:
-            raise InputError(f"demonstrations has {len(rows):,} transitions and replay_size is {most:,}")
+        rows = _rows(*_arrays(data, contract), contract)
+        if len(rows) > capacity:
+            raise InputError(f"demonstrations has {len(rows):,} transitions and replay_size is {capacity:,}")
         content = safetensors.numpy.save({"rows": rows})
-        source = "arrays" if isinstance(given, Mapping) else Path(given).name if _is_file(given) else str(given)
+        source = "arrays" if isinstance(data, Mapping) else Path(data).name if _is_file(data) else str(data)
         return cls(content, {"source": source, "transitions": len(rows), **facts_of(content)})
 
     def write(self, run: RunDirectory) -> None:
@@ -59,15 +59,15 @@ class Demonstrations(NamedTuple):
         write_atomically(run.checkpoints / name, self.content)
 
 
-def is_told(given: object) -> bool:
+def are_facts(data: object) -> bool:
     """Return whether these are the facts about demonstrations in a run's configuration."""
-    return isinstance(given, dict) and "sha256" in given
+    return isinstance(data, dict) and "sha256" in data
 
 
 def files_of(facts: dict[str, Any]) -> dict[str, Facts]:
     """Return the replay file of the demonstrations, by name; empty if there are none."""
-    own = {name: facts[name] for name in ("bytes", "sha256") if facts}
-    return {f"{REPLAY}/0-{facts['transitions']}.safetensors": own} if facts else {}
+    file_facts = {name: facts[name] for name in ("bytes", "sha256") if facts}
+    return {f"{REPLAY}/0-{facts['transitions']}.safetensors": file_facts} if facts else {}
 
 
 def rows_of(run: RunDirectory) -> np.ndarray:
@@ -79,21 +79,21 @@ def rows_of(run: RunDirectory) -> np.ndarray:
     return safetensors.numpy.load(content)["rows"]
 
 
-def _arrays(given: Given, contract: Contract) -> tuple[dict[str, Any], list[str]]:
+def _arrays(data: DemonstrationData, contract: Contract) -> tuple[dict[str, Any], list[str]]:
     """Return the given arrays under csac's names, and the names that they came with."""
-    if isinstance(given, Mapping):
-        arrays = dict(given)
-    elif _is_file(given):
-        arrays = _of_file(Path(given))
-    elif isinstance(given, str):
-        arrays = _of_minari(given, contract)
+    if isinstance(data, Mapping):
+        arrays = dict(data)
+    elif _is_file(data):
+        arrays = _of_file(Path(data))
+    elif isinstance(data, str):
+        arrays = _of_minari(data, contract)
     else:
-        raise InputError(f"demonstrations is a .npz file, a dict of arrays or a Minari id, not {given!r:.40}")
+        raise InputError(f"demonstrations is a .npz file, a dict of arrays or a Minari id, not {data!r:.40}")
     return arrays | {name: arrays[other] for name, other in OTHER_NAMES.items() if other in arrays}, list(arrays)
 
 
-def _is_file(given: str | os.PathLike[str]) -> bool:
-    return isinstance(given, Path) or (isinstance(given, str) and given.endswith(".npz"))
+def _is_file(data: str | os.PathLike[str]) -> bool:
+    return isinstance(data, Path) or (isinstance(data, str) and data.endswith(".npz"))
 
 
 def _of_file(path: Path) -> dict[str, Any]:
@@ -110,15 +110,15 @@ def _of_minari(name: str, contract: Contract) -> dict[str, Any]:
     try:
         minari = importlib.import_module("minari")
     except ImportError:
-        told = "is no .npz file; if it is a Minari data set, install what reads it: pip install 'minari[hdf5]'"
-        raise InputError(f"demonstrations: {name!r} {told}") from None
+        hint = "is no .npz file; if it is a Minari data set, install what reads it: pip install 'minari[hdf5]'"
+        raise InputError(f"demonstrations: {name!r} {hint}") from None
     try:
         episodes = list(minari.load_dataset(name, download=True).iterate_episodes())
-        seen = [contract.flatten(episode.observations) for episode in episodes]  # one more than there are actions
+        observations = [contract.flatten(episode.observations) for episode in episodes]  # one more than actions
         fields = ("actions", "rewards", "terminations", "truncations")
         arrays = {name: np.concatenate([getattr(episode, name) for episode in episodes]) for name in fields}
-        arrays["observations"] = np.concatenate([one[:-1] for one in seen])
-        arrays["next_observations"] = np.concatenate([one[1:] for one in seen])
+        arrays["observations"] = np.concatenate([one[:-1] for one in observations])
+        arrays["next_observations"] = np.concatenate([one[1:] for one in observations])
     except Exception as error:
         raise InputError(f"demonstrations: Minari cannot give {name!r}: {message(error)}") from None
     return arrays
@@ -151,9 +151,9 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
         return flat.reshape(number, size)
 
     actions = (field("actions", spec.action_size) - bounds.centre) / np.where(bounds.half > 0, bounds.half, 1.0)
-    if (beyond := float(np.abs(actions).max())) > 1 + OUTSIDE:
-        told = f"at {beyond:.3g} times the task's bounds: give them on its own scale, clipped to its bounds"
-        raise InputError(f"demonstrations: actions are {told}")
+    if (beyond := float(np.abs(actions).max())) > 1 + BOUNDS_TOLERANCE:
+        problem = f"at {beyond:.3g} times the task's bounds: give them on its own scale, clipped to its bounds"
+        raise InputError(f"demonstrations: actions are {problem}")
     arrays = {"truncations": np.zeros(number), **arrays}
     ends = [field(name, 1)[:, 0] for name in ("terminations", "truncations")]
     if not np.isin(ends, (0.0, 1.0)).all():

@@ -52,11 +52,11 @@ def choose_device(device: str) -> None:
     try:
         chosen = jax.default_backend()
     except Exception as error:  # its type depends on what is missing, and on JAX's version
-        _forget(*before)
+        _restore_settings(*before)
         hint = "pip install '.[cuda]' in a clone of csac, or choose the cpu"
         raise InputError(f"no GPU that JAX can use: {hint}") from error
     if chosen != device:
-        _forget(*before)
+        _restore_settings(*before)
         raise InputError(f"this process computes on the {chosen} already: train on the {device} in a new one")
     os.environ["JAX_PLATFORMS"] = PLATFORMS[device]  # for the workers
     if device == "gpu":
@@ -105,7 +105,7 @@ def _has_looked_for_devices() -> bool:
     return xla_bridge.backends_are_initialized()
 
 
-def _forget(platforms: str | None, variables: Mapping[str, str | None]) -> None:
+def _restore_settings(platforms: str | None, variables: Mapping[str, str | None]) -> None:
     jax.config.update("jax_platforms", platforms)
     for name, value in variables.items():
         os.environ.pop(name, None)

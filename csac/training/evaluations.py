@@ -34,7 +34,7 @@ SECONDS_TO_FINISH = 10.0  # that an evaluation may still take after a stop is re
 class Evaluations:
     """Evaluates the policies of runs that train together, one evaluation at a time, and records each.
 
-    The notifier may end training; the exit stack `opened` closes the evaluators.
+    The notifier may end training; `stack` closes the evaluators.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Evaluations:
         environments: SeedEnvironments,
         watcher: Watcher,
         notifier: Notifier,
-        opened: ExitStack,
+        stack: ExitStack,
     ) -> None:
         self.runs, self.recorders, self.environments = runs, recorders, environments
         self.watcher, self._notifier = watcher, notifier
@@ -56,10 +56,10 @@ class Evaluations:
             environments=config.evaluation_environments or 1,
             lent=None if config.evaluation_environments else environments.environments[0],
         )
-        opened.callback(self._evaluator.close)
+        stack.callback(self._evaluator.close)
         if program.evaluation_processes and config.evaluation_environments:
             self.evaluator = pool = EvaluationPool(self._evaluator, program.evaluation_processes)
-            opened.callback(pool.close)
+            stack.callback(pool.close)
             pool.start()
         self._algorithm = config.algorithm
         self._perturbations = perturbations_of(config.perturbations)
@@ -68,7 +68,7 @@ class Evaluations:
         self.wants_stop = False  # whether a callback ends the runs, or an evaluation was broken off
         self.broken_off: int | None = None  # the step of the evaluation that was broken off
         self.should_stop: Callable[[], bool] = lambda: False
-        self._stop_at = 0.0  # the deadline, once a stop was requested
+        self._deadline = 0.0  # of the evaluation in progress, once a stop was requested
         self._missing_events = [] if len(runs[0].evaluations) else sorted(config.events)
 
     @property
@@ -102,7 +102,7 @@ class Evaluations:
             return
         (step, indices, policies, pending), self._pending = self._pending, None
         try:
-            answers = pending.results(self._is_late)
+            answers = pending.results(self._should_break_off)
         except EvaluationStopped:
             self.broken_off, self.wants_stop = step, True
             self.watcher.note_of(
@@ -125,12 +125,12 @@ class Evaluations:
             self.watcher.evaluated(step, means)
         self.wants_stop = self._notifier.evaluated(step, results) or self.wants_stop
 
-    def _is_late(self) -> bool:
+    def _should_break_off(self) -> bool:
         """Return whether a stop was requested so long ago that the evaluation in progress should be broken off."""
         if not self.should_stop():
             return False
-        self._stop_at = self._stop_at or time.monotonic() + SECONDS_TO_FINISH
-        return time.monotonic() >= self._stop_at
+        self._deadline = self._deadline or time.monotonic() + SECONDS_TO_FINISH
+        return time.monotonic() >= self._deadline
 
     def _record(self, index: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> None:
         """Record a run's evaluation and its policy, also as the best one if it is the best so far."""

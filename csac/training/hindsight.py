@@ -38,7 +38,7 @@ class Hindsight:
         """Store one transition of each environment, up to `step` in all, before the learner does."""
         ends = outcome.terminated, outcome.truncated
         rows = pack(Transition(observations, actions, outcome.reward, outcome.next_observation, *ends))
-        given: dict[int, list[np.ndarray]] = {}
+        copies_by_seed: dict[int, list[np.ndarray]] = {}
         for place in np.ndindex(rows.shape[:-1]):
             if not self._environments.alive[place[0]]:
                 continue
@@ -46,23 +46,23 @@ class Hindsight:
             if ends[0][place] or ends[1][place]:
                 generator = np.random.default_rng([self._environments.seeds[place[0]], *place[1:], step])
                 episode, relabel = np.stack(self._episodes.pop(place)), partial(self._environments.relabel, place)
-                own = relabelled(episode, self._goals, self._environments.spec, self._copies, generator, relabel)
-                given.setdefault(place[0], []).append(own)
-        if given:
-            none = rows.reshape(-1, rows.shape[-1])[:0]
-            several = [np.concatenate([none, *given.get(index, [])]) for index in range(len(rows))]
-            self._learner.extend(several, step - self._environments.spec.environments)
+                copies = relabelled(episode, self._goals, self._environments.spec, self._copies, generator, relabel)
+                copies_by_seed.setdefault(place[0], []).append(copies)
+        if copies_by_seed:
+            no_rows = rows.reshape(-1, rows.shape[-1])[:0]
+            rows_by_seed = [np.concatenate([no_rows, *copies_by_seed.get(index, [])]) for index in range(len(rows))]
+            self._learner.extend(rows_by_seed, step - self._environments.spec.environments)
 
     def save(self, index: int) -> Snapshot:
         """Return the episodes in progress of the seed at this index."""
-        own = {place: rows for place, rows in self._episodes.items() if place[0] == index and rows}
-        return Snapshot({str(place[-1]): np.stack(rows) for place, rows in own.items()}, {})
+        episodes = {place: rows for place, rows in self._episodes.items() if place[0] == index and rows}
+        return Snapshot({str(place[-1]): np.stack(rows) for place, rows in episodes.items()}, {})
 
     def restore(self, index: int, saved: Snapshot) -> None:
         """Restore the episodes that `save` returned; not for a seed whose episode restarts."""
         for name, rows in saved.arrays.items():
-            own = (int(name),) if self._environments.spec.environments > 1 else ()
-            self._episodes[(index, *own)] = [*rows]
+            environment = (int(name),) if self._environments.spec.environments > 1 else ()
+            self._episodes[(index, *environment)] = [*rows]
 
 
 def relabelled(
@@ -83,9 +83,9 @@ def relabelled(
     achieved = slice(achieved.start + following, achieved.stop + following)
     steps = len(episode)
     later = generator.integers(np.arange(steps)[:, None], steps, (steps, copies)).ravel()
-    rows, wanted = np.repeat(episode, copies, axis=0), episode[later, achieved]
-    rows[:, desired] = rows[:, desired.start + following : desired.stop + following] = wanted
-    computed = relabel(rows[:, achieved], wanted)
+    rows, new_goals = np.repeat(episode, copies, axis=0), episode[later, achieved]
+    rows[:, desired] = rows[:, desired.start + following : desired.stop + following] = new_goals
+    computed = relabel(rows[:, achieved], new_goals)
     if computed is None:
         return rows[:0]
     rows[:, reward] = computed[0]
@@ -100,8 +100,8 @@ def places_of(parts: Parts) -> tuple[slice, slice]:
     places = {name: slice(*ends[i : i + 2]) for i, (name, _) in enumerate(parts)}
     shapes = dict(parts)
     if ACHIEVED not in places or DESIRED not in places or shapes[ACHIEVED] != shapes[DESIRED]:
-        told = ", ".join(f"{name} {shape}" for name, shape in parts if name) or "one Box"
-        raise InputError(f"hindsight needs {ACHIEVED} and {DESIRED} of one shape in a Dict observation, not {told}")
+        found = ", ".join(f"{name} {shape}" for name, shape in parts if name) or "one Box"
+        raise InputError(f"hindsight needs {ACHIEVED} and {DESIRED} of one shape in a Dict observation, not {found}")
     return places[ACHIEVED], places[DESIRED]
 
 
@@ -123,5 +123,5 @@ def check_goals(algorithm: Algorithm, environment: Environment) -> None:
     except EnvironmentFailure as error:
         raise InputError(f"hindsight does not work with {environment.task_name}: {error}") from None
     if not np.isclose(computed, reward, rtol=1e-3, atol=1e-4):
-        told = f"{environment.task_name} gave {reward:g} and its compute_reward {computed:g}"
-        raise InputError(f"hindsight needs rewards that compute_reward can tell: {told}")
+        rewards = f"{environment.task_name} gave {reward:g} and its compute_reward {computed:g}"
+        raise InputError(f"hindsight needs rewards that compute_reward can tell: {rewards}")

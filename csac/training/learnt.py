@@ -26,7 +26,7 @@ from csac.training.one_seed import KEY_DATA
 from csac.training.packing import by_name
 from csac.types import InputError, Transition
 
-PAIRS_OF_A_BATCH = 4_096  # newest transitions that give batch-normalised critics their statistics
+STATISTICS_TRANSITIONS = 4_096  # newest transitions that give batch-normalised critics their statistics
 
 
 class Learnt:
@@ -102,7 +102,7 @@ class Learnt:
 
     def _folded(self, critics: list[Any], statistics: Any) -> list[Any]:
         """Return batch-normalised critics as plain ones, with the statistics of the newest transitions."""
-        newest = jax.tree.map(lambda array: array[-PAIRS_OF_A_BATCH:], self._transitions())
+        newest = jax.tree.map(lambda array: array[-STATISTICS_TRANSITIONS:], self._transitions())
 
         def of_one(critic: Any, one: Transition) -> Any:
             next_action = self.algorithm.act(self.state, one.next_observation, jax.random.key(0), explore=False)

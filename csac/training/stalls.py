@@ -29,15 +29,15 @@ def stalls_noted(progress: Callable[[], int], note: Callable[[str], None], who: 
     is_over, thread = threading.Event(), threading.get_ident()
 
     def watch() -> None:
-        before, is_told = progress(), False
+        last_step, is_noted = progress(), False
         while not is_over.wait(SECONDS):
-            now = progress()
-            is_told = is_told and now == before
-            place = _place_in_environment(sys._current_frames().get(thread)) if now == before else None
-            if place is not None and not is_told:  # of an environment in another process it is ""
-                note(f"{who}: at step {now:,} for {SECONDS / 60:.0f} minutes, inside the environment{place}")
-                is_told = True
-            before = now
+            step = progress()
+            is_noted = is_noted and step == last_step
+            place = _place_in_environment(sys._current_frames().get(thread)) if step == last_step else None
+            if place is not None and not is_noted:  # of an environment in another process it is ""
+                note(f"{who}: at step {step:,} for {SECONDS / 60:.0f} minutes, inside the environment{place}")
+                is_noted = True
+            last_step = step
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()

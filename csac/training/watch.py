@@ -87,7 +87,7 @@ class Watch(Watcher):
         """Return whether a run needs no more training: all its steps are made, or a callback would still end it."""
         manifest = run.manifest
         if manifest.state not in ("finished", "failed") or manifest.steps_done < run.config.steps:
-            return self.callbacks.still_stop(run)
+            return self.callbacks.would_stop_again(run)
         return manifest.state == "finished"
 
 
