@@ -55,7 +55,7 @@ class Hindsight:
 
     def save(self, index: int) -> Snapshot:
         """Return the episodes in progress of the seed at this index."""
-        episodes = {place: rows for place, rows in self._episodes.items() if place[0] == index and rows}
+        episodes = {place: rows for place, rows in self._episodes.items() if place[0] == index}
         return Snapshot({str(place[-1]): np.stack(rows) for place, rows in episodes.items()}, {})
 
     def restore(self, index: int, saved: Snapshot) -> None:
