@@ -60,7 +60,7 @@ class Moment:
             InputError: the name is not a plain word, or is already a column.
         """
         if not is_column(name) or name in self.metrics:
-            raise InputError(f"{name!r} cannot name a scalar: it is no plain word, or a column that there is anyway")
+            raise InputError(f"{name!r} cannot name a scalar: it is not a plain word, or is already a column")
         self.scalars[name] = float(value)
 
 

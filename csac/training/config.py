@@ -180,7 +180,7 @@ def check_algorithm(algorithm: Any) -> None:
         raise InputError(f"{text:.60} is no algorithm with hyperparameters: give {names.get(text.lower(), 'CSAC')}()")
     kind: Any = type(algorithm)
     if not kind.__dataclass_params__.frozen:
-        raise InputError(f"{kind.__name__} is to be a frozen dataclass: write @dataclass(frozen=True)")
+        raise InputError(f"{kind.__name__} must be a frozen dataclass: write @dataclass(frozen=True)")
     if missing := [name for name in PROTOCOL if not hasattr(algorithm, name)]:
         raise InputError(
             f"{kind.__name__} has no {' or '.join(missing)}, which an algorithm needs (csac.types.Algorithm)"

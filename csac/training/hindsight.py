@@ -124,4 +124,4 @@ def check_goals(algorithm: Algorithm, environment: Environment) -> None:
         raise InputError(f"hindsight does not work with {environment.task_name}: {error}") from None
     if not np.isclose(computed, reward, rtol=1e-3, atol=1e-4):
         rewards = f"{environment.task_name} gave {reward:g} and its compute_reward {computed:g}"
-        raise InputError(f"hindsight needs rewards that compute_reward can tell: {rewards}")
+        raise InputError(f"hindsight needs rewards that compute_reward reproduces: {rewards}")

@@ -47,7 +47,7 @@ class StopRequest:
             raise KeyboardInterrupt(number)
         self.received.append(number)
         if self._tell:
-            self._tell("stopping at the next step where all can be saved; once more to leave at once")
+            self._tell("stopping at the next step where all can be saved; signal again to leave at once")
 
     def is_set(self) -> bool:
         """Return whether a signal has come."""
