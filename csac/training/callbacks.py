@@ -1,7 +1,7 @@
-"""Callbacks: the caller's own code, told how training goes. It may log numbers and end training.
+"""Callbacks: the caller's own code, called on training events. It may log scalars and end training.
 
-They run in the process that called `train`, one at a time, also where seeds train in processes of their own: a callback
-may be a closure, keeps its state, and sees every seed. Training waits for it.
+They run in the process that called `train`, one at a time, even if seeds train in separate processes: a callback may be
+a closure, keeps its state, and sees every seed. Training waits for it.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 
 class CallbackFailure(Failure):
-    """A callback raised. The runs were saved as at a Ctrl-C; the message is one line, `__cause__` what it raised."""
+    """A callback raised. The runs were saved as on Ctrl-C. The message is one line; `__cause__` is the exception."""
 
 
 @dataclass
 class Moment:
-    """Where a run is when a callback is told."""
+    """The state of a run when a callback is called."""
 
     seed: int
     step: int
@@ -42,30 +42,30 @@ class Moment:
     directory: Path
     """The run's directory."""
     policy: Policy | None = None
-    """The policy of now, for a callback with `needs_policy`."""
+    """The current policy, if a callback has `needs_policy`."""
     scalars: dict[str, float] = field(default_factory=dict)
-    """What was logged so far."""
+    """The scalars logged so far."""
     metrics: tuple[str, ...] = ()
-    """The metrics of the algorithm, whose names are taken."""
+    """The algorithm's metrics, whose names cannot be logged."""
 
     @property
     def run(self) -> RunDirectory:
-        """The run: its tables as far as they are written; those of evaluations are whole."""
+        """The run. Its tables hold the rows written so far; its evaluations are complete."""
         return RunDirectory.open(self.directory)
 
     def log(self, name: str, value: float) -> None:
-        """Log a number: a column of metrics.csv, a curve of TensorBoard and W&B, `train/NAME` or NAME with a slash.
+        """Log a scalar to a column of metrics.csv, and to TensorBoard and W&B as `train/NAME` (NAME if it has a slash).
 
         Raises:
-            InputError: the name is no plain word, or taken.
+            InputError: the name is not a plain word, or is already a column.
         """
         if not is_column(name) or name in self.metrics:
-            raise InputError(f"{name!r} cannot name a scalar: it is no plain word, or a column that there is anyway")
+            raise InputError(f"{name!r} cannot name a scalar: it is not a plain word, or is already a column")
         self.scalars[name] = float(value)
 
 
 class Callback:
-    """What is told of training. Override the methods that you want; one that returns False ends the run, as finished.
+    """Base class of callbacks. Override the methods you need; one that returns False ends the run, as finished.
 
     Seeds that share a program (`seeds_per_process`) end together.
     """
@@ -73,16 +73,16 @@ class Callback:
     interval: int = 1_000
     """Environment steps of a seed between two calls of `on_step`."""
     needs_policy: bool = False
-    """Whether moments hold the policy, which takes a copy of it each time."""
+    """Whether moments hold the policy, which is copied for each one."""
 
     def on_step(self, moment: Moment) -> bool | None:
-        """Hear that `interval` further steps are made, and learnt from."""
+        """Handle `interval` further steps, after their updates."""
 
     def on_episode(self, moment: Moment, episode: FinishedEpisode) -> bool | None:
-        """Hear of a training episode that ended: `episode_return`, `length`, `events`."""
+        """Handle a finished training episode: its `episode_return`, `length` and `events`."""
 
     def on_evaluation(self, moment: Moment, episodes: Sequence[EvaluationEpisode]) -> bool | None:
-        """Hear of an evaluation; `moment.step` is when the policy was as evaluated."""
+        """Handle an evaluation of the policy of step `moment.step`."""
 
 
 class StopOnReturn(Callback):
@@ -97,11 +97,11 @@ class StopOnReturn(Callback):
 
 
 class StopAfterNoImprovement(Callback):
-    """Ends a run after so many evaluations in a row without a new best mean return; a resume counts on.
+    """Ends a run after a number of evaluations in a row without a new best mean return, counted across resumes.
 
     Args:
-        evaluations: how many.
-        after: steps before which no run ends.
+        evaluations: the number of evaluations.
+        after: the step before which no run ends.
     """
 
     def __init__(self, evaluations: int, after: int = 0) -> None:
@@ -125,7 +125,7 @@ class SaveEvery(Callback):
         self.interval = steps
 
     def on_step(self, moment: Moment) -> None:
-        """Save it."""
+        """Save the policy."""
         assert moment.policy
         moment.policy.save(moment.directory / "policies" / f"step_{moment.step}")
 
@@ -136,7 +136,7 @@ def mean_return(episodes: Iterable[EvaluationEpisode]) -> float:
 
 
 class Hears(NamedTuple):
-    """What callbacks want to be told of."""
+    """The events that callbacks handle."""
 
     intervals: tuple[int, ...] = ()
     episodes: bool = False
@@ -145,34 +145,34 @@ class Hears(NamedTuple):
 
 
 class Event(NamedTuple):
-    """What callbacks are told of at once: a moment of each seed of a program that it concerns."""
+    """A training event to pass to callbacks, with one moment for each seed of a program that it concerns."""
 
     method: str
-    """Of `Callback`."""
+    """The method of `Callback` to call."""
     moments: list[Moment]
     arguments: list[tuple[Any, ...]]
-    """What the method is given beside the moment, for each."""
+    """The method's further arguments, for each moment."""
     intervals: tuple[int, ...] = ()
-    """Those that are over, of `on_step`."""
+    """The intervals of `on_step` that have passed."""
 
 
 class Answer(NamedTuple):
-    """What callbacks have to say: who ends the runs, or nothing, and the scalars of each moment."""
+    """The callbacks' answer to an event: what ends the runs, or an empty string, and the scalars of each moment."""
 
     stopped_by: str = ""
     scalars: tuple[dict[str, float], ...] = ()
     failed: bool = False
-    """Whether one of them raised, now or before."""
+    """Whether a callback has raised, in this event or before."""
 
 
 STOPPED = Answer("a stop of all runs")
 
 
 class Callbacks:
-    """A caller's callbacks, and its functions `on_evaluation` and `stop_when`. The first that raises is the last told.
+    """A caller's callbacks, and its functions `on_evaluation` and `stop_when`. After one raises, none is called.
 
     Raises:
-        InputError: something that is no callback.
+        InputError: an argument is not a callback.
     """
 
     def __init__(
@@ -195,56 +195,56 @@ class Callbacks:
 
     @property
     def hears(self) -> Hears:
-        """What they want to be told of."""
+        """The events that they handle."""
 
-        def hearing(method: str) -> list[Callback]:
+        def overriding(method: str) -> list[Callback]:
             return [one for one in self.callbacks if getattr(type(one), method) is not getattr(Callback, method)]
 
         has_function = self.on_evaluation is not None or self.stop_when is not None
         return Hears(
-            tuple(sorted({callback.interval for callback in hearing("on_step")})),
-            bool(hearing("on_episode")),
-            bool(hearing("on_evaluation")) or has_function,
+            tuple(sorted({callback.interval for callback in overriding("on_step")})),
+            bool(overriding("on_episode")),
+            bool(overriding("on_evaluation")) or has_function,
             any(callback.needs_policy for callback in self.callbacks),
         )
 
     def call(self, event: Event) -> Answer:
-        """Tell all of them, and return what they have to say."""
+        """Pass an event to all of them, and return their answer."""
         due = [one for one in self.callbacks if event.method != "on_step" or one.interval in event.intervals]
-        stopped_by = [self._tell(callback, event) for callback in due]
+        stoppers = [self._call_one(callback, event) for callback in due]
         if event.method == "on_evaluation":
             moments = zip(event.moments, event.arguments, strict=True)
             returns = {moment.seed: mean_return(episodes) for moment, (episodes,) in moments}
             step = event.moments[0].step
             self._guarded("on_evaluation", self.on_evaluation, step, dict(returns))
             if self._guarded("stop_when", self.stop_when, step, dict(returns)):
-                stopped_by.append("stop_when")
-        stopper = str(self.failure) if self.failure else next(filter(None, stopped_by), "")
+                stoppers.append("stop_when")
+        stopper = str(self.failure) if self.failure else next(filter(None, stoppers), "")
         return Answer(stopper, tuple(moment.scalars for moment in event.moments), self.failure is not None)
 
-    def still_stop(self, run: RunDirectory) -> bool:
-        """Return whether a run that ended early would end again at its last evaluation."""
+    def would_stop_again(self, run: RunDirectory) -> bool:
+        """Return whether the callbacks would end a run at its last evaluation, as they did before."""
         if run.manifest.state != "finished" or not self.hears.evaluations or not len(run.evaluations):
             return False
         rows, names = run.evaluations, run.evaluations.dtype.names or ()
         episodes = [
-            EvaluationEpisode(*row[2:6], events=dict(zip(names[6:], row[6:], strict=True)))  # as `row` gives them
+            EvaluationEpisode(*row[2:6], events=dict(zip(names[6:], row[6:], strict=True)))  # in `row`'s order
             for row in rows[rows["step"] == rows["step"][-1]].tolist()
         ]
         callbacks = Callbacks([c for c in self.callbacks if not c.needs_policy], None, self.stop_when)
         moment = Moment(run.seed, int(rows["step"][-1]), run.path)
         return bool(callbacks.call(Event("on_evaluation", [moment], [(episodes,)])).stopped_by)
 
-    def _tell(self, callback: Callback, event: Event) -> str:
-        """Return what ends the runs: the callback's name, or nothing."""
+    def _call_one(self, callback: Callback, event: Event) -> str:
+        """Return the callback's name if it ends the runs, else an empty string."""
         name, goes_on = type(callback).__name__, True
         for moment, arguments in zip(event.moments, event.arguments, strict=True):
-            told = self._guarded(f"{name}.{event.method}", getattr(callback, event.method), moment, *arguments)
-            goes_on = goes_on and (told is None or bool(told))
+            returned = self._guarded(f"{name}.{event.method}", getattr(callback, event.method), moment, *arguments)
+            goes_on = goes_on and (returned is None or bool(returned))
         return "" if goes_on else name
 
     def _guarded(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
-        """Return what a caller's function returns, None where it raises or something has raised before."""
+        """Return what a caller's function returns, or None if it raises or another has raised before."""
         if function is None or self.failure:
             return None
         try:
@@ -256,9 +256,9 @@ class Callbacks:
 
 
 class Notifier:
-    """Tells the callbacks what happens to the runs of a loop, and records the scalars that they answer with.
+    """Passes a loop's events to the callbacks, and records the scalars that they log.
 
-    `call` tells them and returns their answer; `policy` returns the policy of a seed as it is now.
+    `call` passes an event and returns their answer; `policy` returns the current policy of a seed.
     """
 
     def __init__(
@@ -275,24 +275,24 @@ class Notifier:
         self.stopped_by = ""  # what ended the runs
 
     def after_step(self, step: int, stride: int, alive: np.ndarray, episodes: Sequence[FinishedEpisode]) -> bool:
-        """Tell of the last `stride` steps and of the episodes that ended; return whether to stop."""
+        """Report the last `stride` steps and the episodes that ended; return whether to stop."""
         if episodes and self._hears.episodes:
-            told = [episode.seed_index for episode in episodes]
-            self._tell("on_episode", step, told, [(episode,) for episode in episodes])
+            indices = [episode.seed_index for episode in episodes]
+            self._notify("on_episode", step, indices, [(episode,) for episode in episodes])
         due = tuple(interval for interval in self._hears.intervals if step % interval < stride)
         if due:
             indices = np.flatnonzero(alive).tolist()
-            self._tell("on_step", step, indices, [()] * len(indices), due)
+            self._notify("on_step", step, indices, [()] * len(indices), due)
         return bool(self.stopped_by)
 
     def evaluated(self, step: int, results: Mapping[int, tuple[Policy, Any]]) -> bool:
-        """Tell of an evaluation, by seed index the policy and its episodes; return whether to stop."""
+        """Report an evaluation: each seed's policy and episodes, by seed index; return whether to stop."""
         if results and self._hears.evaluations:
             policies = {index: policy for index, (policy, _) in results.items()}
-            self._tell("on_evaluation", step, [*results], [(e,) for _, e in results.values()], policies=policies)
+            self._notify("on_evaluation", step, [*results], [(e,) for _, e in results.values()], policies=policies)
         return bool(self.stopped_by)
 
-    def _tell(
+    def _notify(
         self,
         method: str,
         step: int,

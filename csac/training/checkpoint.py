@@ -1,12 +1,12 @@
-"""Checkpoints of one run: all that it needs to go on exactly, in safetensors and JSON, whole or not there.
+"""Checkpoints of one run: all that it needs to resume exactly, in safetensors and JSON, complete or absent.
 
-    checkpoint/step_<n>/checkpoint.json     which files it is made of, with their checksums, and a few values
-    checkpoint/step_<n>/state.safetensors   what has been learnt, the environment's state and the run's counters
-    checkpoint/step_<n>/<table>.csv         the tables by then; best.safetensors, the best policy; manifest.json
+    checkpoint/step_<n>/checkpoint.json     the list of its files, with their checksums, and a few values
+    checkpoint/step_<n>/state.safetensors   the learner's state, the environment's state and the run's counters
+    checkpoint/step_<n>/<table>.csv         the tables so far; best.safetensors, the best policy; manifest.json
     checkpoint/replay/<a>-<b>.safetensors   the transitions a to b - 1
 
-Transitions never change, so each checkpoint only adds the new ones: its cost does not grow with the replay. The folder
-gets its name once it is whole, so a checkpoint that was cut off does not exist.
+Transitions never change, so each checkpoint only adds the new ones: its cost does not grow with the replay buffer. The
+folder gets its name once it is complete, so an interrupted write leaves no checkpoint.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ LIST, STATE, REPLAY = "checkpoint.json", "state.safetensors", "replay"
 
 Facts = dict[str, Any]  # of a file: {"bytes": size, "sha256": checksum}
 
-_LOST = (errno.ENOENT, errno.EIO, errno.ENOTDIR, errno.EISDIR)
+_LOST_FILE_ERRORS = (errno.ENOENT, errno.EIO, errno.ENOTDIR, errno.EISDIR)
 
 
 class Damaged(InputError):
-    """A checkpoint's file is missing, cut off or changed. The message names it."""
+    """A file of a checkpoint is missing, truncated or changed. The message names it."""
 
 
 class Checkpoint(NamedTuple):
@@ -50,9 +50,9 @@ class Checkpoint(NamedTuple):
     """The run's `checkpoint/`."""
     step: int
     files: dict[str, Facts]
-    """Its own files, by name, and those of its transitions, as `replay/<a>-<b>.safetensors`."""
+    """The checkpoint's own files, by name, and its replay files, as `replay/<a>-<b>.safetensors`."""
     transitions: tuple[int, int]
-    """The first transition that the memory held, and the one after the last."""
+    """The first transition in the replay buffer, and one past the last."""
     values: dict[str, Any]
 
     @classmethod
@@ -76,7 +76,7 @@ class Checkpoint(NamedTuple):
             raise Damaged(f"{path} is not a checkpoint ({type(error).__name__}: {error})") from error
 
     def read(self, name: str) -> bytes:
-        """Return one of the files' content; a table's or best policy's from the run if it has it. Raises Damaged."""
+        """Return a file's content; a damaged table or best policy comes from the run if it matches. Raises Damaged."""
         path, facts = self._path(name), self.files[name]
         try:
             content = _read(path)
@@ -84,23 +84,23 @@ class Checkpoint(NamedTuple):
                 raise Damaged(f"{path} has changed since it was written")
             return content
         except Damaged:
-            own = self.folder.parent / ("policy" if name.endswith(".safetensors") else "") / name
-            if own.is_file() and facts_of(content := own.read_bytes()[: facts["bytes"]]) == facts:
+            run_file = self.folder.parent / ("policy" if name.endswith(".safetensors") else "") / name
+            if run_file.is_file() and facts_of(content := run_file.read_bytes()[: facts["bytes"]]) == facts:
                 return content
             raise
 
     def state(self) -> Snapshot:
-        """Return what was saved but for the transitions. Raises Damaged."""
+        """Return everything that was saved except the transitions. Raises Damaged."""
         try:
             return Snapshot(safetensors.numpy.load(self.read(STATE)), self.values)
         except (safetensors.SafetensorError, ValueError) as error:
             raise Damaged(f"{self._path(STATE)} is not what csac writes ({error})") from error
 
     def fill(self, rows: np.ndarray) -> list[str]:
-        """Put the transitions into a ring [capacity, width]; return a line for each file of them that is lost.
+        """Put the transitions into a ring [capacity, width]; return a message for each replay file that is lost.
 
-        In the place of lost transitions there are copies of others, so that none is drawn that was never made. Raises
-        Damaged where none is left.
+        Copies of other transitions replace lost ones, so that only real transitions are sampled. Raises Damaged if none
+        is left.
         """
         first, last = self.transitions
         known, lost = np.zeros(last - first, bool), []
@@ -115,11 +115,11 @@ class Checkpoint(NamedTuple):
             numbers = np.arange(max(begin, first), min(end, last))
             rows[numbers % len(rows)] = shard[numbers - begin]
             known[numbers - first] = True
-        missing, there = first + np.flatnonzero(~known), first + np.flatnonzero(known)
-        if len(missing) and not len(there):
+        missing, present = first + np.flatnonzero(~known), first + np.flatnonzero(known)
+        if len(missing) and not len(present):
             raise Damaged(f"{self.folder / REPLAY} has none of the transitions of step {self.step}")
         if len(missing):
-            rows[missing % len(rows)] = rows[there[np.arange(len(missing)) % len(there)] % len(rows)]
+            rows[missing % len(rows)] = rows[present[np.arange(len(missing)) % len(present)] % len(rows)]
             lost = lost or [f"{self.folder / REPLAY} lacks {len(missing):,} transitions: others stand in for them"]
         return lost
 
@@ -130,8 +130,8 @@ class Checkpoint(NamedTuple):
 class Writer:
     """Writes the checkpoints of one run, and remembers which transitions are on disk.
 
-    `keep` is how many checkpoints to keep, 0 for all; `known` are the files of the checkpoint that the run goes on
-    from, if their transitions are whole.
+    `keep` is how many checkpoints to keep, 0 for all; `known` are the files of the checkpoint that the run resumes
+    from, if its transitions are complete.
     """
 
     def __init__(self, folder: Path, keep: int, known: Mapping[str, Facts] | None = None) -> None:
@@ -139,7 +139,7 @@ class Writer:
         self._shards = {name: facts for name, facts in (known or {}).items() if name.startswith(f"{REPLAY}/")}
 
     def write(self, step: int, saved: Snapshot, memory: Ring, others: Mapping[str, bytes]) -> None:
-        """Write a checkpoint, then remove what no kept one needs. Raises OSError."""
+        """Write a checkpoint, then remove the files that no kept one needs. Raises OSError."""
         (self.folder / REPLAY).mkdir(parents=True, exist_ok=True)
         oldest = max(memory.added - len(memory.rows), 0)
         self._write_new_rows(memory, oldest)
@@ -153,7 +153,7 @@ class Writer:
             "transitions": [oldest, memory.added],
             "values": saved.values,
         }
-        fields = json.loads(json.dumps(fields))  # as it will be read: the checksum is of that
+        fields = json.loads(json.dumps(fields))  # the checksum covers the fields as they will be read
         contents[LIST] = json.dumps({**fields, "sha256": _checksum(fields)}, indent=1).encode()
         write_folder(self.folder / f"step_{step}", contents)
         prune(self.folder, self.keep)
@@ -169,7 +169,7 @@ class Writer:
 
 
 def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:
-    """Write a folder of files beside `path`, sync and rename: it is whole or not there. Raises OSError."""
+    """Write a folder next to `path`, sync and rename it, so that it is complete or absent. Raises OSError."""
     aside = name_aside(path)
     shutil.rmtree(path, ignore_errors=True)
     aside.mkdir()
@@ -191,7 +191,7 @@ def prune(folder: Path, keep: int, newest: int | None = None) -> None:
     for step in kept:
         try:
             needed.update(Checkpoint.open(folder, step).files)
-        except InputError:  # or the disk failed only this time: all that it may need stays
+        except InputError:  # damaged, or a temporary disk failure: keep whatever it may need
             return
     for path in [*folder.glob("step_*"), *folder.glob(".step_*")]:
         if path.name not in {f"step_{step}" for step in kept}:
@@ -202,15 +202,15 @@ def prune(folder: Path, keep: int, newest: int | None = None) -> None:
 
 
 def steps_in(folder: Path) -> list[int]:
-    """Return the steps that a folder has checkpoints of, in order, sound or not."""
+    """Return the steps of a folder's checkpoints in order, including damaged ones."""
     names = (re.fullmatch(r"step_(\d{1,15})", path.name) for path in folder.glob("step_*"))
     return sorted(int(match[1]) for match in names if match)
 
 
 def newest_sound(folder: Path, until: int | None = None) -> tuple[Checkpoint | None, list[str]]:
-    """Return the newest checkpoint (of step `until` at most) that can be read, and what is wrong with those after it.
+    """Return the newest checkpoint (of step `until` at most) that can be read, and what is wrong with newer ones.
 
-    Raises InputError where one of those after it cannot be read now, and may be sound.
+    Raises InputError if a newer one cannot be read now but may be sound.
     """
     complaints = []
     for step in reversed(steps_in(folder)):
@@ -228,7 +228,7 @@ def newest_sound(folder: Path, until: int | None = None) -> tuple[Checkpoint | N
 
 
 def checkpoint_of(folder: Path, step: int | None) -> Checkpoint:
-    """Return the checkpoint of a step, by default the newest sound one. Raises InputError where there is none."""
+    """Return the checkpoint of a step, by default the newest sound one. Raises InputError if there is none."""
     checkpoint, complaints = newest_sound(folder, step)
     if checkpoint is None or step not in (None, checkpoint.step):
         known = ", ".join(map(str, steps_in(folder))) or "none"
@@ -238,7 +238,7 @@ def checkpoint_of(folder: Path, step: int | None) -> Checkpoint:
 
 
 def shards(files: Mapping[str, Any]) -> list[tuple[int, int, str]]:
-    """Return (first, last + 1, name) of each file of transitions, in order."""
+    """Return (first, last + 1, name) of each replay file, in order of transitions."""
     names = (re.fullmatch(rf"{REPLAY}/(\d+)-(\d+)\.safetensors", name) for name in files)
     return sorted((int(match[1]), int(match[2]), match[0]) for match in names if match)
 
@@ -249,11 +249,11 @@ def facts_of(content: bytes) -> Facts:
 
 
 def _read(path: Path) -> bytes:
-    """Return a file's bytes. Raises Damaged where it is lost, InputError where it may be sound and cannot be read."""
+    """Return a file's bytes. Raises Damaged if it is lost, InputError if it may be sound but cannot be read now."""
     try:
         return path.read_bytes()
     except OSError as error:
-        kind = Damaged if error.errno in _LOST else InputError
+        kind = Damaged if error.errno in _LOST_FILE_ERRORS else InputError
         raise kind(f"{path} cannot be read: {error.strerror}") from error
 
 

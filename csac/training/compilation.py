@@ -1,7 +1,7 @@
-"""Compiled programs, kept from one run to the next in JAX's own cache on disk.
+"""Keep compiled programs from one run to the next, in JAX's persistent compilation cache.
 
-JAX's key for a program says which processor features it may use, but not how many threads it was divided for, and a
-folder may be shared by machines: so each kind of processor and each number of cores has a folder of its own.
+JAX's cache key covers the processor features that a program may use, but not the number of threads it was divided for,
+and machines may share a folder: so each kind of processor and each number of cores has its own folder.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ import jax
 
 from csac.processes import usable_cores
 
-MOST_BYTES = 256 * 2**20  # of all programs together; those of one algorithm, task and preset take half a MiB
-SECONDS_WORTH_KEEPING = 0.1  # of compilation; loading takes a tenth of it or less
+MOST_BYTES = 256 * 2**20  # for all programs; those of one algorithm, task and preset take half a MiB
+SECONDS_WORTH_KEEPING = 0.1  # of compile time; loading takes a tenth of it or less
 
-_PROCESSOR = (  # the lines of /proc/cpuinfo that say for what XLA compiles
+_PROCESSOR = (  # the fields of /proc/cpuinfo that determine what XLA compiles for
     *("vendor_id", "cpu family", "model", "model name", "stepping", "flags"),
     *("CPU implementer", "CPU architecture", "CPU variant", "CPU part", "Features"),
 )
 
 
 def keep_programs() -> None:
-    """Have JAX load what this process compiles from now on, and keep what it has to compile.
+    """Have JAX load programs from the cache in this process from now on, and store those that it has to compile.
 
-    Does nothing where the user has chosen otherwise (`JAX_COMPILATION_CACHE_DIR`, `JAX_ENABLE_COMPILATION_CACHE=0`, or
-    the same in `jax.config`), or where the folder cannot be written.
+    Does nothing if the user has configured the cache (`JAX_COMPILATION_CACHE_DIR`, `JAX_ENABLE_COMPILATION_CACHE=0`, or
+    the same in `jax.config`), or if the folder cannot be written.
     """
     with suppress(OSError):
         if not _is_users_choice():
@@ -42,13 +42,13 @@ def keep_programs() -> None:
 
 
 def tidy_programs() -> str | None:
-    """Remove broken programs before a run, and all where they are too much; return a note where none can be kept."""
+    """Remove broken programs before a run, or all if they are too large; return a note if none can be kept."""
     if _is_users_choice():
         return None
     try:
         home = _make_home()
         programs = list(home.glob("*/*-cache"))
-        with suppress(FileNotFoundError):  # another process removes them too
+        with suppress(FileNotFoundError):  # another process may remove them too
             _remove_broken(home / "checked", programs)
             if sum(program.stat().st_size for program in programs) > MOST_BYTES:
                 for program in programs:
@@ -59,7 +59,7 @@ def tidy_programs() -> str | None:
 
 
 def _remove_broken(mark: Path, programs: list[Path]) -> None:
-    """Remove what a process that was killed has written in part, among what is new: JAX would never replace it."""
+    """Remove programs written since the last check that a killed process left incomplete: JAX never replaces them."""
     since = mark.stat().st_mtime if mark.exists() else 0.0
     mark.touch()
     for program in programs.copy():
@@ -69,7 +69,7 @@ def _remove_broken(mark: Path, programs: list[Path]) -> None:
 
 
 def _is_whole(program: bytes) -> bool:
-    """Whether a program can be unpacked, where JAX has packed it with zlib; with zstd, whether there is anything."""
+    """Return whether a program can be unpacked if JAX packed it with zlib; with zstd, whether it is not empty."""
     try:
         return bool(zlib.decompress(program) if program[:1] == b"\x78" else program)
     except zlib.error:
@@ -88,7 +88,7 @@ def _home() -> Path:
 
 
 def _make_home() -> Path:
-    """Return the folder of all programs. Raises OSError where nothing can be written there."""
+    """Return the folder of all programs. Raises OSError if it cannot be written."""
     home = _home()
     if not home.is_absolute():
         raise FileNotFoundError("there is no home directory")
@@ -98,7 +98,7 @@ def _make_home() -> Path:
 
 
 def _processor() -> str:
-    """Return a name for what XLA compiles for here; where the system does not tell, the machine's own."""
+    """Return an identifier of the processor that XLA compiles for; without /proc/cpuinfo, of this machine."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""From what a user gives to the configurations of runs: names resolved, values checked, the task tried once."""
+"""Build the configurations of runs from a user's options: resolve names, check values, try the task once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.preflight import limit_warning, seed_warning, try_task, wrapper_warnings
 from csac.tasks.registry import check_events, events_of, import_module_of
 from csac.tasks.trust import refuse_untrusted, remember
-from csac.training.demonstrations import Demonstrations, is_told
+from csac.training.demonstrations import Demonstrations, are_facts
 from csac.training.hindsight import check_goals
 from csac.types import InputError
 
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from csac.tasks.registry import Task
-    from csac.training.demonstrations import Given
+    from csac.training.demonstrations import DemonstrationData
     from csac.training.resume import Source
     from csac.types import Algorithm, Spec
 
 
 class TrainOptions(TypedDict, total=False):
-    """The keyword arguments of `train` that say what a run computes, as `RunConfig` explains them."""
+    """The keyword arguments of `train` that define what a run computes; `RunConfig` documents them."""
 
     steps: int
     environments: int
@@ -46,7 +46,7 @@ class TrainOptions(TypedDict, total=False):
     perturbations: str | Perturbation | Iterable[str | Perturbation] | None
     events: Sequence[str] | None
     hindsight: int
-    demonstrations: Given | None
+    demonstrations: DemonstrationData | None
 
 
 RUN_OPTIONS = tuple(TrainOptions.__annotations__)
@@ -57,39 +57,39 @@ PROTOCOL = ("cadence", "memory", "init", "act", "update", "policy")  # `csac.typ
 def make_configs(
     algorithm: Algorithm, task: Task, seeds: Sequence[int], given: TrainOptions, source: Source | None
 ) -> tuple[list[RunConfig], Demonstrations | None, Spec, list[str]]:
-    """Return each seed's configuration, what their replays begin with, the task's sizes, and notes for the user.
+    """Return each seed's configuration, the demonstrations, the task's sizes, and notes for the user.
 
-    The task is made, stepped and perturbed once. Raises InputError for a mistake in the options, or a task that csac
-    cannot learn.
+    The task is created, stepped and perturbed once. Raises InputError for invalid options, or a task that csac cannot
+    learn.
     """
     _refuse_unknown(given, algorithm)
     options: Any = dict(given)
     arguments = options.pop("environment_arguments", None)
     check_arguments("environment_arguments", arguments)
     arguments = as_json("environment_arguments", dict(arguments or {}))
-    asked, events = options.pop("perturbations", None), options.pop("events", None)
+    perturbations, events = options.pop("perturbations", None), options.pop("events", None)
     if events is not None:
         check_events(events)
     if source and events is None:
         events = next(iter(source.runs.values())).config.events
     else:
         events = events_of(task, events or ())
-    offered, read = options.pop("demonstrations", None), None
+    data, demonstrations = options.pop("demonstrations", None), None
     hyperparameters = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
     with closing(Environment(task, arguments)) as environment:
         spec, name = environment.spec, environment.task_name
         try_task(environment, arguments)
-        facts = offered if is_told(offered) else {}
-        if offered and not facts:
+        facts = data if are_facts(data) else {}
+        if data and not facts:
             if source:
                 raise InputError("demonstrations are for a new run: a fork has the replay that it begins with")
-            read = Demonstrations.read(offered, algorithm, environment.contract_parts)
-            facts = read.facts
-        told = seed_warning(environment), limit_warning(environment, task, LONGEST_EPISODE)
-        notes = [*wrapper_warnings(environment), *filter(None, told)]
+            demonstrations = Demonstrations.read(data, algorithm, environment.contract_parts)
+            facts = demonstrations.facts
+        task_warnings = seed_warning(environment), limit_warning(environment, task, LONGEST_EPISODE)
+        notes = [*wrapper_warnings(environment), *filter(None, task_warnings)]
         remember(task)
         remember(name_of(algorithm))
-        asked_for = tuple(map(str, perturbations_of(asked or ())))
+        perturbation_texts = tuple(map(str, perturbations_of(perturbations or ())))
         configs = [
             RunConfig(
                 task=name,
@@ -97,7 +97,7 @@ def make_configs(
                 hyperparameters=hyperparameters,
                 seed=seed,
                 environment_arguments=arguments,
-                perturbations=source.perturbations(seed, asked) if source else asked_for,
+                perturbations=source.perturbations(seed, perturbations) if source else perturbation_texts,
                 demonstrations=source.runs[seed].config.demonstrations if source else facts,
                 events=tuple(events),
                 task_is_callable=not isinstance(task, str),
@@ -108,30 +108,30 @@ def make_configs(
         if configs[0].hindsight:
             check_goals(algorithm, environment)
         changes = perturbations_of(configs[0].perturbations)
-        refuse_late(changes, configs[0].steps, planned=source is not None and asked is None)
+        refuse_late(changes, configs[0].steps, planned=source is not None and perturbations is None)
         for item in changes:
             environment.perturb({item.kind: item.value})
     spec = spec._replace(environments=configs[0].environments)
-    return configs, read, spec, [f"note: {line}" for line in notes]
+    return configs, demonstrations, spec, [f"note: {line}" for line in notes]
 
 
 def labels(seeds: int, first_seed: int) -> list[int]:
-    """Return the seeds from `first_seed` on. Raises InputError where there are none or too many."""
+    """Return the seeds from `first_seed` on. Raises InputError if there are none or too many."""
     check_whole("seeds", seeds, 1, MOST_SEEDS)
     check_whole("first_seed", first_seed, 0, SEED_LIMIT - seeds)
     return list(range(first_seed, first_seed + seeds))
 
 
 def name_of(algorithm: Algorithm) -> str:
-    """Return what the manifest calls an algorithm: a name of `ALGORITHMS`, or `module:Class` of one from elsewhere."""
+    """Return an algorithm's name in the manifest: a key of `ALGORITHMS`, or `module:Class` if it is user-defined."""
     kind = type(algorithm)
     return next((name for name, own in ALGORITHMS.items() if own is kind), f"{kind.__module__}:{kind.__qualname__}")
 
 
 def class_named(name: str) -> Any:
-    """Return the algorithm of this name, or the class `module:Class`, whose module it imports: ask `trust` first.
+    """Return the algorithm class of a name; imports the module of `module:Class`, so check that it is trusted first.
 
-    Raises InputError where there is none, or nothing can import it.
+    Raises InputError if there is no such class, or it cannot be imported.
     """
     if name in ALGORITHMS:
         return ALGORITHMS[name]
@@ -147,7 +147,7 @@ def class_named(name: str) -> Any:
 
 
 def class_typed(name: str) -> Any:
-    """Return the class `module:Class` that the user has typed. Raises InputError also where it has no defaults."""
+    """Return the class `module:Class` that the user typed. Raises InputError too if a field has no default."""
     kind = class_named(name)
     for item in dataclasses.fields(kind):
         if item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING:
@@ -157,10 +157,10 @@ def class_typed(name: str) -> Any:
 
 
 def algorithm_of(config: RunConfig, run: str | Path = "the run", trust_task: bool = False) -> Algorithm:
-    """Return the algorithm of a run with its hyperparameters; one from elsewhere if its module is trusted.
+    """Return the algorithm of a run with its hyperparameters; a user-defined one only if its module is trusted.
 
-    Raises InputError where this csac does not know them, or nobody here has named the module, which is not imported
-    then.
+    Raises InputError if this csac does not know them, or if nobody on this machine has named the module, which is then
+    not imported.
     """
     refuse_untrusted(config.algorithm if config.algorithm not in ALGORITHMS else "", run, trust_task)
     make = class_named(config.algorithm)
@@ -173,14 +173,14 @@ def algorithm_of(config: RunConfig, run: str | Path = "the run", trust_task: boo
 
 
 def check_algorithm(algorithm: Any) -> None:
-    """Raise InputError for what is no algorithm with its hyperparameters: a name, a class, something else."""
+    """Raise InputError unless this is an instance of a valid algorithm, rather than a name or a class."""
     if isinstance(algorithm, type) or not (dataclasses.is_dataclass(algorithm) and hasattr(algorithm, "update")):
-        given = algorithm.__name__ if isinstance(algorithm, type) else str(algorithm)
+        text = algorithm.__name__ if isinstance(algorithm, type) else str(algorithm)
         names = {name: kind.__name__ for name, kind in ALGORITHMS.items()}
-        raise InputError(f"{given:.60} is no algorithm with hyperparameters: give {names.get(given.lower(), 'CSAC')}()")
+        raise InputError(f"{text:.60} is no algorithm with hyperparameters: give {names.get(text.lower(), 'CSAC')}()")
     kind: Any = type(algorithm)
     if not kind.__dataclass_params__.frozen:
-        raise InputError(f"{kind.__name__} is to be a frozen dataclass: write @dataclass(frozen=True)")
+        raise InputError(f"{kind.__name__} must be a frozen dataclass: write @dataclass(frozen=True)")
     if missing := [name for name in PROTOCOL if not hasattr(algorithm, name)]:
         raise InputError(
             f"{kind.__name__} has no {' or '.join(missing)}, which an algorithm needs (csac.types.Algorithm)"

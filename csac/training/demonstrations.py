@@ -1,4 +1,4 @@
-"""Demonstrations: transitions of one's own, which a replay begins with, as the first file of its checkpoints."""
+"""Demonstrations: the user's own transitions, which a replay buffer starts with, kept as its first replay file."""
 
 from __future__ import annotations
 
@@ -25,53 +25,53 @@ if TYPE_CHECKING:
     from csac.tasks.spaces import ContractParts
     from csac.types import Algorithm
 
-Given = str | Path | Mapping[str, Any]  # a .npz file, a Minari data set's id, or arrays by name
+DemonstrationData = str | Path | Mapping[str, Any]  # a .npz file, the id of a Minari data set, or arrays by name
 
-OTHER_NAMES = {"terminations": "terminated", "truncations": "truncated"}  # in `load_checkpoint(run).replay()`
-OUTSIDE = 1e-3  # of half an action's range: more than rounding
+OTHER_NAMES = {"terminations": "terminated", "truncations": "truncated"}  # names in `load_checkpoint(run).replay()`
+BOUNDS_TOLERANCE = 1e-3  # as a fraction of half an action's range: more than rounding
 
 
 class Demonstrations(NamedTuple):
-    """The transitions as a run keeps them, and what its manifest tells of them."""
+    """The content of a run's replay file of transitions, and the facts about it in the configuration."""
 
     content: bytes
     facts: dict[str, Any]
 
     @classmethod
-    def read(cls, given: Given, algorithm: Algorithm, parts: ContractParts) -> Demonstrations:
-        """Read transitions for a task with these parts. Raises InputError for what is none of such a task's."""
-        if (most := getattr(algorithm, "replay_size", None)) is None:
+    def read(cls, data: DemonstrationData, algorithm: Algorithm, parts: ContractParts) -> Demonstrations:
+        """Read transitions for a task with these parts. Raises InputError if they do not fit the task."""
+        if (capacity := getattr(algorithm, "replay_size", None)) is None:
             raise InputError(
                 f"demonstrations are for algorithms with a replay, and {type(algorithm).__name__} has none"
             )
         contract = Contract(None, "", "relu", "tanh", *parts)
-        rows = _rows(*_arrays(given, contract), contract)
-        if len(rows) > most:
-            raise InputError(f"demonstrations has {len(rows):,} transitions and replay_size is {most:,}")
+        rows = _rows(*_arrays(data, contract), contract)
+        if len(rows) > capacity:
+            raise InputError(f"demonstrations has {len(rows):,} transitions and replay_size is {capacity:,}")
         content = safetensors.numpy.save({"rows": rows})
-        source = "arrays" if isinstance(given, Mapping) else Path(given).name if _is_file(given) else str(given)
+        source = "arrays" if isinstance(data, Mapping) else Path(data).name if _is_file(data) else str(data)
         return cls(content, {"source": source, "transitions": len(rows), **facts_of(content)})
 
     def write(self, run: RunDirectory) -> None:
-        """Give them to a new run. Raises OSError."""
+        """Write them into a new run. Raises OSError."""
         name = next(iter(files_of(self.facts)))
         (run.checkpoints / REPLAY).mkdir(parents=True, exist_ok=True)
         write_atomically(run.checkpoints / name, self.content)
 
 
-def is_told(given: object) -> bool:
-    """Return whether this is what a run's configuration tells of its demonstrations."""
-    return isinstance(given, dict) and "sha256" in given
+def are_facts(data: object) -> bool:
+    """Return whether these are the facts about demonstrations in a run's configuration."""
+    return isinstance(data, dict) and "sha256" in data
 
 
 def files_of(facts: dict[str, Any]) -> dict[str, Facts]:
-    """Return the file of demonstrations among those of a checkpoint; none where there are none."""
-    own = {name: facts[name] for name in ("bytes", "sha256") if facts}
-    return {f"{REPLAY}/0-{facts['transitions']}.safetensors": own} if facts else {}
+    """Return the replay file of the demonstrations, by name; empty if there are none."""
+    file_facts = {name: facts[name] for name in ("bytes", "sha256") if facts}
+    return {f"{REPLAY}/0-{facts['transitions']}.safetensors": file_facts} if facts else {}
 
 
 def rows_of(run: RunDirectory) -> np.ndarray:
-    """Return the packed transitions [n, width] that a run begins with. Raises InputError where they are lost."""
+    """Return the packed transitions [n, width] that a run starts with. Raises InputError if they are lost."""
     ((name, facts),) = files_of(run.config.demonstrations).items()
     path = run.checkpoints / name
     if not path.is_file() or facts_of(content := path.read_bytes()) != facts:
@@ -79,21 +79,21 @@ def rows_of(run: RunDirectory) -> np.ndarray:
     return safetensors.numpy.load(content)["rows"]
 
 
-def _arrays(given: Given, contract: Contract) -> tuple[dict[str, Any], list[str]]:
-    """Return what was given as arrays by our names, and the names that it has."""
-    if isinstance(given, Mapping):
-        arrays = dict(given)
-    elif _is_file(given):
-        arrays = _of_file(Path(given))
-    elif isinstance(given, str):
-        arrays = _of_minari(given, contract)
+def _arrays(data: DemonstrationData, contract: Contract) -> tuple[dict[str, Any], list[str]]:
+    """Return the given arrays under csac's names, and the names that they came with."""
+    if isinstance(data, Mapping):
+        arrays = dict(data)
+    elif _is_file(data):
+        arrays = _of_file(Path(data))
+    elif isinstance(data, str):
+        arrays = _of_minari(data, contract)
     else:
-        raise InputError(f"demonstrations is a .npz file, a dict of arrays or a Minari id, not {given!r:.40}")
+        raise InputError(f"demonstrations is a .npz file, a dict of arrays or a Minari id, not {data!r:.40}")
     return arrays | {name: arrays[other] for name, other in OTHER_NAMES.items() if other in arrays}, list(arrays)
 
 
-def _is_file(given: str | os.PathLike[str]) -> bool:
-    return isinstance(given, Path) or (isinstance(given, str) and given.endswith(".npz"))
+def _is_file(data: str | os.PathLike[str]) -> bool:
+    return isinstance(data, Path) or (isinstance(data, str) and data.endswith(".npz"))
 
 
 def _of_file(path: Path) -> dict[str, Any]:
@@ -110,15 +110,15 @@ def _of_minari(name: str, contract: Contract) -> dict[str, Any]:
     try:
         minari = importlib.import_module("minari")
     except ImportError:
-        told = "is no .npz file; if it is a Minari data set, install what reads it: pip install 'minari[hdf5]'"
-        raise InputError(f"demonstrations: {name!r} {told}") from None
+        hint = "is no .npz file; if it is a Minari data set, install what reads it: pip install 'minari[hdf5]'"
+        raise InputError(f"demonstrations: {name!r} {hint}") from None
     try:
         episodes = list(minari.load_dataset(name, download=True).iterate_episodes())
-        seen = [contract.flatten(episode.observations) for episode in episodes]  # one more than there are actions
+        observations = [contract.flatten(episode.observations) for episode in episodes]  # one more than actions
         fields = ("actions", "rewards", "terminations", "truncations")
         arrays = {name: np.concatenate([getattr(episode, name) for episode in episodes]) for name in fields}
-        arrays["observations"] = np.concatenate([one[:-1] for one in seen])
-        arrays["next_observations"] = np.concatenate([one[1:] for one in seen])
+        arrays["observations"] = np.concatenate([one[:-1] for one in observations])
+        arrays["next_observations"] = np.concatenate([one[1:] for one in observations])
     except Exception as error:
         raise InputError(f"demonstrations: Minari cannot give {name!r}: {message(error)}") from None
     return arrays
@@ -136,7 +136,7 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
 
     def field(name: str, size: int) -> np.ndarray:
         try:
-            with np.errstate(over="ignore"):  # becomes infinite, which is refused
+            with np.errstate(over="ignore"):  # an overflow becomes infinite, which is refused
                 value = contract.flatten(arrays[name]) if "observations" in name else np.asarray(arrays[name])
                 if value.dtype.kind not in "biuf":
                     raise TypeError(f"{value.dtype} is no type of numbers")
@@ -151,9 +151,9 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
         return flat.reshape(number, size)
 
     actions = (field("actions", spec.action_size) - bounds.centre) / np.where(bounds.half > 0, bounds.half, 1.0)
-    if (beyond := float(np.abs(actions).max())) > 1 + OUTSIDE:
-        told = f"at {beyond:.3g} times the task's bounds: give them on its own scale, clipped to its bounds"
-        raise InputError(f"demonstrations: actions are {told}")
+    if (beyond := float(np.abs(actions).max())) > 1 + BOUNDS_TOLERANCE:
+        problem = f"at {beyond:.3g} times the task's bounds: give them on its own scale, clipped to its bounds"
+        raise InputError(f"demonstrations: actions are {problem}")
     arrays = {"truncations": np.zeros(number), **arrays}
     ends = [field(name, 1)[:, 0] for name in ("terminations", "truncations")]
     if not np.isin(ends, (0.0, 1.0)).all():

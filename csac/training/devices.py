@@ -1,4 +1,4 @@
-"""Where a process computes: JAX decides it once, at its first computation."""
+"""Choose the device that a process computes on. JAX fixes it at its first computation."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-PRNG = "threefry2x32"  # runs are the same on every machine with the same keys
-PLATFORMS = {"cpu": "cpu", "gpu": "cuda"}  # as JAX calls them
+PRNG = "threefry2x32"  # with the same keys, runs are the same on every machine
+PLATFORMS = {"cpu": "cpu", "gpu": "cuda"}  # by JAX's names
 FLAGS = "XLA_FLAGS"  # read by XLA when JAX first looks for devices
-EXACT_GPU = "--xla_gpu_deterministic_ops"  # of XLA: every run has the same kernels, none of which sums in any order
-PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"  # of JAX: whether a process takes most of a GPU's memory as it begins
-PRECISION = "highest"  # of a GPU's matrix products; by default JAX rounds their float32 to TF32, of 10 bits
+EXACT_GPU = "--xla_gpu_deterministic_ops"  # of XLA: the same kernels in every run, which sum in a fixed order
+PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"  # of JAX: whether a process reserves most of a GPU's memory at its start
+PRECISION = "highest"  # of matrix products on a GPU; by default JAX rounds float32 inputs to TF32, of 10 bits
 
 
 def choose_device(device: str) -> None:
     """Compute on "cpu" or "gpu" ("cuda") in this process and in those that it starts.
 
-    A CPU's programs are dispatched asynchronously, which is JAX's default: the client looks after a program's outputs
-    while it runs already. `JAX_CPU_ENABLE_ASYNC_DISPATCH=0` changes that and no number.
+    CPU programs are dispatched asynchronously, which is JAX's default: the client handles a program's outputs while the
+    program is already running. `JAX_CPU_ENABLE_ASYNC_DISPATCH=0` turns that off and changes no number.
 
     A GPU computes as a CPU does, in float32 and the same in every run, unless the user's own XLA_FLAGS or
-    JAX_DEFAULT_MATMUL_PRECISION say otherwise. A process takes the GPU's memory as it needs it, so that several share
-    one, unless XLA_PYTHON_CLIENT_PREALLOCATE says otherwise. Where this process has looked for devices already it is
-    too late for that and for XLA's flags: a warning says so. Raises InputError where there is no such device, this
-    process has computed on another one, or JAX is set to numbers or keys that csac does not compute with.
+    JAX_DEFAULT_MATMUL_PRECISION say otherwise. A process allocates GPU memory as it needs it, so that several can share
+    a GPU, unless XLA_PYTHON_CLIENT_PREALLOCATE says otherwise. If JAX has already initialised its devices, it is too
+    late for that and for XLA's flags: a warning says so. Raises InputError if there is no such device, this process has
+    computed on another one, or JAX is set to 64 bits or another PRNG.
     """
     device = "gpu" if device == "cuda" else device
     if device not in PLATFORMS:
@@ -51,12 +51,12 @@ def choose_device(device: str) -> None:
         os.environ[PREALLOCATE] = os.environ.get(PREALLOCATE) or "false"
     try:
         chosen = jax.default_backend()
-    except Exception as error:  # which one depends on what is missing, and on JAX's version
-        _forget(*before)
+    except Exception as error:  # its type depends on what is missing, and on JAX's version
+        _restore_settings(*before)
         hint = "pip install '.[cuda]' in a clone of csac, or choose the cpu"
         raise InputError(f"no GPU that JAX can use: {hint}") from error
     if chosen != device:
-        _forget(*before)
+        _restore_settings(*before)
         raise InputError(f"this process computes on the {chosen} already: train on the {device} in a new one")
     os.environ["JAX_PLATFORMS"] = PLATFORMS[device]  # for the workers
     if device == "gpu":
@@ -72,7 +72,7 @@ def choose_device(device: str) -> None:
 
 
 def in_use() -> dict[str, str]:
-    """Return what decides the last bits of what this process and its workers compute, as `Machine` has it."""
+    """Return the settings that decide the last bits of results in this process and its workers, as in `Machine`."""
     config: Any = jax.config
     return {
         "gpu": jax.devices()[0].device_kind if jax.default_backend() == "gpu" else "",
@@ -82,30 +82,30 @@ def in_use() -> dict[str, str]:
 
 
 def with_exact_kernels(flags: str) -> str:
-    """Return XLA's flags with a GPU's numbers the same in every run; what the flags say of that already stays."""
+    """Return XLA's flags with deterministic GPU kernels, unless the flags already set that option."""
     return flags if EXACT_GPU in flags else f"{flags} {EXACT_GPU}=true".strip()
 
 
 def multiply_in_float32() -> None:
-    """Let products be of float32 in this process, unless the user has set another precision."""
+    """Compute matrix products in float32 in this process, unless the user has set another precision."""
     config: Any = jax.config
     if config.jax_default_matmul_precision is None:
         config.update("jax_default_matmul_precision", PRECISION)
 
 
 def preallocates() -> bool:
-    """Whether the user has each process take most of a GPU's memory as it begins, as JAX reads the variable."""
+    """Return whether the user has processes reserve most of a GPU's memory, as JAX reads the variable."""
     return os.environ.get(PREALLOCATE, "") not in ("", "0", "false", "False")
 
 
 def _has_looked_for_devices() -> bool:
-    """Whether JAX has, after which it reads no variable of the GPU. It has no public function that tells."""
-    from jax._src import xla_bridge  # here, so that nothing on a CPU depends on what is not public
+    """Return whether JAX has, after which it ignores the GPU variables. It has no public function for this."""
+    from jax._src import xla_bridge  # here, so that a CPU never needs the private module
 
     return xla_bridge.backends_are_initialized()
 
 
-def _forget(platforms: str | None, variables: Mapping[str, str | None]) -> None:
+def _restore_settings(platforms: str | None, variables: Mapping[str, str | None]) -> None:
     jax.config.update("jax_platforms", platforms)
     for name, value in variables.items():
         os.environ.pop(name, None)

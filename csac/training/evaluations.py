@@ -1,4 +1,4 @@
-"""Evaluations while training: in between, beside it in other processes, or in the training environment itself."""
+"""Evaluations during training: between steps, in parallel processes, or in the training environment itself."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from csac.training.watch import Watcher
     from csac.types import PolicyNetwork
 
-SECONDS_TO_FINISH = 10.0  # that an evaluation has once a stop is asked for
+SECONDS_TO_FINISH = 10.0  # that an evaluation may still take after a stop is requested
 
 
 class Evaluations:
-    """Evaluates the policies of runs that are trained together, one evaluation at a time, and records each.
+    """Evaluates the policies of runs that train together, one evaluation at a time, and records each.
 
-    The notifier may end training; `opened` closes what is opened here.
+    The notifier may end training; `stack` closes the evaluators.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Evaluations:
         environments: SeedEnvironments,
         watcher: Watcher,
         notifier: Notifier,
-        opened: ExitStack,
+        stack: ExitStack,
     ) -> None:
         self.runs, self.recorders, self.environments = runs, recorders, environments
         self.watcher, self._notifier = watcher, notifier
@@ -56,36 +56,36 @@ class Evaluations:
             environments=config.evaluation_environments or 1,
             lent=None if config.evaluation_environments else environments.environments[0],
         )
-        opened.callback(self._evaluator.close)
+        stack.callback(self._evaluator.close)
         if program.evaluation_processes and config.evaluation_environments:
             self.evaluator = pool = EvaluationPool(self._evaluator, program.evaluation_processes)
-            opened.callback(pool.close)
+            stack.callback(pool.close)
             pool.start()
         self._algorithm = config.algorithm
         self._perturbations = perturbations_of(config.perturbations)
         self._pending: tuple[int, list[int], list[Policy], Any] | None = None
-        self.step = int(runs[0].evaluations["step"].max(initial=0))  # of the newest one
-        self.wants_stop = False  # whether the watcher has said so of an evaluation, or one was broken off
-        self.broken_off: int | None = None  # the step of that one
+        self.step = int(runs[0].evaluations["step"].max(initial=0))  # of the newest evaluation
+        self.wants_stop = False  # whether a callback ends the runs, or an evaluation was broken off
+        self.broken_off: int | None = None  # the step of the evaluation that was broken off
         self.should_stop: Callable[[], bool] = lambda: False
-        self._stop_at = 0.0  # when, once a stop was asked for
+        self._deadline = 0.0  # of the evaluation in progress, once a stop was requested
         self._missing_events = [] if len(runs[0].evaluations) else sorted(config.events)
 
     @property
     def is_ready(self) -> bool:
-        """Whether an evaluation has been made that `finish` has not recorded yet."""
+        """Whether the evaluation in progress is done and only needs recording by `finish`."""
         return bool(self._pending and self._pending[3].is_over)
 
     def policy(self, network: PolicyNetwork, step: int) -> Policy:
-        """Return the policy that leaves training with this network."""
+        """Return the policy for deployment that has this network."""
         names = self.environments.task_name, self._algorithm, network.activation, network.head
         contract = Contract(*names, *self.environments.contract_parts, critic_activation=network.critic_activation)
         return Policy(network, contract, step=step)
 
     def begin(self, step: int, networks: Sequence[PolicyNetwork], task_step: int) -> None:
-        """Begin to evaluate each seed's network after `step`, on the task of `task_step`."""
+        """Begin to evaluate each seed's network of `step`, on the task as perturbed after `task_step`."""
         self.finish()
-        if self.broken_off is not None:  # this one is left to a resume
+        if self.broken_off is not None:  # a resume makes this evaluation
             self.broken_off = step
             return
         self.step = step
@@ -97,12 +97,12 @@ class Evaluations:
             self.finish()
 
     def finish(self) -> None:
-        """Wait for the evaluation in progress, if there is one, and record it; a stop breaks off a long one."""
+        """Wait for the evaluation in progress, if any, and record it; a stop request breaks off a long one."""
         if not self._pending:
             return
         (step, indices, policies, pending), self._pending = self._pending, None
         try:
-            answers = pending.results(self._is_late)
+            answers = pending.results(self._should_break_off)
         except EvaluationStopped:
             self.broken_off, self.wants_stop = step, True
             self.watcher.note_of(
@@ -125,15 +125,15 @@ class Evaluations:
             self.watcher.evaluated(step, means)
         self.wants_stop = self._notifier.evaluated(step, results) or self.wants_stop
 
-    def _is_late(self) -> bool:
-        """Return whether a stop was asked for so long ago that nobody waits for the evaluation in progress."""
+    def _should_break_off(self) -> bool:
+        """Return whether a stop was requested so long ago that the evaluation in progress should be broken off."""
         if not self.should_stop():
             return False
-        self._stop_at = self._stop_at or time.monotonic() + SECONDS_TO_FINISH
-        return time.monotonic() >= self._stop_at
+        self._deadline = self._deadline or time.monotonic() + SECONDS_TO_FINISH
+        return time.monotonic() >= self._deadline
 
     def _record(self, index: int, step: int, policy: Policy, episodes: list[EvaluationEpisode]) -> None:
-        """Record a run's evaluation, and its policy where it is the best so far."""
+        """Record a run's evaluation and its policy, also as the best one if it is the best so far."""
         run, recorder = self.runs[index], self.recorders[index]
         recorder.add("evaluations", [episode.row(run.seed, step) for episode in episodes])
         recorder.flush("evaluations")
@@ -149,7 +149,7 @@ class Evaluations:
             self.watcher.note_of(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
 
     def _warn_of_missing_events(self, episodes: Sequence[EvaluationEpisode]) -> None:
-        """Say which events no episode of the first evaluation has held."""
+        """Note which events no episode of the first evaluation reported."""
         for name in self._missing_events:
             if all(episode.events[name] is None for episode in episodes):
                 self.watcher.note_of(self.runs[0], f"note: no episode's last info holds a number called {name!r}")

@@ -1,4 +1,4 @@
-"""Hindsight: transitions once more, with goals that their episode reached later (HER, Andrychowicz et al. 2017)."""
+"""Hindsight: copy transitions with goals that their episode achieved later (HER, Andrychowicz et al. 2017)."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ ACHIEVED, DESIRED = "achieved_goal", "desired_goal"
 
 
 class Hindsight:
-    """Keeps the episodes in progress, and at the end of each gives its seed's replay `copies` of each transition."""
+    """Keeps the episodes in progress; at an episode's end, adds `copies` of each transition to its seed's replay."""
 
     def __init__(self, copies: int, environments: SeedEnvironments, learner: Learner) -> None:
         self._copies, self._environments, self._learner = copies, environments, learner
         self._goals = places_of(environments.contract_parts.observation_parts)
-        self._episodes: dict[tuple[int, ...], list[np.ndarray]] = {}  # packed transitions by place
+        self._episodes: dict[tuple[int, ...], list[np.ndarray]] = {}  # packed transitions by (seed index, environment)
 
     def after_step(self, observations: np.ndarray, actions: np.ndarray, outcome: Steps, step: int) -> None:
-        """Take a step of each environment, the last of which is number `step`, before the learner does."""
+        """Store one transition of each environment, up to `step` in all, before the learner does."""
         ends = outcome.terminated, outcome.truncated
         rows = pack(Transition(observations, actions, outcome.reward, outcome.next_observation, *ends))
-        given: dict[int, list[np.ndarray]] = {}
+        copies_by_seed: dict[int, list[np.ndarray]] = {}
         for place in np.ndindex(rows.shape[:-1]):
             if not self._environments.alive[place[0]]:
                 continue
@@ -46,23 +46,23 @@ class Hindsight:
             if ends[0][place] or ends[1][place]:
                 generator = np.random.default_rng([self._environments.seeds[place[0]], *place[1:], step])
                 episode, relabel = np.stack(self._episodes.pop(place)), partial(self._environments.relabel, place)
-                own = relabelled(episode, self._goals, self._environments.spec, self._copies, generator, relabel)
-                given.setdefault(place[0], []).append(own)
-        if given:
-            none = rows.reshape(-1, rows.shape[-1])[:0]
-            several = [np.concatenate([none, *given.get(index, [])]) for index in range(len(rows))]
-            self._learner.extend(several, step - self._environments.spec.environments)
+                copies = relabelled(episode, self._goals, self._environments.spec, self._copies, generator, relabel)
+                copies_by_seed.setdefault(place[0], []).append(copies)
+        if copies_by_seed:
+            no_rows = rows.reshape(-1, rows.shape[-1])[:0]
+            rows_by_seed = [np.concatenate([no_rows, *copies_by_seed.get(index, [])]) for index in range(len(rows))]
+            self._learner.extend(rows_by_seed, step - self._environments.spec.environments)
 
     def save(self, index: int) -> Snapshot:
-        """Return the episodes in progress of the seed at this place."""
-        own = {place: rows for place, rows in self._episodes.items() if place[0] == index and rows}
-        return Snapshot({str(place[-1]): np.stack(rows) for place, rows in own.items()}, {})
+        """Return the episodes in progress of the seed at this index."""
+        episodes = {place: rows for place, rows in self._episodes.items() if place[0] == index}
+        return Snapshot({str(place[-1]): np.stack(rows) for place, rows in episodes.items()}, {})
 
     def restore(self, index: int, saved: Snapshot) -> None:
-        """Go on with what `save` returned; an episode that restarts is left out instead."""
+        """Restore the episodes that `save` returned; not for a seed whose episode restarts."""
         for name, rows in saved.arrays.items():
-            own = (int(name),) if self._environments.spec.environments > 1 else ()
-            self._episodes[(index, *own)] = [*rows]
+            environment = (int(name),) if self._environments.spec.environments > 1 else ()
+            self._episodes[(index, *environment)] = [*rows]
 
 
 def relabelled(
@@ -75,7 +75,7 @@ def relabelled(
 ) -> np.ndarray:
     """Return `copies` of each transition of an episode [steps, width], with goals achieved in that step or a later one.
 
-    Rewards are computed for the new goals, and so is `terminated` where the task can; else it is what it was.
+    Rewards are recomputed for the new goals, and so is `terminated` if the task can; otherwise it is unchanged.
     """
     achieved, desired = goals
     reward = spec.observation_size + spec.action_size
@@ -83,9 +83,9 @@ def relabelled(
     achieved = slice(achieved.start + following, achieved.stop + following)
     steps = len(episode)
     later = generator.integers(np.arange(steps)[:, None], steps, (steps, copies)).ravel()
-    rows, wanted = np.repeat(episode, copies, axis=0), episode[later, achieved]
-    rows[:, desired] = rows[:, desired.start + following : desired.stop + following] = wanted
-    computed = relabel(rows[:, achieved], wanted)
+    rows, new_goals = np.repeat(episode, copies, axis=0), episode[later, achieved]
+    rows[:, desired] = rows[:, desired.start + following : desired.stop + following] = new_goals
+    computed = relabel(rows[:, achieved], new_goals)
     if computed is None:
         return rows[:0]
     rows[:, reward] = computed[0]
@@ -95,18 +95,18 @@ def relabelled(
 
 
 def places_of(parts: Parts) -> tuple[slice, slice]:
-    """Return where the achieved and the desired goal lie in a flat observation. Raises InputError without them."""
+    """Return the slices of the achieved and the desired goal in a flat observation. Raises InputError without them."""
     ends = np.cumsum([0, *(math.prod(shape) for _, shape in parts)]).tolist()
     places = {name: slice(*ends[i : i + 2]) for i, (name, _) in enumerate(parts)}
     shapes = dict(parts)
     if ACHIEVED not in places or DESIRED not in places or shapes[ACHIEVED] != shapes[DESIRED]:
-        told = ", ".join(f"{name} {shape}" for name, shape in parts if name) or "one Box"
-        raise InputError(f"hindsight needs {ACHIEVED} and {DESIRED} of one shape in a Dict observation, not {told}")
+        found = ", ".join(f"{name} {shape}" for name, shape in parts if name) or "one Box"
+        raise InputError(f"hindsight needs {ACHIEVED} and {DESIRED} of one shape in a Dict observation, not {found}")
     return places[ACHIEVED], places[DESIRED]
 
 
 def check_goals(algorithm: Algorithm, environment: Environment) -> None:
-    """Raise InputError where an algorithm or a task has no use for hindsight. The task makes a step."""
+    """Raise InputError if an algorithm or a task does not support hindsight. Steps the environment once."""
     if not hasattr(algorithm, "replay_size"):
         raise InputError(f"hindsight is for algorithms with a replay, and {type(algorithm).__name__} has none")
     if getattr(algorithm, "n_steps", 1) > 1:
@@ -123,5 +123,5 @@ def check_goals(algorithm: Algorithm, environment: Environment) -> None:
     except EnvironmentFailure as error:
         raise InputError(f"hindsight does not work with {environment.task_name}: {error}") from None
     if not np.isclose(computed, reward, rtol=1e-3, atol=1e-4):
-        told = f"{environment.task_name} gave {reward:g} and its compute_reward {computed:g}"
-        raise InputError(f"hindsight needs rewards that compute_reward can tell: {told}")
+        rewards = f"{environment.task_name} gave {reward:g} and its compute_reward {computed:g}"
+        raise InputError(f"hindsight needs rewards that compute_reward reproduces: {rewards}")

@@ -1,4 +1,4 @@
-"""What a run has learnt and remembers, from Python: its algorithm's state, critics included, and its replay."""
+"""Read a run's learnt state, critics included, and its replay buffer from Python."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from csac.training.one_seed import KEY_DATA
 from csac.training.packing import by_name
 from csac.types import InputError, Transition
 
-PAIRS_OF_A_BATCH = 4_096  # transitions that critics normalised over batches are seen by
+STATISTICS_TRANSITIONS = 4_096  # newest transitions that give batch-normalised critics their statistics
 
 
 class Learnt:
-    """What a seed has learnt by a checkpoint.
+    """The learnt state of a seed at a checkpoint.
 
     Attributes:
         run: the run.
-        algorithm: with its hyperparameters.
+        algorithm: the algorithm with its hyperparameters.
         step: environment steps made.
-        state: the algorithm's own `State`, a tree of NumPy arrays: actor, critics, targets, optimisers.
+        state: the algorithm's `State`, a tree of NumPy arrays: actor, critics, targets, optimisers.
     """
 
     def __init__(self, run: RunDirectory, checkpoint: Checkpoint, trust_task: bool = False) -> None:
@@ -53,7 +53,7 @@ class Learnt:
         self._reward_scale = learner.arrays.get("returns.statistics.std", np.float32(1.0))
 
     def replay(self) -> dict[str, np.ndarray]:
-        """Return the transitions in the memory, from the oldest on, as arrays.
+        """Return the transitions in the replay buffer, oldest first, as arrays.
 
         `observations` and `next_observations` [n, observation] are flat, `actions` [n, action] on the environment's
         scale, `rewards` [n], `terminated` and `truncated` [n] bool.
@@ -70,12 +70,12 @@ class Learnt:
         }
 
     def q_values(self, observations: Any, actions: np.ndarray) -> np.ndarray:
-        """Return each critic's Q(s, a), [critic] or for batches [n, critic], in the task's own rewards.
+        """Return each critic's Q(s, a), [critic] or for batches [n, critic], on the scale of the task's rewards.
 
-        Observations are the task's own, actions on the environment's scale.
+        Observations are as the task gives them, actions on the environment's scale.
 
         Raises:
-            InputError: the algorithm has no critics of actions.
+            InputError: the algorithm has no critics Q(s, a).
         """
         critics, statistics = self._critics()
         flat = np.atleast_2d(self._contract.flatten(observations))
@@ -90,7 +90,7 @@ class Learnt:
         return values if self._contract.flatten(observations).ndim == 2 else values[0]
 
     def _critics(self) -> tuple[list[Any], Any]:
-        """Return the critics as they can be asked, and what they see observations by."""
+        """Return the critics, ready to evaluate, and the statistics that normalise their observations."""
         pairs = [self.state] if hasattr(self.state, "critics") else list(self.state)
         critics = [c for pair in pairs for c in getattr(pair, "critics", [getattr(pair, "critic", None)])]
         if any(critic is None for critic in critics):
@@ -101,8 +101,8 @@ class Learnt:
         return critics, statistics
 
     def _folded(self, critics: list[Any], statistics: Any) -> list[Any]:
-        """Return critics that are normalised over batches as plain ones, by the newest transitions."""
-        newest = jax.tree.map(lambda array: array[-PAIRS_OF_A_BATCH:], self._transitions())
+        """Return batch-normalised critics as plain ones, with the statistics of the newest transitions."""
+        newest = jax.tree.map(lambda array: array[-STATISTICS_TRANSITIONS:], self._transitions())
 
         def of_one(critic: Any, one: Transition) -> Any:
             next_action = self.algorithm.act(self.state, one.next_observation, jax.random.key(0), explore=False)
@@ -113,7 +113,7 @@ class Learnt:
         return [jax.vmap(of_one, (None, 0), out_axes=None, axis_name=BATCH)(critic, newest) for critic in critics]
 
     def _transitions(self) -> Transition:
-        """Return what is in the memory, [n, ...] each, with actions as the algorithm chose them."""
+        """Return the transitions in the replay buffer, [n, ...] each, with actions as the algorithm chose them."""
         first, last = self._checkpoint.transitions
         rows = np.zeros((last - first, row_width(self._contract.spec)), np.float32)
         if len(rows):
@@ -126,13 +126,13 @@ class Learnt:
 def load_checkpoint(
     directory: str | os.PathLike[str], seed: int | None = None, step: int | None = None, trust_task: bool = False
 ) -> Learnt:
-    """Return what a seed has learnt by its newest checkpoint, or the one of a step.
+    """Return the learnt state of a seed at its newest checkpoint, or at the one of a step.
 
     Args:
         directory: a set of runs, or one run.
-        seed: the seed's label; by default the one that `csac.load` takes.
-        step: one of those that are kept (`keep_checkpoints`).
-        trust_task: whether to import the module of an algorithm of one's own that nobody has named here.
+        seed: the seed's label; by default the one that `csac.load` chooses.
+        step: the step of a checkpoint that was kept (`keep_checkpoints`).
+        trust_task: whether to import the module of a user-defined algorithm that nobody has named on this machine.
 
     Raises:
         InputError: there is no such run, seed or checkpoint.

@@ -1,4 +1,4 @@
-"""Signals while training: the first SIGINT or SIGTERM asks for a stop, the second is taken literally."""
+"""Signals during training: the first SIGINT or SIGTERM requests a stop, the second interrupts at once."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 
 class Interrupted(Exception):
-    """Training was stopped by a signal, and everything that can be saved is saved.
+    """Training was stopped by a signal, after saving everything that can be saved.
 
-    `can_resume` says whether `resume` goes on with it.
+    `can_resume` says whether `resume` can continue it.
     """
 
     def __init__(self, runs: RunSet, signal_number: int) -> None:
@@ -32,14 +32,14 @@ class Interrupted(Exception):
 
 
 class StopRequest:
-    """Note SIGINT and SIGTERM as their handler; the second of them raises KeyboardInterrupt(its number)."""
+    """A handler of SIGINT and SIGTERM that records the first; the second raises KeyboardInterrupt(its number)."""
 
     def __init__(self, tell: Callable[[str], None] | None = None) -> None:
         self.received: list[int] = []
         self._tell, self._process = tell, os.getpid()
 
     def __call__(self, number: int, _: Any = None) -> None:
-        """Take a signal."""
+        """Handle a signal."""
         if os.getpid() != self._process:
             _end_helper(number)
             return
@@ -47,7 +47,7 @@ class StopRequest:
             raise KeyboardInterrupt(number)
         self.received.append(number)
         if self._tell:
-            self._tell("stopping at the next step where all can be saved; once more to leave at once")
+            self._tell("stopping at the next step where all can be saved; signal again to leave at once")
 
     def is_set(self) -> bool:
         """Return whether a signal has come."""
@@ -58,8 +58,8 @@ class StopRequest:
 def stop_requested(tell: Callable[[str], None] | None = None) -> Iterator[StopRequest]:
     """Yield the stop request that SIGINT and SIGTERM set; SIGHUP is ignored, as a run outlives its terminal.
 
-    Within another one that is the same request: a signal to a study stops every run in it. `tell` is called with a
-    line for the user. Outside of the main thread nothing is handled.
+    A nested call yields the outer request: a signal to a study stops every run in it. `tell` is called with a line for
+    the user. Outside of the main thread no signal is handled.
     """
     outer = signal.getsignal(signal.SIGINT)
     request = outer if isinstance(outer, StopRequest) else StopRequest(tell)
@@ -69,9 +69,9 @@ def stop_requested(tell: Callable[[str], None] | None = None) -> Iterator[StopRe
 
 @contextmanager
 def leaving_at_once() -> Iterator[None]:
-    """Let SIGINT and SIGTERM end this process at once, with their exit code and a line, while nothing is to be saved.
+    """Let SIGINT and SIGTERM end this process at once, with their exit code and a message, while nothing needs saving.
 
-    An exception in their place does not always arrive: imports and finalisers swallow some.
+    An exception would not always arrive: imports and finalisers swallow some.
     """
     process = os.getpid()
 
@@ -87,7 +87,7 @@ def leaving_at_once() -> Iterator[None]:
 
 
 def _end_helper(number: int) -> None:
-    """End a helper that the task has forked by a signal whose handler it inherited."""
+    """End a helper process of the task, which inherited this handler, as the signal does by default."""
     signal.signal(number, signal.SIG_DFL)
     os.kill(os.getpid(), number)
 
@@ -109,11 +109,11 @@ def _handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
 
 @contextmanager
 def storage_failures(path: Path) -> Iterator[None]:
-    """Raise StorageFailure where a file below this folder can no longer be written."""
+    """Raise StorageFailure if a file below this folder can no longer be written."""
     try:
         yield
     except OSError as error:
-        # Of a connection: the parent is gone. Without a reason of the system's: of a library, such as a task's.
+        # A ConnectionError means that the parent is gone; an error without strerror is a library's, such as a task's.
         is_other = isinstance(error, ConnectionError) or not error.strerror
         if is_other or not str(error.filename or path).startswith(str(path)):
             raise

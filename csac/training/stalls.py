@@ -1,4 +1,4 @@
-"""Notice that training stands still inside an environment, and say where."""
+"""Detect that training hangs inside an environment, and report where."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import FrameType
 
-SECONDS = 180.0  # in one call of an environment, before a line says so
+SECONDS = 180.0  # without a step, in a call of an environment, before a note
 _ENVIRONMENTS = {
     str(Path(__file__).parents[1] / name) for name in ("tasks/environment.py", "tasks/workers.py", "evaluation/pool.py")
 }
@@ -22,22 +22,22 @@ _ENVIRONMENTS = {
 
 @contextmanager
 def stalls_noted(progress: Callable[[], int], note: Callable[[str], None], who: str) -> Iterator[None]:
-    """Call `note` once whenever this thread's step, `progress`, stays the same for minutes while an environment runs.
+    """Call `note` once each time this thread hangs in an environment: `progress`, its step, is the same for minutes.
 
-    `who` names the seed. Nothing is ended: a real robot may wait for somebody.
+    `who` names the seed. Nothing is stopped: a real robot may be waiting for somebody.
     """
     is_over, thread = threading.Event(), threading.get_ident()
 
     def watch() -> None:
-        before, is_told = progress(), False
+        last_step, is_noted = progress(), False
         while not is_over.wait(SECONDS):
-            now = progress()
-            is_told = is_told and now == before
-            place = _place_in_environment(sys._current_frames().get(thread)) if now == before else None
-            if place is not None and not is_told:  # in a process of its own there is no place
-                note(f"{who}: at step {now:,} for {SECONDS / 60:.0f} minutes, inside the environment{place}")
-                is_told = True
-            before = now
+            step = progress()
+            is_noted = is_noted and step == last_step
+            place = _place_in_environment(sys._current_frames().get(thread)) if step == last_step else None
+            if place is not None and not is_noted:  # of an environment in another process it is ""
+                note(f"{who}: at step {step:,} for {SECONDS / 60:.0f} minutes, inside the environment{place}")
+                is_noted = True
+            last_step = step
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -49,7 +49,7 @@ def stalls_noted(progress: Callable[[], int], note: Callable[[str], None], who: 
 
 
 def _place_in_environment(frame: FrameType | None) -> str | None:
-    """Return where the user's code is, as " (file.py:12)", or None outside of an environment."""
+    """Return the line of user code that runs, as " (file.py:12)", or None outside of an environment."""
     places = []
     while frame:
         places.append((frame.f_code.co_filename, frame.f_lineno))

@@ -1,4 +1,4 @@
-"""Who is told what happens in training, in the process that called `train`: the reporter, the callbacks, the curve."""
+"""Route training events, in the process that called `train`, to the progress reporter, the callbacks and the curve."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 
 class Watcher:
-    """Receives progress, results and notes while a program trains; all go to `send`, and this one's does nothing."""
+    """Receives progress, results and notes while a program trains. All go to `send`, which does nothing here."""
 
     def send(self, name: str, *arguments: Any) -> None:
-        """Pass on a call of the method of this name."""
+        """Forward a call of the method of this name."""
 
     def wait_for_turn(self, step: int) -> None:
-        """Wait until it is this program's turn to train on, after so many steps."""
+        """Wait until this program, which has made `step` steps, may continue."""
 
     def progress(self, steps: Mapping[int, int]) -> None:
         """Receive how many steps each seed has made."""
@@ -36,11 +36,11 @@ class Watcher:
         self.send("evaluated", step, dict(returns))
 
     def call(self, event: Event) -> Answer:
-        """Tell the callbacks of an event, and return their answer."""
+        """Pass an event to the callbacks, and return their answer."""
         return Answer()
 
     def failed(self, seed: int, step: int, reason: str) -> None:
-        """Receive that a seed has failed, and why."""
+        """Receive the failure of a seed and its reason."""
         self.send("failed", seed, step, reason)
 
     def note(self, text: str) -> None:
@@ -54,7 +54,7 @@ class Watcher:
 
 
 class Watch(Watcher):
-    """Tells the caller what happens, with a reporter on the terminal where `progress` is wanted. Raises InputError."""
+    """Passes events to the callbacks, and to a reporter on the terminal if `progress` is true. Raises InputError."""
 
     def __init__(self, progress: bool, callbacks: Callbacks) -> None:
         check_flag("progress", progress)
@@ -65,12 +65,12 @@ class Watch(Watcher):
             self.reporter = Reporter()
 
     def send(self, name: str, *arguments: Any) -> None:
-        """Show it."""
+        """Call the method of the reporter, if there is one."""
         if self.reporter:
             getattr(self.reporter, name)(*arguments)
 
     def call(self, event: Event) -> Answer:
-        """Tell the callbacks; show who ends the runs."""
+        """Pass an event to the callbacks; note which of them ends the runs."""
         answer = self.callbacks.call(event)
         if answer.stopped_by:
             seeds = ", ".join(str(moment.seed) for moment in event.moments)
@@ -78,21 +78,21 @@ class Watch(Watcher):
         return answer
 
     def failed(self, seed: int, step: int, reason: str) -> None:
-        """Show that a seed failed, or warn of it."""
+        """Report that a seed failed; without a reporter, warn."""
         super().failed(seed, step, reason)
         if not self.reporter:
             warnings.warn(f"seed {seed} failed at step {step}: {reason}", RuntimeWarning, stacklevel=2)
 
     def is_over(self, run: RunDirectory) -> bool:
-        """Return whether a run needs no more training: all its steps are made, or a callback still ends it there."""
+        """Return whether a run needs no more training: all its steps are made, or a callback would still end it."""
         manifest = run.manifest
         if manifest.state not in ("finished", "failed") or manifest.steps_done < run.config.steps:
-            return self.callbacks.still_stop(run)
+            return self.callbacks.would_stop_again(run)
         return manifest.state == "finished"
 
 
 def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:
-    """Draw the evaluations of a set into its `curve.png`; a picture that cannot be drawn is no failure of the runs."""
+    """Plot the evaluations of a set into its `curve.png`; if that fails, only note it."""
     rows = runs.sound_evaluations if len(runs.sound_evaluations) else runs.evaluations
     if not len(rows):
         return

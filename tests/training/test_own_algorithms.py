@@ -163,7 +163,7 @@ def test_one_that_no_module_can_give_is_resumed_with_the_class_given(tmp_path, o
         ("calm:policy_at", "the module calm has no algorithm policy_at"),
         ("reinforce:State", "the module reinforce has no algorithm State"),
         ("broken:Half", "Half has no memory or init or act or policy"),
-        ("broken:Melting", "Melting is to be a frozen dataclass"),
+        ("broken:Melting", "Melting must be a frozen dataclass"),
         ("broken:Required", "width of broken:Required has no default"),
         ("nowhere:SAC", "the module nowhere cannot be imported"),
         ("calm", "no algorithm is called 'calm': choose csac or sac"),
