@@ -1,6 +1,6 @@
-"""Evaluations that are begun and whose results are asked for later: in this process, or in several, with equal numbers.
+"""Asynchronous evaluations, in this process or in worker processes, with bit-identical results.
 
-The processes run NumPy and the task; JAX is not imported.
+The workers run NumPy and the task; they do not import JAX.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
     from csac.deploy.policy import Policy
     from csac.evaluation.evaluator import Evaluator
 
-    # A policy, the number of a batch's first episode, whether deterministic, how the task is perturbed.
+    # Policy, number of the batch's first episode, whether deterministic, perturbations by kind.
     Work = tuple[Policy, int, bool, dict[str, float]]
-    OnProgress = Callable[[int, int], None]  # episodes done, episodes in all
+    OnProgress = Callable[[int, int], None]  # episodes done, episodes in total
 
-_BATCHES_THAT_PAY = 2  # for each process: it takes as long to start as a short batch takes
+_BATCHES_THAT_PAY = 2  # per process: starting one takes as long as a short batch
 _SECONDS_BETWEEN_STOPS = 1.0
 
-Batch = tuple[int, int]  # which policy, number of the first episode
+Batch = tuple[int, int]  # policy index, number of the first episode
 Result = list[EvaluationEpisode] | EvaluationFailure
 
 
 class EvaluationStopped(Exception):
-    """An evaluation ended early, since `should_stop` said so."""
+    """An evaluation ended early because `should_stop` returned True."""
 
 
 class Pending:
-    """An evaluation of several policies that was begun.
+    """An evaluation of several policies in progress.
 
-    `workers` have a batch each, in order, and get the next whenever somebody waits here or asks whether it is over.
-    What a process that dies leaves undone runs in this process when the results are asked for: everything without
-    workers. `notes` are lines on what happened that changes no number.
+    Each of the `workers` has one batch at a time; finished ones get the next batch during `is_over` and `results`.
+    Without workers, or for a batch whose worker died, `results` runs the batches in this process. `notes` are lines
+    about events that do not change the results.
     """
 
     def __init__(
@@ -62,14 +62,14 @@ class Pending:
 
     @property
     def is_over(self) -> bool:
-        """Whether the results need not be waited for. Does not wait."""
+        """Whether no worker is busy any more. Does not wait."""
         self._receive(0.0)
         return not self._busy
 
     def results(self, should_stop: Callable[[], bool] | None = None) -> list[Result]:
-        """Return each policy's episodes in order, or its first failure, which does not end the others. Waits.
+        """Wait, and return each policy's episodes in order, or its first failure, which does not affect the others.
 
-        Raises EvaluationStopped where `should_stop`, asked every second and before each step here, says so.
+        Raise EvaluationStopped if `should_stop`, called every second and before each step here, returns True.
         """
         while self._busy:
             if should_stop and should_stop():
@@ -81,7 +81,7 @@ class Pending:
         return [self._result(index) for index in range(len(self._policies))]
 
     def _receive(self, seconds: float | None) -> None:
-        """Take the answers that come within so many seconds, or the next one, and hand out what waits."""
+        """Wait for answers, at most so many `seconds` (None: until one arrives), and hand out waiting batches."""
         ready = wait([worker.connection for worker in self._busy], seconds) if self._busy else []
         for worker in [worker for worker in self._busy if worker.connection in ready]:
             batch = self._busy.pop(worker)
@@ -128,16 +128,16 @@ class Pending:
 
 
 def choose_processes(evaluator: Evaluator, policies: int) -> int:
-    """Return how many processes pay for evaluating so many policies: at most one per core."""
+    """Return how many processes are worthwhile for evaluating this many policies: at most one per core."""
     return max(1, min(cores_to_use(), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
 
 
 class EvaluationPool:
-    """Does what `Evaluator` does, batch by batch in processes of their own; the numbers are the same to the last bit.
+    """Evaluates like `Evaluator`, but in worker processes; the results are the same to the last bit.
 
-    A batch is what one evaluator steps at a time, so that nothing depends on which process takes it. The processes
-    start at the first evaluation, or at `start`, and wait for the next until `close`. Each works with the evaluator,
-    perturbed as it is when an evaluation begins.
+    The unit of work is one batch of the evaluator, so that results do not depend on which worker runs it. The workers
+    start at the first evaluation, or at `start`, and live until `close`. Each has a copy of the evaluator, which takes
+    the perturbations that hold when an evaluation begins.
     """
 
     def __init__(self, evaluator: Evaluator, processes: int) -> None:
@@ -153,25 +153,25 @@ class EvaluationPool:
         self._workers: list[Child] = []
 
     def start(self) -> None:
-        """Start every process that is not there, so that an evaluation need not wait for it."""
+        """Start all processes that are not running, so that an evaluation need not wait for them."""
         self._start(self._processes)
 
     def begin(
         self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
     ) -> Pending:
-        """Begin to evaluate policies and return. The evaluation before must be over; after a stop, close the pool."""
+        """Start an evaluation and return at once. The previous one must be over; after a stop, close the pool first."""
         self._start(min(self._processes, len(self._evaluator.batches(len(policies)))))
         return Pending(self._evaluator, policies, deterministic, on_progress, self._workers)
 
     def close(self) -> None:
-        """End the processes, which close their environments; another evaluation starts new ones.
+        """End the processes, which close their environments; the next evaluation starts new ones.
 
-        One that is in the middle of a long batch is killed: nobody waits for its episodes.
+        A process that is busy with a long batch is killed.
         """
         workers, self._workers = self._workers, []
         for worker in workers:
             if worker.process.is_alive():
-                worker.tell(None)  # where a task has forked, its child holds this end of the pipe open
+                worker.tell(None)  # closing the pipe is not enough if a child forked by a task holds it open
         end(workers)
 
     def _start(self, processes: int) -> None:
@@ -179,12 +179,12 @@ class EvaluationPool:
             worker.kill()
             self._workers.remove(worker)
         while len(self._workers) < processes:
-            self._evaluator.close()  # no process is sent open environments
+            self._evaluator.close()  # workers get the evaluator without open environments
             self._workers.append(Child(_work, self._evaluator))
 
 
 def _work(connection: Connection, evaluator: Evaluator) -> None:
-    """Run the batches that are asked for, until there are no more or the parent is gone."""
+    """Run the requested batches until the parent sends None or is gone."""
     try:
         while work := connection.recv():
             connection.send(evaluator.answer(*work))
