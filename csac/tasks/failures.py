@@ -1,4 +1,4 @@
-"""How an environment's errors are told: in one line, with the place in the code that raised."""
+"""Format an environment's exceptions in one line, with the file and line that raised."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ _PASSED_OVER = (sysconfig.get_path("stdlib"), "<frozen")
 
 
 class EnvironmentFailure(Failure):
-    """An environment raised, or gave what is not a finite number of the right shape. The message is one line."""
+    """An environment raised, or returned a non-finite value or a wrong shape. The message is one line."""
 
 
 def failure_of(call: str, error: BaseException) -> EnvironmentFailure:
-    """Return the failure of an environment whose `call` raised, be it a panic of native code or `sys.exit`.
+    """Return the failure of an environment whose method `call` raised, even a panic of native code or `sys.exit`.
 
-    Raises the error itself if it is a KeyboardInterrupt or GeneratorExit.
+    Raise the error itself if it is a KeyboardInterrupt or GeneratorExit.
     """
     raise_interrupt(error)
     return EnvironmentFailure(f"{call} raised {raised(error)}")
 
 
 def raise_interrupt(error: BaseException) -> None:
-    """Raise an error again that is none of the code that raised it: KeyboardInterrupt or GeneratorExit."""
+    """Re-raise a KeyboardInterrupt or GeneratorExit, which is no error of the environment."""
     if isinstance(error, KeyboardInterrupt | GeneratorExit):
         raise error
 
 
 def raised(error: BaseException) -> str:
-    """Return an error's type, message and place in one line: the last frame of the user's code, else of a library's."""
+    """Return type, message and place of an error in one line; `place_of` chooses the place."""
     origin = error
-    while origin.__cause__:  # Gymnasium raises another one from what a constructor raised
+    while origin.__cause__:  # Gymnasium raises its own error from that of a constructor
         origin = origin.__cause__
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(origin.__traceback__)]
     return one_line(error) + place_of(places)
 
 
 def place_of(places: Sequence[tuple[str, int]]) -> str:
-    """Return the innermost of files and lines that is the user's, else a library's, as " (file.py:12)", or nothing."""
+    """Return the innermost frame in the user's code, or else in a library, as " (file.py:12)", or an empty string."""
     foreign = [place for place in places if _PACKAGES.search(place[0]) or not place[0].startswith(_PASSED_OVER)]
     foreign = [place for place in foreign if not place[0].startswith(_CSAC)]
     own = [place for place in foreign if not _PACKAGES.search(place[0])]
@@ -60,7 +60,7 @@ def one_line(error: BaseException) -> str:
 
 
 def message(error: BaseException) -> str:
-    """Return an error's message in one line that every file and terminal takes."""
+    """Return an error's message in one line that is safe for every file and terminal."""
     try:
         text = str(error)
     except Exception as unsaid:

@@ -1,4 +1,4 @@
-"""Environments in processes of their own: what a seed's slow environments compute, they compute side by side."""
+"""Step slow environments in parallel worker processes."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from csac.tasks.registry import Task
 from csac.tasks.spaces import ContractParts
 from csac.types import Spec
 
-SECONDS_THAT_PAY = 3e-4  # of a step: asking a process for it takes a fifth of that
+SECONDS_THAT_PAY = 3e-4  # per step; the round trip to a process takes a fifth of that
 STEPS_TRIED = 10
 
 
 class Workers:
-    """Processes with so many environments each, and an `Environment` here for each of those.
+    """Worker processes with `numbers` of environments each, and a `RemoteEnvironment` for each of these.
 
-    Of a step's `info` only the numbers that `events` are of come back.
+    A step returns only those entries of `info` that `events` need, if they are numbers.
     """
 
     def __init__(
@@ -63,10 +63,10 @@ class Workers:
 
 
 class RemoteEnvironment:
-    """An `Environment` in another process, with its methods; what is asked ahead is computed meanwhile.
+    """An `Environment` in a worker process, with its methods; `ask` starts a call without waiting for the result.
 
-    A worker answers in order: of the environments that it has, what is asked ahead of all is answered before more is
-    asked. Its death is an EnvironmentFailure of each.
+    A worker answers in order: after `ask` on several of its environments, collect their results in the same order
+    before calling anything else. If it dies, every call raises EnvironmentFailure.
     """
 
     def __init__(self, worker: Worker, number: int, spec: Spec, parts: ContractParts, task_name: str) -> None:
@@ -74,17 +74,17 @@ class RemoteEnvironment:
         self._worker, self._number, self._is_asked = worker, number, False
 
     def ask(self, method: str, *arguments: Any) -> None:
-        """Begin to compute what the next call of this method returns."""
-        with suppress(OSError):  # of a dead process; it is seen when it does not answer
+        """Start a call in the worker; the next call of the method returns its result."""
+        with suppress(OSError):  # the process is dead: `answer` reports it
             self._worker.tell((self._number, method, arguments))
         self._is_asked = True
 
     def __getattr__(self, method: str) -> Callable[..., Any]:
-        """Return a method of the environment, which is called in its process."""
+        """Return a method of the environment, to be run in the worker."""
         return partial(self._answer, method)
 
     def close(self) -> None:
-        """Do nothing: `Workers.close` closes all."""
+        """Do nothing: `Workers.close` closes all environments."""
 
     def _answer(self, method: str, *arguments: Any) -> Any:
         if not self._is_asked:
@@ -97,7 +97,7 @@ class Worker(Child):
     """The parent's end of a process that steps environments."""
 
     def answer(self) -> Any:
-        """Return the next answer, or raise what was raised there; EnvironmentFailure where the process is gone."""
+        """Return the next answer or raise the worker's exception; raise EnvironmentFailure if the process is gone."""
         try:
             answer, error, details = self.connection.recv()
         except (EOFError, OSError):
@@ -115,7 +115,7 @@ def _serve(
     seed: int,
     events: Sequence[str],
 ) -> None:
-    """Do what environments are asked, until there is no more or the parent is gone."""
+    """Run the requested calls on environments until the parent sends None or is gone."""
     seed_globals(seed)
     environments: list[Environment] = []
     names = {info_name(event) for event in events}
@@ -134,19 +134,19 @@ def _serve(
 
 
 def _outcome(names: set[str], function: Any, *arguments: Any) -> tuple[Any, Exception | None, str]:
-    """Return what a call returns, or raises, with the traceback of its cause."""
+    """Return (result, exception, traceback of the exception's cause) of a call."""
     try:
         result = function(*arguments)
         if function.__name__ == "step_environment_scale":
             told = {name: result[-1][name] for name in names & result[-1].keys()}
-            result = (*result[:-1], numbers_in(told))  # its info may hold what cannot be sent
+            result = (*result[:-1], numbers_in(told))  # `info` may hold objects that cannot be pickled
         return result, None, ""
     except Exception as error:
         return None, error, "".join(traceback.format_exception(error)) if error.__cause__ else ""
 
 
 def choose_processes(task: Task, environment_arguments: dict[str, Any] | None, environments: int, cores: int) -> int:
-    """Return how many processes pay for so many environments: one for each core where a step takes long, else none."""
+    """Return how many processes are worthwhile: if a step is slow, one per environment up to `cores`, else 0."""
     processes = min(environments, cores)
     if processes < 2:
         return 0
