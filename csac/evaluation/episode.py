@@ -48,7 +48,7 @@ class EvaluationEpisode(NamedTuple):
         }
 
 
-class Playing:
+class RunningEpisode:
     """An evaluation episode in progress. Stochastic actions are drawn from `generator`."""
 
     def __init__(
@@ -82,15 +82,15 @@ class Playing:
 
     def result(self) -> EvaluationEpisode:
         """Return the record of the finished episode."""
-        said = self._events.of(self.last_info, self.length)
-        return EvaluationEpisode(self.number, self._return, self.length, _success(self.last_info), said)
+        events = self._events.of(self.last_info, self.length)
+        return EvaluationEpisode(self.number, self._return, self.length, _success(self.last_info), events)
 
     def _failure(self, error: EnvironmentFailure) -> EvaluationFailure:
         place = f"evaluation episode {self.number}, reset with seed {self._seed}, at step {self.length}"
         return EvaluationFailure(f"{place}: {error}")
 
 
-def start(episodes: Sequence[Playing], rows: np.ndarray, ignores_seed: bool | None) -> bool | None:
+def start(episodes: Sequence[RunningEpisode], rows: np.ndarray, ignores_seed: bool | None) -> bool | None:
     """Reset each episode's environment and write its first observation into rows [episode, observation].
 
     Return whether the task's resets ignore their seed, None if a single episode cannot show it. If they do, episode j
@@ -98,13 +98,13 @@ def start(episodes: Sequence[Playing], rows: np.ndarray, ignores_seed: bool | No
     """
     for row, episode in zip(rows, episodes, strict=True):
         row[:] = episode.start()
-    is_told = ignores_seed is not None or len(episodes) < 2
-    ignores_seed = ignores_seed if is_told else bool((rows == rows[0]).all())
+    is_known = ignores_seed is not None or len(episodes) < 2
+    ignores_seed = ignores_seed if is_known else bool((rows == rows[0]).all())
     if ignores_seed:
         for row, episode in zip(rows, episodes, strict=True):
             for _ in range(episode.number):
                 row[:] = episode.start()
-    return ignores_seed if is_told else ignores_seed and not (rows == rows[0]).all()  # still alike: deterministic
+    return ignores_seed if is_known else ignores_seed and not (rows == rows[0]).all()  # still alike: deterministic
 
 
 def _success(info: dict[str, Any]) -> float | None:

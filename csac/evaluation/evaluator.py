@@ -11,7 +11,7 @@ import numpy as np
 from csac.checks import check_flag, check_whole
 from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy
-from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, Playing, start
+from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, RunningEpisode, start
 from csac.evaluation.pool import EvaluationStopped, Pending
 from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
@@ -61,7 +61,7 @@ class Evaluator:
         check_whole("first_seed", first_seed, 0, _SEED_LIMIT - episodes)
         self._task, self._environment_arguments = task, environment_arguments
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
-        self._lent, self._at_once = lent, min(environments, EPISODES_AT_ONCE, episodes)
+        self._lent, self._batch_size = lent, min(environments, EPISODES_AT_ONCE, episodes)
         self._environments = [lent] if lent else []
         self._ignores_seed: bool | None = None  # None before the first batch
         self.perturbed: dict[str, float] = {}
@@ -98,7 +98,7 @@ class Evaluator:
 
     def batches(self, policies: int) -> list[Batch]:
         """Return (policy index, number of the first episode) of every batch, in order."""
-        return [(index, first) for index in range(policies) for first in range(0, self.episodes, self._at_once)]
+        return [(index, first) for index in range(policies) for first in range(0, self.episodes, self._batch_size)]
 
     def run_batch(
         self,
@@ -112,11 +112,11 @@ class Evaluator:
         Raise InputError and EvaluationFailure as `run` does, and EvaluationStopped if `should_stop`, called before each
         step, returns True.
         """
-        self._make_environments(self._at_once)
+        self._make_environments(self._batch_size)
         check_contract(policy, self._environments[0])
-        numbers = range(first, min(first + self._at_once, self.episodes))
+        numbers = range(first, min(first + self._batch_size, self.episodes))
         episodes = [
-            Playing(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
+            RunningEpisode(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
             for environment, number in zip(self._environments, numbers, strict=False)
         ]
         observation_size, action_size = policy.contract.spec[:2]
@@ -141,7 +141,7 @@ class Evaluator:
             raise
         return [episode.result() for episode in episodes]
 
-    def answer(
+    def try_batch(
         self,
         policy: Policy,
         first: int,
@@ -164,17 +164,17 @@ class Evaluator:
         """
         self._make_environments(1)
         environment = self._environments[0]
-        episode = Playing(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
+        episode = RunningEpisode(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
         with globals_seeded(self._first_seed + number):
             episode.start()
             state, start = None, np.ones(1, bool)
             while not episode.ended:
                 observation = environment.raw_observation
-                answer = policy.predict(observation, state=state, episode_start=start, deterministic=deterministic)
-                if not isinstance(answer, tuple) or len(answer) != 2:
+                prediction = policy.predict(observation, state=state, episode_start=start, deterministic=deterministic)
+                if not isinstance(prediction, tuple) or len(prediction) != 2:
                     kind = type(policy).__name__
-                    raise InputError(f"predict of a {kind} must return (action, state), not {answer!r:.40}")
-                action, state = answer
+                    raise InputError(f"predict of a {kind} must return (action, state), not {prediction!r:.40}")
+                action, state = prediction
                 episode.step(action)
                 start = np.zeros(1, bool)
         return episode.result()
@@ -210,8 +210,8 @@ def evaluate(
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> np.ndarray:
     """Return the returns [episodes] of a policy. Arguments and errors are those of `evaluate_episodes`."""
-    given = policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed
-    return np.array([episode.episode_return for episode in _played(*given)])
+    arguments = policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed
+    return np.array([episode.episode_return for episode in _evaluate(*arguments)])
 
 
 def evaluate_episodes(
@@ -246,17 +246,17 @@ def evaluate_episodes(
     if events is not None:
         check_events(events)
     events = events_of(task) if events is None else events
-    return _played(policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed, events)
+    return _evaluate(policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed, events)
 
 
-def _played(
+def _evaluate(
     policy: Any,
     deterministic: bool,
     perturbations: str | Perturbation | Iterable[str | Perturbation],
     task: Task,
-    *given: Any,
+    *arguments: Any,
 ) -> list[EvaluationEpisode]:
-    evaluator = Evaluator(task, *given)
+    evaluator = Evaluator(task, *arguments)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     check_flag("deterministic", deterministic)
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
@@ -278,11 +278,11 @@ def check_contract(policy: Policy, environment: Environment) -> None:
     Its action bounds may lie within the environment's: a policy may be restricted to part of the range.
     """
     contract, parts, name = policy.contract, environment.contract_parts, environment.task_name
-    known = (contract.observation_parts, contract.action_shape)
-    if known != parts[:2]:
+    trained = (contract.observation_parts, contract.action_shape)
+    if trained != parts[:2]:
         raise InputError(
-            f"the policy was trained on observations {_told(known[0])} and actions {known[1]}; "
-            f"{name} has {_told(parts.observation_parts)} and {parts.action_shape}: evaluate it on its own task"
+            f"the policy was trained on observations {_describe(trained[0])} and actions {trained[1]}; "
+            f"{name} has {_describe(parts.observation_parts)} and {parts.action_shape}: evaluate it on its own task"
         )
     low, high = parts.action_low.astype(np.float64), parts.action_high.astype(np.float64)  # float64: no overflow
     rounding = BOUNDS_ROUNDING * np.maximum(np.abs(low), np.abs(high))
@@ -295,5 +295,5 @@ def check_contract(policy: Policy, environment: Environment) -> None:
         )
 
 
-def _told(parts: Parts) -> str:
+def _describe(parts: Parts) -> str:
     return ", ".join(str(shape) if key is None else f"{key} {shape}" for key, shape in parts)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 IMPLAUSIBLE = 1e-4  # a p-value below this rejects the artefact
 # Files that an artefact folder may hold, and the cache that Python leaves after importing the loader.
-_KNOWN = {CONTRACT, POLICY, CARD, CURVE, "__pycache__", *FILES.values()}
+_ARTEFACT_FILES = {CONTRACT, POLICY, CARD, CURVE, "__pycache__", *FILES.values()}
 
 
 class Exported(NamedTuple):
@@ -108,19 +108,19 @@ def placed(place: Path) -> Iterator[Path]:
         _check_place(place)
         place = Path(os.path.realpath(place))  # replace the target of a symbolic link, not the link
         place.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as aside:
-            new = Path(aside, "new")
+        with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as temporary:
+            new = Path(temporary, "new")
             new.mkdir()
             yield new
             if place.exists():
-                os.rename(place, Path(aside, "old"))
+                os.rename(place, Path(temporary, "old"))
             os.rename(new, place)
 
 
 def _check_place(place: Path) -> None:
     names = {entry.name for entry in place.iterdir()} if place.exists() else set()
     fields = read_json(place / CONTRACT) if CONTRACT in names else {}
-    if names and (names - _KNOWN or not isinstance(fields, dict) or "format" not in fields):
+    if names and (names - _ARTEFACT_FILES or not isinstance(fields, dict) or "format" not in fields):
         raise InputError(f"{place} holds something else than an artefact: choose a new or an empty folder")
 
 
@@ -133,10 +133,10 @@ def provenance(runs: RunSet, run: RunDirectory, policy: Policy, which: Which) ->
     """
     manifest, config = run.manifest, run.config
     steps = manifest.steps_done if policy.step is None else policy.step
-    own = run.evaluations
-    own = own[own["step"] <= steps]
-    own = own[own["step"] == own["step"].max(initial=0)]
-    sound = list(last_evaluations(runs.sound_evaluations, points=1).values())
+    evaluations = run.evaluations
+    evaluations = evaluations[evaluations["step"] <= steps]
+    latest = evaluations[evaluations["step"] == evaluations["step"].max(initial=0)]
+    last_returns = list(last_evaluations(runs.sound_evaluations, points=1).values())
     return {
         "task": config.task,
         "environment_arguments": config.environment_arguments,
@@ -152,8 +152,8 @@ def provenance(runs: RunSet, run: RunDirectory, policy: Policy, which: Which) ->
         "versions": manifest.versions,
         "command": manifest.command,
         "created": manifest.created,
-        "evaluation": {"step": int(own["step"][0]), **summary(own["return"])} if len(own) else None,
-        "all_seeds": summary(np.array(sound)) if sound else None,
+        "evaluation": {"step": int(latest["step"][0]), **summary(latest["return"])} if len(latest) else None,
+        "all_seeds": summary(np.array(last_returns)) if last_returns else None,
     }
 
 
@@ -166,12 +166,12 @@ def _learnt_weights(run: RunDirectory, steps: int) -> dict[str, float]:
 
 def summary(returns: np.ndarray) -> dict[str, Any]:
     """Return count, mean, standard deviation and 95 % t-interval of returns; None where there are too few."""
-    over, count = mean_and_interval(returns), len(returns)
+    statistics, count = mean_and_interval(returns), len(returns)
     return {
         "count": count,
-        "mean_return": float(over.mean),
+        "mean_return": float(statistics.mean),
         "standard_deviation": float(returns.std(ddof=1)) if count > 1 else None,
-        "interval_95": [float(over.low), float(over.high)] if count >= FEWEST_FOR_INTERVAL else None,
+        "interval_95": [float(statistics.low), float(statistics.high)] if count >= FEWEST_FOR_INTERVAL else None,
     }
 
 
@@ -181,28 +181,29 @@ def _verify(
     """Return how the artefact compares with the policy: in actions and, given a task, in closed loop."""
     found, recorded = {}, None
     if task:
-        watched = _Watched(policy)
-        before = evaluate(watched, task, episodes, environment_arguments=arguments)
-        after = evaluate(artefact, task, episodes, environment_arguments=arguments)
+        recording = _RecordingPolicy(policy)
+        policy_returns = evaluate(recording, task, episodes, environment_arguments=arguments)
+        artefact_returns = evaluate(artefact, task, episodes, environment_arguments=arguments)
         if artefact.guards.fallback is None:
-            check_returns(before, after)
-        found, recorded = {"returns": summary(after), "returns_of_the_run": summary(before)}, np.array(watched.seen)
+            check_returns(policy_returns, artefact_returns)
+        found = {"returns": summary(artefact_returns), "returns_of_the_run": summary(policy_returns)}
+        recorded = np.array(recording.observations)
     compared = compare_actions(artefact, policy, recorded)
     return {**found, "observations": compared.observations, "largest_difference": compared.largest}
 
 
-class _Watched:
+class _RecordingPolicy:
     """A policy that records its flattened observations."""
 
     def __init__(self, policy: Policy) -> None:
-        self.policy, self.seen = policy, []
+        self.policy, self.observations = policy, []
 
     def predict(self, observation: Any, **options: Any) -> tuple[np.ndarray, Any]:
-        self.seen.append(self.policy.contract.flatten(observation))
+        self.observations.append(self.policy.contract.flatten(observation))
         return self.policy.predict(observation, **options)
 
 
-def check_returns(before: np.ndarray, after: np.ndarray) -> None:
+def check_returns(policy_returns: np.ndarray, artefact_returns: np.ndarray) -> None:
     """Raise InputError if Welch's t-test finds the mean returns too far apart for the same policy.
 
     Tasks are chaotic: a difference in the last bit makes episodes diverge, so that only their statistics can agree.
@@ -210,13 +211,13 @@ def check_returns(before: np.ndarray, after: np.ndarray) -> None:
     """
     from scipy import stats  # slow to import
 
-    if len(before) < 2 or not (before.std() > 0 or after.std() > 0):
+    if len(policy_returns) < 2 or not (policy_returns.std() > 0 or artefact_returns.std() > 0):
         return
-    welch: Any = stats.ttest_ind(before, after, equal_var=False)
+    welch: Any = stats.ttest_ind(policy_returns, artefact_returns, equal_var=False)
     if welch.pvalue < IMPLAUSIBLE:
         raise InputError(
-            f"in closed loop the artefact is not the policy of the run: its mean return is {after.mean():.6g}, the "
-            f"policy's {before.mean():.6g}; nothing was written"
+            f"in closed loop the artefact is not the policy of the run: its mean return is "
+            f"{artefact_returns.mean():.6g}, the policy's {policy_returns.mean():.6g}; nothing was written"
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from csac.checks import check_flag, check_whole
 from csac.deploy.choosing import has_policy, load, load_run
-from csac.evaluation.episode import EvaluationFailure, Playing
+from csac.evaluation.episode import EvaluationFailure, RunningEpisode
 from csac.evaluation.evaluator import LONGEST_EPISODE, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.sets import RunSet
@@ -69,8 +69,8 @@ def evaluate_run(
     if not chosen:
         raise InputError(f"{runs.path} holds no {which} policies: an evaluation writes them")
     policies = {run.seed: load_run(run, which) for run in chosen}
-    given = task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events
-    evaluator = Evaluator(*given, environments=runs.config.evaluation_environments or 1)
+    evaluator_arguments = task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events
+    evaluator = Evaluator(*evaluator_arguments, environments=runs.config.evaluation_environments or 1)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     with closing(Environment(task, arguments)) as environment:
         environment.perturb(evaluator.perturbed)
@@ -116,7 +116,7 @@ def play(
         environment.perturb(perturbed)
         with nullcontext() if video is None else _filming(environment, run.config.task, video) as film:
             for number in range(episodes):
-                episode = Playing(environment, number, FRESH_EVALUATION_SEED + number, longest)
+                episode = RunningEpisode(environment, number, FRESH_EVALUATION_SEED + number, longest)
                 observation = episode.start()
                 if film:
                     film.add()
@@ -137,8 +137,8 @@ def perturbation_notes(
     directory: str | Path, perturbations: str | Perturbation | Iterable[str | Perturbation]
 ) -> list[str]:
     """Return a line on the perturbations of an evaluation, or else on those that only its training had, if any."""
-    if given := constant_perturbations(perturbations):
-        return [f"perturbed: {', '.join(item.label for item in given)}"]
+    if parsed := constant_perturbations(perturbations):
+        return [f"perturbed: {', '.join(item.label for item in parsed)}"]
     trained = RunSet.open(directory).config.perturbations
     return [f"{line}: see --perturb" for line in unlike_training(trained)]
 
@@ -191,7 +191,7 @@ class _Film:
         speed = (adapter and adapter.pictures_per_second) or raw.metadata.get("render_fps") or DEFAULT_FRAMES_PER_SECOND
         self._frames_per_second, self._task, self._path = round(speed), task, path
         self._writer: Any = None
-        self._shown = 0  # frames of this episode
+        self._frames_written = 0  # in this episode
         self._last = np.zeros((0, 0, 3), np.uint8)
 
     def add(self) -> None:
@@ -207,9 +207,9 @@ class _Film:
 
     def end_episode(self) -> None:
         """Repeat the last frame until the episode lasts `SECONDS_ON_SCREEN`."""
-        while self._shown < round(SECONDS_ON_SCREEN * self._frames_per_second):
+        while self._frames_written < round(SECONDS_ON_SCREEN * self._frames_per_second):
             self._write()
-        self._shown = 0
+        self._frames_written = 0
 
     def close(self) -> None:
         if self._writer:
@@ -225,26 +225,26 @@ class _Film:
             )
             self._writer.send(None)
         self._writer.send(self._last)
-        self._shown += 1
+        self._frames_written += 1
 
 
 @contextmanager
 def _filming(environment: Environment, task: str, video: str | Path) -> Iterator[_Film]:
     """Yield a film that is written to a temporary file, and renamed to `video` once it is complete."""
     path = Path(video).absolute()  # a task may change the working directory
-    aside = path.with_name(f".{os.getpid()}.{path.name}")
-    film = _Film(environment, task, aside)
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    film = _Film(environment, task, temporary)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        aside.touch()
+        temporary.touch()
         yield film
         film.close()
-        if not aside.stat().st_size:  # ffmpeg may exit before anything is written
+        if not temporary.stat().st_size:  # ffmpeg may exit before anything is written
             raise OSError("ffmpeg failed")
-        aside.replace(path)
+        temporary.replace(path)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or 'ffmpeg failed'}; choose another place") from error
     finally:
         film.close()
         with suppress(OSError):  # renamed already, or another error is on its way
-            aside.unlink()
+            temporary.unlink()

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from csac.evaluation.evaluator import Evaluator
 
     # Policy, number of the batch's first episode, whether deterministic, perturbations by kind.
-    Work = tuple[Policy, int, bool, dict[str, float]]
+    Request = tuple[Policy, int, bool, dict[str, float]]
     OnProgress = Callable[[int, int], None]  # episodes done, episodes in total
 
-_BATCHES_THAT_PAY = 2  # per process: starting one takes as long as a short batch
-_SECONDS_BETWEEN_STOPS = 1.0
+_BATCHES_PER_PROCESS = 2  # at least: starting a process takes as long as a short batch
+_SECONDS_BETWEEN_STOP_CHECKS = 1.0
 
 Batch = tuple[int, int]  # policy index, number of the first episode
 Result = list[EvaluationEpisode] | EvaluationFailure
@@ -56,7 +56,7 @@ class Pending:
         self._evaluator, self._policies, self._deterministic = evaluator, policies, deterministic
         self._perturbed, self._on_progress = dict(evaluator.perturbed), on_progress
         self._answers: dict[Batch, Result] = {}
-        self._idle, self._waiting = list(workers), deque(evaluator.batches(len(policies)))
+        self._idle, self._queue = list(workers), deque(evaluator.batches(len(policies)))
         self._busy: dict[Child, Batch] = {}
         self._hand_out()
 
@@ -74,10 +74,10 @@ class Pending:
         while self._busy:
             if should_stop and should_stop():
                 raise EvaluationStopped
-            self._receive(_SECONDS_BETWEEN_STOPS if should_stop else None)
+            self._receive(_SECONDS_BETWEEN_STOP_CHECKS if should_stop else None)
         for batch in self._evaluator.batches(len(self._policies)):
-            if batch not in self._answers and not self._is_spared(batch):
-                self._take(batch, self._evaluator.answer(*self._work(batch), should_stop))
+            if batch not in self._answers and not self._is_skipped(batch):
+                self._store(batch, self._evaluator.try_batch(*self._request(batch), should_stop))
         return [self._result(index) for index in range(len(self._policies))]
 
     def _receive(self, seconds: float | None) -> None:
@@ -90,29 +90,29 @@ class Pending:
             except (EOFError, OSError):
                 self.notes.append(f"evaluation: {worker.cause_of_death()}; its episodes are run by this one instead")
                 continue
-            self._take(batch, answer)
+            self._store(batch, answer)
             self._idle.append(worker)
         self._hand_out()
 
     def _hand_out(self) -> None:
-        while self._waiting and self._idle:
-            batch = self._waiting.popleft()
-            if not self._is_spared(batch):
+        while self._queue and self._idle:
+            batch = self._queue.popleft()
+            if not self._is_skipped(batch):
                 worker = self._idle.pop()
-                worker.tell(self._work(batch))
+                worker.tell(self._request(batch))
                 self._busy[worker] = batch
 
-    def _take(self, batch: Batch, answer: Result) -> None:
+    def _store(self, batch: Batch, answer: Result) -> None:
         self._answers[batch] = answer
         if self._on_progress:
-            done = sum(len(given) for given in self._answers.values() if isinstance(given, list))
+            done = sum(len(result) for result in self._answers.values() if isinstance(result, list))
             self._on_progress(done, len(self._policies) * self._evaluator.episodes)
 
-    def _work(self, batch: Batch) -> Work:
+    def _request(self, batch: Batch) -> Request:
         index, first = batch
         return self._policies[index], first, self._deterministic, self._perturbed
 
-    def _is_spared(self, batch: Batch) -> bool:
+    def _is_skipped(self, batch: Batch) -> bool:
         """Whether an earlier batch of the same policy has failed."""
         failed = (other for other, answer in self._answers.items() if isinstance(answer, EvaluationFailure))
         return any(other[0] == batch[0] and other < batch for other in failed)
@@ -129,7 +129,7 @@ class Pending:
 
 def choose_processes(evaluator: Evaluator, policies: int) -> int:
     """Return how many processes are worthwhile for evaluating this many policies: at most one per core."""
-    return max(1, min(cores_to_use(), len(evaluator.batches(policies)) // _BATCHES_THAT_PAY))
+    return max(1, min(cores_to_use(), len(evaluator.batches(policies)) // _BATCHES_PER_PROCESS))
 
 
 class EvaluationPool:
@@ -180,14 +180,14 @@ class EvaluationPool:
             self._workers.remove(worker)
         while len(self._workers) < processes:
             self._evaluator.close()  # workers get the evaluator without open environments
-            self._workers.append(Child(_work, self._evaluator))
+            self._workers.append(Child(_serve, self._evaluator))
 
 
-def _work(connection: Connection, evaluator: Evaluator) -> None:
+def _serve(connection: Connection, evaluator: Evaluator) -> None:
     """Run the requested batches until the parent sends None or is gone."""
     try:
-        while work := connection.recv():
-            connection.send(evaluator.answer(*work))
+        while request := connection.recv():
+            connection.send(evaluator.try_batch(*request))
     except (EOFError, OSError):
         return
     finally:

@@ -28,11 +28,11 @@ class EpisodeEvents:
 
     def of(self, info: Mapping[str, Any], length: int) -> dict[str, bool | float | None]:
         """Return the events by name after `length` steps, the last of which returned `info`; None for missing ones."""
-        said: dict[str, bool | float | None] = {name: number(info.get(name)) for name in self._names}
+        events: dict[str, bool | float | None] = {name: number(info.get(name)) for name in self._names}
         for name in self._summed:
             if name in self.sums:
-                said[name] = self.sums[name] / (length if name.endswith(":mean") else 1)
-        return said
+                events[name] = self.sums[name] / (length if name.endswith(":mean") else 1)
+        return events
 
 
 def info_name(event: str) -> str:

@@ -14,7 +14,7 @@ from csac.types import Failure
 _CSAC = f"{Path(__file__).parents[1]}{os.sep}"
 _PACKAGES = re.compile(r"\b(site|dist)-packages\b")
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[@-~]|[\x00-\x1f\x7f-\x9f]")  # a terminal's colours and controls
-_PASSED_OVER = (sysconfig.get_path("stdlib"), "<frozen")
+_SKIPPED_PATHS = (sysconfig.get_path("stdlib"), "<frozen")
 
 
 class EnvironmentFailure(Failure):
@@ -47,10 +47,10 @@ def raised(error: BaseException) -> str:
 
 def place_of(places: Sequence[tuple[str, int]]) -> str:
     """Return the innermost frame in the user's code, or else in a library, as " (file.py:12)", or an empty string."""
-    foreign = [place for place in places if _PACKAGES.search(place[0]) or not place[0].startswith(_PASSED_OVER)]
-    foreign = [place for place in foreign if not place[0].startswith(_CSAC)]
-    own = [place for place in foreign if not _PACKAGES.search(place[0])]
-    return "".join(f" ({Path(path).name}:{line})" for path, line in (own or foreign)[-1:])
+    external = [place for place in places if _PACKAGES.search(place[0]) or not place[0].startswith(_SKIPPED_PATHS)]
+    external = [place for place in external if not place[0].startswith(_CSAC)]
+    in_user_code = [place for place in external if not _PACKAGES.search(place[0])]
+    return "".join(f" ({Path(path).name}:{line})" for path, line in (in_user_code or external)[-1:])
 
 
 def one_line(error: BaseException) -> str:
@@ -63,6 +63,6 @@ def message(error: BaseException) -> str:
     """Return an error's message in one line that is safe for every file and terminal."""
     try:
         text = str(error)
-    except Exception as unsaid:
-        text = f"(its message cannot be had: {type(unsaid).__name__})"
+    except Exception as failure:
+        text = f"(its message cannot be had: {type(failure).__name__})"
     return " ".join(_ESCAPES.sub(" ", text.encode("utf-8", "backslashreplace").decode()).split())

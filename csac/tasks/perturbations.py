@@ -40,7 +40,7 @@ NOISES = ("observation_noise", "action_noise")
 KINDS = (*PHYSICS, *NOISES)
 
 _EXAMPLE = "friction=1.5@300000"
-_WRITTEN = re.compile(r"(?P<kind>[^=@]+?)\s*=(?P<value>[^=@]+)(?:@(?P<step>[^=@]+))?")
+_PATTERN = re.compile(r"(?P<kind>[^=@]+?)\s*=(?P<value>[^=@]+)(?:@(?P<step>[^=@]+))?")
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Perturbation:
     @classmethod
     def parse(cls, text: str) -> Perturbation:
         """Return the perturbation that `KIND=VALUE@STEP` or `KIND=VALUE` describes. Raise InputError if malformed."""
-        match = _WRITTEN.fullmatch(text.strip())
+        match = _PATTERN.fullmatch(text.strip())
         value, step = (_number(match[name] or "0") if match else math.nan for name in ("value", "step"))
         if match is None or math.isnan(value) or not step.is_integer():  # a step may be written as 3e5
             raise InputError(
@@ -86,8 +86,8 @@ class Perturbation:
 
 def unlike_training(trained: Iterable[str | Perturbation]) -> list[str]:
     """Return a line saying that an unperturbed test differs from its perturbed training; [] if that was unperturbed."""
-    told = ", ".join(map(str, perturbations_of(trained)))
-    return [f"not perturbed, unlike its training ({told})"] if told else []
+    listed = ", ".join(map(str, perturbations_of(trained)))
+    return [f"not perturbed, unlike its training ({listed})"] if listed else []
 
 
 def perturbations_of(given: str | Perturbation | Iterable[str | Perturbation]) -> tuple[Perturbation, ...]:
@@ -192,7 +192,7 @@ class Physics:
         wanted = {**dict.fromkeys(PHYSICS, 1.0), **factors}
         changed = {kind: factor for kind, factor in wanted.items() if factor != self._factors[kind]}
         if "gain" in changed:
-            self._refuse_curved_actuators()
+            self._refuse_nonlinear_actuators()
         for kind, factor in changed.items():
             for name in _SCALED[kind]:
                 attrgetter(name)(self._model)[...] = attrgetter(name)(self._original) * factor
@@ -221,11 +221,11 @@ class Physics:
         ratio = model.dof_M0.mean() / original.dof_M0.mean() if model.nv else 1.0
         model.stat.meaninertia = original.stat.meaninertia * ratio
 
-    def _refuse_curved_actuators(self) -> None:
+    def _refuse_nonlinear_actuators(self) -> None:
         gains, biases = self._mujoco.mjtGain, self._mujoco.mjtBias
-        straight = np.isin(self._model.actuator_gaintype, [int(gains.mjGAIN_FIXED), int(gains.mjGAIN_AFFINE)])
-        straight &= np.isin(self._model.actuator_biastype, [int(biases.mjBIAS_NONE), int(biases.mjBIAS_AFFINE)])
-        if not straight.all():
+        is_linear = np.isin(self._model.actuator_gaintype, [int(gains.mjGAIN_FIXED), int(gains.mjGAIN_AFFINE)])
+        is_linear &= np.isin(self._model.actuator_biastype, [int(biases.mjBIAS_NONE), int(biases.mjBIAS_AFFINE)])
+        if not is_linear.all():
             raise InputError(f"{self._task_name} has actuators, such as muscles, whose gain cannot be scaled")
 
 

@@ -41,12 +41,12 @@ def seed_warning(environment: Environment) -> str | None:
     except EnvironmentFailure:
         return None
     if not np.array_equal(first, second):
-        told = "gives other observations for the same seed: runs do not repeat"
+        problem = "gives other observations for the same seed: runs do not repeat"
     elif np.array_equal(first, other):
-        told = "gives the same observation for every seed: episodes may be one"
+        problem = "gives the same observation for every seed: episodes may be one"
     else:
         return None
-    return f"{environment.task_name}: reset(seed=...) {told}"
+    return f"{environment.task_name}: reset(seed=...) {problem}"
 
 
 def limit_warning(environment: Environment, task: Task, longest: int) -> str | None:
@@ -56,10 +56,10 @@ def limit_warning(environment: Environment, task: Task, longest: int) -> str | N
         wrapper = wrapper.env
     if isinstance(wrapper, TimeLimit) or (spec and spec.max_episode_steps) or adapter_of(task):
         return None
-    how = "--env-kwargs '{\"max_episode_steps\": 1000}'" if isinstance(task, str) else "gymnasium.wrappers.TimeLimit"
+    remedy = "--env-kwargs '{\"max_episode_steps\": 1000}'" if isinstance(task, str) else "gymnasium.wrappers.TimeLimit"
     return (
         f"{environment.task_name} has no time limit: an evaluation episode that does not end by itself takes "
-        f"{longest:,} steps ({how} sets one)"
+        f"{longest:,} steps ({remedy} sets one)"
     )
 
 

@@ -155,12 +155,12 @@ def quietly() -> Iterator[None]:
     PyBullet prints from C, past Python's streams, and PyFlyt from Python, whose streams need not write to the file
     descriptors (a notebook's do not). Any other output is passed on at the end of the block.
     """
-    with _lock, _descriptor_kept(1), _descriptor_kept(2), _stream_kept("stdout"), _stream_kept("stderr"):
+    with _lock, _filter_descriptor(1), _filter_descriptor(2), _filter_stream("stdout"), _filter_stream("stderr"):
         yield
 
 
 @contextmanager
-def _descriptor_kept(descriptor: int) -> Iterator[None]:
+def _filter_descriptor(descriptor: int) -> Iterator[None]:
     """Redirect a file descriptor to a file during this block, then pass on what is not chatter."""
     _flush()
     try:
@@ -184,17 +184,17 @@ def _descriptor_kept(descriptor: int) -> Iterator[None]:
 
 
 @contextmanager
-def _stream_kept(name: str) -> Iterator[None]:
+def _filter_stream(name: str) -> Iterator[None]:
     """Replace Python's stream of this name by a buffer during this block, then pass on what is not chatter."""
-    stream, aside = getattr(sys, name), io.StringIO()
-    setattr(sys, name, aside)
+    stream, buffer = getattr(sys, name), io.StringIO()
+    setattr(sys, name, buffer)
     try:
         yield
     finally:
-        if getattr(sys, name) is aside:
+        if getattr(sys, name) is buffer:
             setattr(sys, name, stream)
         with suppress(OSError, ValueError, AttributeError):  # the reader is gone, or there is no stream
-            stream.write(_without_chatter(aside.getvalue()))
+            stream.write(_without_chatter(buffer.getvalue()))
 
 
 def _without_chatter(written: str) -> str:

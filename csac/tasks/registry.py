@@ -36,7 +36,7 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
     name = task if isinstance(task, str) else _name_of(task) or "the task"
     adapter = adapter_of(task)
     _silence_mujoco()
-    with _undisturbed(bool(adapter) or "pybullet" in sys.modules):
+    with _isolated(bool(adapter) or "pybullet" in sys.modules):
         known = registered(task) if isinstance(task, str) else task
         try:
             if isinstance(known, str):
@@ -46,7 +46,7 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
             if adapter and adapter.wrap:
                 environment = adapter.wrap(environment)
         except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
-            raise InputError(_missing(name, error, adapter)) from error
+            raise InputError(_missing_package(name, error, adapter)) from error
         except BaseException as error:
             raise_interrupt(error)
             given = f" with the arguments {arguments}" if arguments else ""
@@ -105,12 +105,12 @@ def _register_known(name: str) -> None:
         importlib.import_module(adapter.module)
     except ImportError as error:
         if name in ADAPTERS:
-            raise InputError(_missing(name, error, adapter)) from error
+            raise InputError(_missing_package(name, error, adapter)) from error
     if name in ADAPTERS and name not in gymnasium.registry:
         raise InputError(f"the {adapter.module.partition('.')[0]} that is installed has no {name}: {INSTALL}")
 
 
-def _missing(name: str, error: Exception, adapter: Adapter | None) -> str:
+def _missing_package(name: str, error: Exception, adapter: Adapter | None) -> str:
     hint = f": {INSTALL}" if adapter else ""
     return f"{name} needs a package that is not installed ({message(error)}){hint}"
 
@@ -163,7 +163,7 @@ def is_column(name: object) -> bool:
 
 
 @contextmanager
-def _undisturbed(is_pybullet: bool) -> Iterator[None]:
+def _isolated(is_pybullet: bool) -> Iterator[None]:
     """Hide Gymnasium's warnings and PyBullet's output in this block, and restore the working directory afterwards."""
     with ExitStack() as stack, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r".*WARN: ")  # such as: an id has a newer version

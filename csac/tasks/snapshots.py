@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import gymnasium
 
 # MuJoCo recomputes these in every step; their sizes depend on the current contacts.
-_MADE_ANEW = ("efc_", "iefc_", "island_", "iacc", "ifrc_", "map_")
+_RECOMPUTED = ("efc_", "iefc_", "island_", "iacc", "ifrc_", "map_")
 _KNOWN_WRAPPERS = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
 
 
@@ -76,16 +76,16 @@ def _mujoco_arrays(environment: Any) -> dict[str, np.ndarray]:
     Positions and velocities are not enough: Ant's reward reads body positions of the previous step.
     """
     data = environment.data
-    names = (name for name in dir(data) if not name.startswith(("_", *_MADE_ANEW)))
+    names = (name for name in dir(data) if not name.startswith(("_", *_RECOMPUTED)))
     arrays = ((name, getattr(data, name)) for name in names)
     return {name: array for name, array in arrays if isinstance(array, np.ndarray) and array.size}
 
 
 def _set_mujoco(environment: Any, saved: Snapshot) -> None:
     arrays = _mujoco_arrays(environment)
-    given = {name.removeprefix("mujoco."): array for name, array in saved.arrays.items()}
-    if {name: array.shape for name, array in arrays.items()} != {name: array.shape for name, array in given.items()}:
+    stored = {name.removeprefix("mujoco."): array for name, array in saved.arrays.items()}
+    if {name: array.shape for name, array in arrays.items()} != {name: array.shape for name, array in stored.items()}:
         raise ValueError("its physics has other arrays: MuJoCo or the task has changed")
     for name, array in arrays.items():
-        array[...] = given[name]
+        array[...] = stored[name]
     environment.data.time = saved.values["mujoco_time"]

@@ -31,13 +31,13 @@ def module_of(task: object) -> str:
 def remember(task: object) -> None:
     """Record that the user has named this task, and so its module. Do nothing if the file cannot be written."""
     module = module_of(task)
-    place = _place(module)
-    if not place:
+    location = _location(module)
+    if not location:
         return
     with suppress(OSError, RuntimeError):  # RuntimeError: the home directory is unknown
-        note = _note(module, place)
-        note.parent.mkdir(parents=True, exist_ok=True)
-        note.write_text(f"{module}\n{place}\n", encoding="utf-8", errors="replace")
+        record = _record_path(module, location)
+        record.parent.mkdir(parents=True, exist_ok=True)
+        record.write_text(f"{module}\n{location}\n", encoding="utf-8", errors="replace")
 
 
 def refuse_untrusted(task: object, run: str | Path, trust_task: bool = False) -> None:
@@ -52,14 +52,14 @@ def refuse_untrusted(task: object, run: str | Path, trust_task: bool = False) ->
     if trust_task:
         remember(task)
         return
-    place = _place(module)
-    if not place:
+    location = _location(module)
+    if not location:
         raise InputError(f"{run} needs the module {module}, which is not found here: begin where it is, or install it")
     with suppress(OSError, RuntimeError):
-        if _note(module, place).exists():
+        if _record_path(module, location).exists():
             return
     raise InputError(
-        f"{run} wants to run the code of the module {module} in {place}, which you have not named before: "
+        f"{run} wants to run the code of the module {module} in {location}, which you have not named before: "
         "look at it, and if you trust it, add --trust-task (in Python: trust_task=True)"
     )
 
@@ -72,14 +72,14 @@ def named_task(config: RunConfig, run: str | Path, trust_task: bool, instead: st
     return config.task
 
 
-def _note(module: str, place: str) -> Path:
+def _record_path(module: str, location: str) -> Path:
     """Return the path of the file that records this module at this location."""
     state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    name = hashlib.sha256(f"{module}\n{place}".encode(errors="surrogatepass")).hexdigest()[:32]
+    name = hashlib.sha256(f"{module}\n{location}".encode(errors="surrogatepass")).hexdigest()[:32]
     return state / "csac" / "trusted_tasks" / name
 
 
-def _place(module: str) -> str:
+def _location(module: str) -> str:
     """Return the location of a module's top-level package or file, or an empty string, without importing anything."""
     first = module.partition(".")[0]
     try:
@@ -89,4 +89,4 @@ def _place(module: str) -> str:
     if spec is None:
         return ""
     places = [spec.origin] if spec.has_location and spec.origin else list(spec.submodule_search_locations or [])
-    return os.pathsep.join(os.path.realpath(place) for place in places) or spec.origin or ""
+    return os.pathsep.join(os.path.realpath(location) for location in places) or spec.origin or ""

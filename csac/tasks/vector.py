@@ -83,7 +83,7 @@ class SeedEnvironments:
             while len(self.environments) < len(self._places):
                 self.environments.append(Environment(task, environment_arguments))
             stack.pop_all()
-        self._at = dict(zip(self._places, self.environments, strict=True))
+        self._by_place = dict(zip(self._places, self.environments, strict=True))
         first = self.environments[0]
         self.spec = first.spec._replace(environments=environments)
         self.contract_parts, self.task_name = first.contract_parts, first.task_name
@@ -94,11 +94,11 @@ class SeedEnvironments:
         self._action_axes = *axes, *first.contract_parts.action_shape
         self.observations = np.zeros((*axes, self.spec.observation_size), np.float32)  # to act on next
         self._reward = np.zeros(axes, np.float32)
-        self._begun = dict.fromkeys(self._places, 0)
+        self._episodes_begun = dict.fromkeys(self._places, 0)
         self._returns = dict.fromkeys(self._places, 0.0)
         self._lengths = dict.fromkeys(self._places, 0)
         self._events = events
-        self._said = {place: EpisodeEvents(events) for place in self._places}
+        self._episode_events = {place: EpisodeEvents(events) for place in self._places}
         self._failures: list[Failure] = []
         self.refused: dict[int, str] = {}  # by seed index: why the saved episode was not restored
 
@@ -115,7 +115,7 @@ class SeedEnvironments:
         """Perturb every seed's task, as `Environment.perturb` does."""
         for place in self._running:
             try:
-                self._at[place].perturb(values)
+                self._by_place[place].perturb(values)
             except EnvironmentFailure as error:
                 self._fail(place, error)
 
@@ -128,10 +128,10 @@ class SeedEnvironments:
         episodes: list[FinishedEpisode] = []
         if self._workers:
             for place in self._running:
-                self._at[place].ask("step_environment_scale", scaled[place])
+                self._by_place[place].ask("step_environment_scale", scaled[place])
         for place in self._running:
             try:
-                step = self._at[place].step_environment_scale(scaled[place])
+                step = self._by_place[place].step_environment_scale(scaled[place])
             except EnvironmentFailure as error:
                 self._fail(place, error)
                 continue
@@ -139,10 +139,10 @@ class SeedEnvironments:
             self._returns[place] += step[1]
             self._lengths[place] += 1
             if self._events:
-                self._said[place].add(info)
+                self._episode_events[place].add(info)
             if step[2] or step[3]:
-                said = self._said[place].of(info, self._lengths[place])
-                episodes.append(FinishedEpisode(place[0], self._returns[place], self._lengths[place], said))
+                events = self._episode_events[place].of(info, self._lengths[place])
+                episodes.append(FinishedEpisode(place[0], self._returns[place], self._lengths[place], events))
                 ended.append(place)
         self.observations, self._reward = next_observation.copy(), reward
         self._reset([place for place in ended if place in self._running])
@@ -156,7 +156,7 @@ class SeedEnvironments:
     ) -> tuple[np.ndarray, np.ndarray | None] | None:
         """Return the result of `Environment.relabel`, or None if it fails, which the next `step` reports."""
         try:
-            return self._at[place].relabel(achieved, desired)
+            return self._by_place[place].relabel(achieved, desired)
         except EnvironmentFailure as error:
             self._fail(place, error)
             return None
@@ -164,14 +164,14 @@ class SeedEnvironments:
     def stop(self, index: int) -> None:
         """Stop stepping the seed with this index."""
         self.alive[index] = False
-        self._rest(index)
+        self._stop_stepping(index)
 
     def save(self, index: int) -> Snapshot:
         """Return a snapshot of the seed with this index. Unless "exact", restoring it restarts the current episodes.
 
         "problem" says why an environment that supports snapshots could not be saved.
         """
-        saved = {str(place[-1]): self._save(place) for place in self._of(index)}
+        saved = {str(place[-1]): self._save(place) for place in self._places_of(index)}
         if self.spec.environments == 1:
             return next(iter(saved.values()))
         joined, all_values = Snapshot.joined(saved), [one.values for one in saved.values()]
@@ -181,22 +181,22 @@ class SeedEnvironments:
         return joined
 
     def _save(self, place: Place) -> Snapshot:
-        inner, problem = None, ""
+        snapshot, problem = None, ""
         try:
-            inner = self._at[place].snapshot() if self.alive[place[0]] else None
+            snapshot = self._by_place[place].snapshot() if self.alive[place[0]] else None
         except EnvironmentFailure as error:
             problem = str(error)
-        arrays = {"observation": self.observations[place].copy(), **(inner.arrays if inner else {})}
+        arrays = {"observation": self.observations[place].copy(), **(snapshot.arrays if snapshot else {})}
         values = {
             "alive": bool(self.alive[place[0]]),
             "reward": float(self._reward[place]),
-            "episodes_begun": self._begun[place],
+            "episodes_begun": self._episodes_begun[place],
             "episode_return": self._returns[place],
             "episode_length": self._lengths[place],
-            **({"events": self._said[place].sums} if self._said[place].sums else {}),
-            "exact": inner is not None,
+            **({"events": self._episode_events[place].sums} if self._episode_events[place].sums else {}),
+            "exact": snapshot is not None,
             "problem": problem,
-            "environment": inner.values if inner else {},
+            "environment": snapshot.values if snapshot else {},
         }
         return Snapshot(arrays, values)
 
@@ -218,29 +218,29 @@ class SeedEnvironments:
         """
         if self.spec.environments == 1:
             return self._restore((index,), saved, saved.values["exact"])
-        parts = {place: saved.part(str(place[-1])) for place in self._of(index)}
-        gone_on = [self._restore(place, part, saved.values["exact"]) for place, part in parts.items()]
-        return all(gone_on)
+        parts = {place: saved.part(str(place[-1])) for place in self._places_of(index)}
+        are_restored = [self._restore(place, part, saved.values["exact"]) for place, part in parts.items()]
+        return all(are_restored)
 
     def _restore(self, place: Place, saved: Snapshot, is_exact: bool) -> bool:
         arrays, values = dict(saved.arrays), saved.values
-        self._begun[place] = values["episodes_begun"]
+        self._episodes_begun[place] = values["episodes_begun"]
         self.observations, self._reward = self.observations.copy(), self._reward.copy()
         self.observations[place], self._reward[place] = arrays.pop("observation"), values["reward"]
         if not values["alive"]:
             self.stop(place[0])
         elif is_exact and self._is_restored(place, Snapshot(arrays, values["environment"])):
             self._returns[place], self._lengths[place] = values["episode_return"], values["episode_length"]
-            self._said[place] = EpisodeEvents(self._events, values.get("events"))
+            self._episode_events[place] = EpisodeEvents(self._events, values.get("events"))
         else:
-            self._begun[place] -= 1
+            self._episodes_begun[place] -= 1
             self._reset([place])
             return False
         return True
 
     def begin_again(self) -> np.ndarray:
         """Restart the episodes in progress; return observations [seed, observation]."""
-        self._begun = {place: begun - 1 for place, begun in self._begun.items()}
+        self._episodes_begun = {place: begun - 1 for place, begun in self._episodes_begun.items()}
         return self.reset()
 
     @property
@@ -260,39 +260,39 @@ class SeedEnvironments:
         if self._workers:
             self._workers.close()
 
-    def _of(self, index: int) -> list[Place]:
+    def _places_of(self, index: int) -> list[Place]:
         """Return the places of the environments of the seed with this index."""
         return [place for place in self._places if place[0] == index]
 
     def _reset(self, places: Sequence[Place]) -> None:
-        seeds = [training_seed(self.seeds[place[0]], self._begun[place], *place[1:]) for place in places]
+        seeds = [training_seed(self.seeds[place[0]], self._episodes_begun[place], *place[1:]) for place in places]
         for place, seed in zip(places, seeds, strict=True):
             self._returns[place], self._lengths[place] = 0.0, 0
-            self._said[place] = EpisodeEvents(self._events)
-            self._begun[place] += 1
+            self._episode_events[place] = EpisodeEvents(self._events)
+            self._episodes_begun[place] += 1
             if self._workers:
-                self._at[place].ask("reset", seed)
+                self._by_place[place].ask("reset", seed)
         for place, seed in zip(places, seeds, strict=True):
             try:
-                self.observations[place] = self._at[place].reset(seed)
+                self.observations[place] = self._by_place[place].reset(seed)
             except EnvironmentFailure as error:
                 self._fail(place, error)
 
     def _is_restored(self, place: Place, saved: Snapshot) -> bool:
         """Restore an environment's snapshot; return whether it accepts it: the task may have changed since."""
-        seed = training_seed(self.seeds[place[0]], self._begun[place] - 1, *place[1:])
+        seed = training_seed(self.seeds[place[0]], self._episodes_begun[place] - 1, *place[1:])
         try:
-            self._at[place].restore(seed, saved)
+            self._by_place[place].restore(seed, saved)
         except EnvironmentFailure as error:
             self.refused[place[0]] = str(error)
             return False
         return True
 
-    def _rest(self, index: int) -> None:
+    def _stop_stepping(self, index: int) -> None:
         self._running = [place for place in self._running if place[0] != index]
 
     def _fail(self, place: Place, error: EnvironmentFailure) -> None:
-        self._rest(place[0])
+        self._stop_stepping(place[0])
         details = "".join(traceback.format_exception(error)) if error.__cause__ else ""
         if all(failure.seed_index != place[0] for failure in self._failures):
             self._failures.append(Failure(place[0], str(error), details))

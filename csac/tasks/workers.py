@@ -26,7 +26,7 @@ STEPS_TRIED = 10
 
 
 class Workers:
-    """Worker processes with `numbers` of environments each, and a `RemoteEnvironment` for each of these.
+    """Worker processes with `counts` of environments each, and a `RemoteEnvironment` for each of these.
 
     A step returns only those entries of `info` that `events` need, if they are numbers.
     """
@@ -35,23 +35,23 @@ class Workers:
         self,
         task: Task,
         environment_arguments: dict[str, Any] | None,
-        numbers: list[int],
+        counts: list[int],
         seed: int,
         events: Sequence[str] = (),
     ) -> None:
         self._workers: list[Worker] = []
         try:
-            for index, number in enumerate(numbers):
-                work = _serve, task, environment_arguments, number, seed + index, events
+            for index, count in enumerate(counts):
+                work = _serve, task, environment_arguments, count, seed + index, events
                 self._workers.append(Worker(*work))
-            facts = [worker.answer() for worker in self._workers]
+            descriptions = [worker.answer() for worker in self._workers]
         except BaseException:
             self.close()
             raise
         self.environments = [
-            RemoteEnvironment(worker, i, *of_worker)
-            for worker, number, of_worker in zip(self._workers, numbers, facts, strict=True)
-            for i in range(number)
+            RemoteEnvironment(worker, i, *description)
+            for worker, count, description in zip(self._workers, counts, descriptions, strict=True)
+            for i in range(count)
         ]
 
     def close(self) -> None:
@@ -69,15 +69,15 @@ class RemoteEnvironment:
     before calling anything else. If it dies, every call raises EnvironmentFailure.
     """
 
-    def __init__(self, worker: Worker, number: int, spec: Spec, parts: ContractParts, task_name: str) -> None:
+    def __init__(self, worker: Worker, index: int, spec: Spec, parts: ContractParts, task_name: str) -> None:
         self.spec, self.contract_parts, self.task_name = spec, parts, task_name
-        self._worker, self._number, self._is_asked = worker, number, False
+        self._worker, self._index, self._is_pending = worker, index, False
 
     def ask(self, method: str, *arguments: Any) -> None:
         """Start a call in the worker; the next call of the method returns its result."""
         with suppress(OSError):  # the process is dead: `answer` reports it
-            self._worker.tell((self._number, method, arguments))
-        self._is_asked = True
+            self._worker.tell((self._index, method, arguments))
+        self._is_pending = True
 
     def __getattr__(self, method: str) -> Callable[..., Any]:
         """Return a method of the environment, to be run in the worker."""
@@ -87,9 +87,9 @@ class RemoteEnvironment:
         """Do nothing: `Workers.close` closes all environments."""
 
     def _answer(self, method: str, *arguments: Any) -> Any:
-        if not self._is_asked:
+        if not self._is_pending:
             self.ask(method, *arguments)
-        self._is_asked = False
+        self._is_pending = False
         return self._worker.answer()
 
 
@@ -111,7 +111,7 @@ def _serve(
     connection: Connection,
     task: Task,
     environment_arguments: dict[str, Any] | None,
-    number: int,
+    count: int,
     seed: int,
     events: Sequence[str],
 ) -> None:
@@ -122,15 +122,15 @@ def _serve(
     with ExitStack() as stack, suppress(EOFError, OSError):
 
         def make() -> tuple[Any, ...]:
-            for _ in range(number):
+            for _ in range(count):
                 environments.append(Environment(task, environment_arguments))
                 stack.callback(environments[-1].close)
             return environments[0].spec, environments[0].contract_parts, environments[0].task_name
 
         connection.send(_outcome(names, make))
-        while asked := connection.recv():
-            place, method, arguments = asked
-            connection.send(_outcome(names, getattr(environments[place], method), *arguments))
+        while request := connection.recv():
+            index, method, arguments = request
+            connection.send(_outcome(names, getattr(environments[index], method), *arguments))
 
 
 def _outcome(names: set[str], function: Any, *arguments: Any) -> tuple[Any, Exception | None, str]:
@@ -138,8 +138,8 @@ def _outcome(names: set[str], function: Any, *arguments: Any) -> tuple[Any, Exce
     try:
         result = function(*arguments)
         if function.__name__ == "step_environment_scale":
-            told = {name: result[-1][name] for name in names & result[-1].keys()}
-            result = (*result[:-1], numbers_in(told))  # `info` may hold objects that cannot be pickled
+            wanted = {name: result[-1][name] for name in names & result[-1].keys()}
+            result = (*result[:-1], numbers_in(wanted))  # `info` may hold objects that cannot be pickled
         return result, None, ""
     except Exception as error:
         return None, error, "".join(traceback.format_exception(error)) if error.__cause__ else ""
