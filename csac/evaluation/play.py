@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from csac.evaluation.episode import EvaluationEpisode
     from csac.evaluation.pool import OnProgress
     from csac.record.run import Which
-    from csac.tasks.failures import message
-from csac.tasks.perturbations import Perturbation
+    from csac.tasks.perturbations import Perturbation
 
 DEFAULT_FRAMES_PER_SECOND = 30
 SECONDS_ON_SCREEN = 1.0  # minimum duration of an episode in a video: its last frame is repeated to fill it
