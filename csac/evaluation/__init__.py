@@ -1,1 +1,1 @@
-"""How good it is: policies on episodes of their own, in this process or several, and for the eye. No JAX."""
+"""Evaluate policies in separate environments, in one or several processes; play, film and export them. No JAX."""

@@ -1,4 +1,4 @@
-"""One evaluation episode: its return, and what its last step says of it."""
+"""One evaluation episode: run it, and record its return, length, success and events."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 class EvaluationFailure(Failure):
-    """An evaluation environment raised, or gave what is not finite. The message names the episode and is one line."""
+    """An evaluation environment raised or returned a non-finite value. The one-line message names the episode."""
 
 
 class EvaluationEpisode(NamedTuple):
-    """One evaluation episode; `success` is the task's own verdict (1 or 0), or None where it gives none.
+    """One evaluation episode; `success` is 1 or 0 as reported by the task, or None if it reports nothing.
 
-    `events` are what `info` holds under the names asked for (`csac.tasks.events`): a bool, a number, or None where it
-    holds neither.
+    `events` maps each requested name to its value in `info` (`csac.tasks.events`): a bool, a number, or None if it
+    is neither.
     """
 
     episode: int
@@ -36,7 +36,7 @@ class EvaluationEpisode(NamedTuple):
     events: Mapping[str, float | None] = MappingProxyType({})
 
     def row(self, seed: int, step: int) -> dict[str, Any]:
-        """Return the row of evaluations.csv that says this of a seed's policy of that step."""
+        """Return this episode's row of evaluations.csv; `step` is the training step of the seed's policy."""
         return {
             "seed": seed,
             "step": step,
@@ -48,8 +48,8 @@ class EvaluationEpisode(NamedTuple):
         }
 
 
-class Playing:
-    """One episode on its way. `generator` is what stochastic actions are drawn from."""
+class RunningEpisode:
+    """An evaluation episode in progress. Stochastic actions are drawn from `generator`."""
 
     def __init__(
         self, environment: Environment, number: int, seed: int, limit: int, events: Sequence[str] = ()
@@ -62,14 +62,14 @@ class Playing:
         self._events = EpisodeEvents(events)
 
     def start(self) -> np.ndarray:
-        """Reset the environment and return the first observation. Raises EvaluationFailure."""
+        """Reset the environment and return the first observation. Raise EvaluationFailure if it fails."""
         try:
             return self.environment.reset(self._seed)
         except EnvironmentFailure as error:
             raise self._failure(error) from error
 
     def step(self, action: np.ndarray) -> np.ndarray:
-        """Apply an action on the environment's scale and return the observation. Raises EvaluationFailure."""
+        """Apply an action on the environment's scale; return the observation. Raise EvaluationFailure if it fails."""
         try:
             observation, reward, terminated, truncated, self.last_info = self.environment.step_environment_scale(action)
         except EnvironmentFailure as error:
@@ -81,33 +81,33 @@ class Playing:
         return observation
 
     def result(self) -> EvaluationEpisode:
-        """Return what there is to say of the episode."""
-        said = self._events.of(self.last_info, self.length)
-        return EvaluationEpisode(self.number, self._return, self.length, _success(self.last_info), said)
+        """Return the record of the finished episode."""
+        events = self._events.of(self.last_info, self.length)
+        return EvaluationEpisode(self.number, self._return, self.length, _success(self.last_info), events)
 
     def _failure(self, error: EnvironmentFailure) -> EvaluationFailure:
         place = f"evaluation episode {self.number}, reset with seed {self._seed}, at step {self.length}"
         return EvaluationFailure(f"{place}: {error}")
 
 
-def start(episodes: Sequence[Playing], rows: np.ndarray, ignores_seed: bool | None) -> bool | None:
-    """Put the first observations of new episodes into rows [episode, observation]; return whether seeds change nothing.
+def start(episodes: Sequence[RunningEpisode], rows: np.ndarray, ignores_seed: bool | None) -> bool | None:
+    """Reset each episode's environment and write its first observation into rows [episode, observation].
 
-    None where one episode cannot tell. If so, episode j begins as the j-th of its environment, which is to be new: a
-    generator that no seed reaches, made in a constructor, would give the same episode again and again.
+    Return whether the task's resets ignore their seed, None if a single episode cannot show it. If they do, episode j
+    is the j-th of its environment, which must be new: with a generator that the constructor seeds, all would be alike.
     """
     for row, episode in zip(rows, episodes, strict=True):
         row[:] = episode.start()
-    is_told = ignores_seed is not None or len(episodes) < 2
-    ignores_seed = ignores_seed if is_told else bool((rows == rows[0]).all())
+    is_known = ignores_seed is not None or len(episodes) < 2
+    ignores_seed = ignores_seed if is_known else bool((rows == rows[0]).all())
     if ignores_seed:
         for row, episode in zip(rows, episodes, strict=True):
             for _ in range(episode.number):
                 row[:] = episode.start()
-    return ignores_seed if is_told else ignores_seed and not (rows == rows[0]).all()  # else all begin alike
+    return ignores_seed if is_known else ignores_seed and not (rows == rows[0]).all()  # still alike: deterministic
 
 
 def _success(info: dict[str, Any]) -> float | None:
-    """Return 1 or 0 for what a task says of its success, and None where it is silent or says nothing that counts."""
+    """Return 1 or 0 for the success that `info` reports, or None if it reports none or no number."""
     verdicts = (numbers(info.get(name)) for name in ("is_success", "success"))
     return next((float(verdict.all()) for verdict in verdicts if verdict is not None), None)

@@ -1,4 +1,4 @@
-"""Returns of a policy, per episode, in environments of its own."""
+"""Evaluate a policy episode by episode in separate environments."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from csac.checks import check_flag, check_whole
 from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy
-from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, Playing, start
+from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, RunningEpisode, start
 from csac.evaluation.pool import EvaluationStopped, Pending
 from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from csac.tasks.spaces import Parts
 
 
-EPISODES_AT_ONCE = 10  # rows of every batch that the policy sees: rounding depends on its shape
-LONGEST_EPISODE = 100_000  # steps; a task that never ends would never let training go on
+EPISODES_AT_ONCE = 10  # rows of every observation batch: fixed, since rounding depends on the batch shape
+LONGEST_EPISODE = 100_000  # steps; otherwise a task whose episodes never end would block training
 
 _SEED_LIMIT = 2**32
 
@@ -38,13 +38,13 @@ _SEED_LIMIT = 2**32
 class Evaluator:
     """Evaluates policies on a task, always on the same `episodes`: episode j is reset with `first_seed + j`.
 
-    Episodes run side by side in batches of one fixed shape, so that an episode's numbers depend neither on when the
-    others end nor on how many there are. The environments are made at the first batch and kept, but for tasks whose
-    resets do not forget what was before: they are made anew for each batch. `perturbed` is what `perturb` was
-    last given.
+    Episodes run in parallel in batches of one fixed shape, so that an episode's result depends neither on when the
+    others end nor on how many there are. The environments are created at the first batch and reused, except for tasks
+    whose resets leave state behind or ignore their seed: those get new environments for each batch. `perturbed` is the
+    latest argument of `perturb`.
 
-    So many `environments` are stepped side by side, ten at most, and no number depends on it; or the one that is `lent`
-    is, and stays open. `events` are what to keep of each episode's `info` (`csac.tasks.events`).
+    `environments`, at most ten, are stepped in parallel; their number does not change the results. Alternatively the
+    environment `lent` is used and left open. `events` names what to record from `info` (`csac.tasks.events`).
     """
 
     def __init__(
@@ -61,43 +61,44 @@ class Evaluator:
         check_whole("first_seed", first_seed, 0, _SEED_LIMIT - episodes)
         self._task, self._environment_arguments = task, environment_arguments
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
-        self._lent, self._at_once = lent, min(environments, EPISODES_AT_ONCE, episodes)
+        self._lent, self._batch_size = lent, min(environments, EPISODES_AT_ONCE, episodes)
         self._environments = [lent] if lent else []
         self._ignores_seed: bool | None = None  # None before the first batch
         self.perturbed: dict[str, float] = {}
 
     def perturb(self, values: Mapping[str, float]) -> None:
-        """Change the task from the next batch on, as `Environment.perturb`; what the task cannot be, a batch refuses.
+        """Perturb the task from the next batch on, as `Environment.perturb` does.
 
-        Raises InputError where environments that are there refuse it; then so does each batch, until it is changed.
+        Raise InputError if the task does not support it: here if environments are open, otherwise in the next batch.
+        Each batch raises it again until the perturbation is changed.
         """
         self.perturbed = dict(values)
         try:
             for environment in self._environments:
                 environment.perturb(values)
         except InputError:
-            self.close()  # those that are left as they were would be run as if they were perturbed
+            self.close()  # the remaining ones are not perturbed and must not be used as if they were
             raise
 
     def begin(
         self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
     ) -> Pending:
-        """Return the evaluation of these policies, which `Pending.results` runs."""
+        """Return a pending evaluation of these policies; `Pending.results` runs it."""
         return Pending(self, policies, deterministic, on_progress)
 
     def run(self, policy: Policy, deterministic: bool = True) -> list[EvaluationEpisode]:
-        """Return the episodes in order; stochastic actions are drawn by the episode's seed, never as the task draws.
+        """Return the episodes in order; the episode's seed determines stochastic actions, in a stream of their own.
 
         Raises:
-            InputError: the policy was trained on other observations or actions, or the task cannot be made.
-            EvaluationFailure: an environment raised, or gave what is not a finite number.
+            InputError: the policy was trained on other observations or actions, or the task cannot be created.
+            EvaluationFailure: an environment raised or returned a non-finite value.
         """
         batches = (self.run_batch(policy, first, deterministic) for _, first in self.batches(1))
         return [episode for batch in batches for episode in batch]
 
     def batches(self, policies: int) -> list[Batch]:
-        """Return (which policy, number of its first episode) of every batch, in order."""
-        return [(index, first) for index in range(policies) for first in range(0, self.episodes, self._at_once)]
+        """Return (policy index, number of the first episode) of every batch, in order."""
+        return [(index, first) for index in range(policies) for first in range(0, self.episodes, self._batch_size)]
 
     def run_batch(
         self,
@@ -106,16 +107,16 @@ class Evaluator:
         deterministic: bool = True,
         should_stop: Callable[[], bool] | None = None,
     ) -> list[EvaluationEpisode]:
-        """Return the episodes of the batch that begins with number `first`, played side by side to their ends.
+        """Run the batch that starts with episode number `first` to the end, in parallel, and return its episodes.
 
-        Raises InputError and EvaluationFailure as `run`, EvaluationStopped where `should_stop`, asked before each step,
-        says so.
+        Raise InputError and EvaluationFailure as `run` does, and EvaluationStopped if `should_stop`, called before each
+        step, returns True.
         """
-        self._make_environments(self._at_once)
+        self._make_environments(self._batch_size)
         check_contract(policy, self._environments[0])
-        numbers = range(first, min(first + self._at_once, self.episodes))
+        numbers = range(first, min(first + self._batch_size, self.episodes))
         episodes = [
-            Playing(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
+            RunningEpisode(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
             for environment, number in zip(self._environments, numbers, strict=False)
         ]
         observation_size, action_size = policy.contract.spec[:2]
@@ -136,11 +137,11 @@ class Evaluator:
                         observations[row] = episode.step(actions[row])
                     running = [(row, episode) for row, episode in running if not episode.ended]
         except EvaluationFailure:
-            self.close()  # what has raised may be broken for good, and the next policy is to fail by itself alone
+            self.close()  # an environment that raised may stay broken, and must not make the next policy fail too
             raise
         return [episode.result() for episode in episodes]
 
-    def answer(
+    def try_batch(
         self,
         policy: Policy,
         first: int,
@@ -148,38 +149,38 @@ class Evaluator:
         perturbed: dict[str, float],
         should_stop: Callable[[], bool] | None = None,
     ) -> Result:
-        """Return the episodes of a batch on the task perturbed so, or its failure. Raises EvaluationStopped."""
+        """Return a batch's episodes on the perturbed task, or its failure. Raise EvaluationStopped."""
         try:
             if perturbed != self.perturbed:
                 self.perturb(perturbed)
             return self.run_batch(policy, first, deterministic, should_stop)
-        except (EvaluationFailure, InputError) as error:  # the latter: the task cannot be made once more
+        except (EvaluationFailure, InputError) as error:  # InputError: the task can no longer be created
             return EvaluationFailure(str(error))
 
     def play(self, policy: Any, number: int, deterministic: bool) -> EvaluationEpisode:
-        """Return an episode that a policy with Stable-Baselines3's `predict` plays, on the task's raw observations.
+        """Run an episode with a policy that has Stable-Baselines3's `predict`, on the task's raw observations.
 
-        Raises InputError and EvaluationFailure as `run`.
+        Raise InputError and EvaluationFailure as `run` does.
         """
         self._make_environments(1)
         environment = self._environments[0]
-        episode = Playing(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
+        episode = RunningEpisode(environment, number, self._first_seed + number, LONGEST_EPISODE, self._events)
         with globals_seeded(self._first_seed + number):
             episode.start()
             state, start = None, np.ones(1, bool)
             while not episode.ended:
                 observation = environment.raw_observation
-                answer = policy.predict(observation, state=state, episode_start=start, deterministic=deterministic)
-                if not isinstance(answer, tuple) or len(answer) != 2:
+                prediction = policy.predict(observation, state=state, episode_start=start, deterministic=deterministic)
+                if not isinstance(prediction, tuple) or len(prediction) != 2:
                     kind = type(policy).__name__
-                    raise InputError(f"predict of a {kind} must return (action, state), not {answer!r:.40}")
-                action, state = answer
+                    raise InputError(f"predict of a {kind} must return (action, state), not {prediction!r:.40}")
+                action, state = prediction
                 episode.step(action)
                 start = np.zeros(1, bool)
         return episode.result()
 
     def close(self) -> None:
-        """Close the environments, but for one that is lent; another batch makes new ones."""
+        """Close the environments, except a lent one; the next batch creates new ones."""
         if self._lent:
             return
         for environment in self._environments:
@@ -208,9 +209,9 @@ def evaluate(
     environment_arguments: dict[str, Any] | None = None,
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> np.ndarray:
-    """Return the returns [episodes] of a policy. `evaluate_episodes` explains the arguments and what is raised."""
-    given = policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed
-    return np.array([episode.episode_return for episode in _played(*given)])
+    """Return the returns [episodes] of a policy. Arguments and errors are those of `evaluate_episodes`."""
+    arguments = policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed
+    return np.array([episode.episode_return for episode in _evaluate(*arguments)])
 
 
 def evaluate_episodes(
@@ -223,40 +224,39 @@ def evaluate_episodes(
     events: Sequence[str] | None = None,
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> list[EvaluationEpisode]:
-    """Return the episodes that a policy plays, each with its return, length, success and events.
+    """Evaluate a policy and return its episodes, each with return, length, success and events.
 
     Args:
-        policy: a csac `Policy`, or any object whose `predict` has Stable-Baselines3's shape: that one is given the
-            task's raw observations one at a time and answers on the task's own action scale.
-        task: as `train`'s.
-        episodes: how many.
-        first_seed: what the first is reset with; the next ones with `first_seed + 1`, ...
-        deterministic: whether the policy takes its most likely action, or draws one.
+        policy: a csac `Policy`, or any object with Stable-Baselines3's `predict`, which gets the task's raw
+            observations one at a time and returns actions on the task's own scale.
+        task: as in `train`.
+        episodes: number of episodes.
+        first_seed: reset seed of the first episode; the next ones use `first_seed + 1`, ...
+        deterministic: whether the policy takes its most likely action or samples one.
         environment_arguments: keyword arguments for the environment.
-        events: names in the `info` of an episode's last step; None for those that a known task has by itself.
-        perturbations: what changes the task for all of every episode, such as `("friction=2",)`.
+        events: names in the `info` of an episode's last step; None for the default events of a known task.
+        perturbations: changes of the task that hold for whole episodes, such as `("friction=2",)`.
 
-    A policy that was trained on another task, or another version of it, is warned of where its observations and actions
-    fit all the same.
+    Warn if the policy was trained on another task, or another version of it, with the same observations and actions.
 
     Raises:
-        InputError: as `Evaluator`, a policy without `predict`, or perturbations that the task cannot have.
+        InputError: as `Evaluator.run`, invalid arguments, or perturbations that the task does not support.
         EvaluationFailure: as `Evaluator.run`.
     """
     if events is not None:
         check_events(events)
     events = events_of(task) if events is None else events
-    return _played(policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed, events)
+    return _evaluate(policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed, events)
 
 
-def _played(
+def _evaluate(
     policy: Any,
     deterministic: bool,
     perturbations: str | Perturbation | Iterable[str | Perturbation],
     task: Task,
-    *given: Any,
+    *arguments: Any,
 ) -> list[EvaluationEpisode]:
-    evaluator = Evaluator(task, *given)
+    evaluator = Evaluator(task, *arguments)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     check_flag("deterministic", deterministic)
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
@@ -266,25 +266,25 @@ def _played(
             return [evaluator.play(policy, number, deterministic) for number in range(evaluator.episodes)]
         episodes = evaluator.run(policy, deterministic)
     one, other = (name.rpartition(":")[2] if isinstance(name, str) else "" for name in (policy.contract.task, task))
-    if one != other and one and other and not one.isidentifier():  # what a Python function is called says nothing
+    if one != other and one and other and not one.isidentifier():  # the name of a Python function identifies no task
         text = f"the policy was trained on {one} and is evaluated on {other}: their returns cannot be compared"
         warnings.warn(text, stacklevel=3)
     return episodes
 
 
 def check_contract(policy: Policy, environment: Environment) -> None:
-    """Raise InputError where a policy was trained on other observations or actions than a task has now.
+    """Raise InputError if a policy was trained with other observations or actions than the environment has.
 
-    A policy whose actions are within the task's bounds is none of another task: it may keep away from them.
+    Its action bounds may lie within the environment's: a policy may be restricted to part of the range.
     """
     contract, parts, name = policy.contract, environment.contract_parts, environment.task_name
-    known = (contract.observation_parts, contract.action_shape)
-    if known != parts[:2]:
+    trained = (contract.observation_parts, contract.action_shape)
+    if trained != parts[:2]:
         raise InputError(
-            f"the policy was trained on observations {_told(known[0])} and actions {known[1]}; "
-            f"{name} has {_told(parts.observation_parts)} and {parts.action_shape}: evaluate it on its own task"
+            f"the policy was trained on observations {_describe(trained[0])} and actions {trained[1]}; "
+            f"{name} has {_describe(parts.observation_parts)} and {parts.action_shape}: evaluate it on its own task"
         )
-    low, high = parts.action_low.astype(np.float64), parts.action_high.astype(np.float64)  # the widest may not overflow
+    low, high = parts.action_low.astype(np.float64), parts.action_high.astype(np.float64)  # float64: no overflow
     rounding = BOUNDS_ROUNDING * np.maximum(np.abs(low), np.abs(high))
     is_outside = (contract.action_low < low - rounding) | (contract.action_high > high + rounding)
     if is_outside.any():
@@ -295,5 +295,5 @@ def check_contract(policy: Policy, environment: Environment) -> None:
         )
 
 
-def _told(parts: Parts) -> str:
+def _describe(parts: Parts) -> str:
     return ", ".join(str(shape) if key is None else f"{key} {shape}" for key, shape in parts)

@@ -1,4 +1,4 @@
-"""Export a run's policy: write it as an artefact, verify that beside the policy, and only then put it in place."""
+"""Export a run's policy: write an artefact, verify it against the policy, then move it into place."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from csac.deploy.policy import Policy
     from csac.tasks.registry import Task
 
-IMPLAUSIBLE = 1e-4  # a chance so small is none
-# What an artefact's folder holds, with what Python leaves where the loader was imported.
-_KNOWN = {CONTRACT, POLICY, CARD, CURVE, "__pycache__", *FILES.values()}
+IMPLAUSIBLE = 1e-4  # a p-value below this rejects the artefact
+# Files that an artefact folder may hold, and the cache that Python leaves after importing the loader.
+_ARTEFACT_FILES = {CONTRACT, POLICY, CARD, CURVE, "__pycache__", *FILES.values()}
 
 
 class Exported(NamedTuple):
-    """An artefact in its place, the fields of its contract, and what its user should know, a line each."""
+    """The exported artefact's folder, the fields of its contract, and notes for the user, one line each."""
 
     place: Path
     fields: dict[str, Any]
@@ -61,16 +61,16 @@ def export_run(
 ) -> Exported:
     """Export a run's policy into a folder and verify it.
 
-    `seed` and `which` choose its policy as in `csac.load`, `fallback` and `rate_limit` are guards as in `make_guards`,
+    `seed` and `which` choose the policy as in `csac.load`, `fallback` and `rate_limit` are guards as in `make_guards`,
     and `format` is numpy, onnx or c. The folder is `place`, by default `export/<format>` in the run; `card` adds a
-    model card. `episodes` of `csac evaluate`'s verify it: 0 plays none, and the task is not made. `task` makes the
-    environment of a run whose task was made by a Python function; `trust_task` lets the task import a module that the
-    user has never named here.
+    model card. The artefact is verified in closed loop on the first `episodes` of `csac evaluate`; 0 skips this and
+    does not create the task. `task` creates the environment of a run whose task was a Python function; `trust_task`
+    allows importing the task's module even if the user has never named it on this machine.
 
     Raises:
-        InputError: arguments that cannot be used, a run, seed or task that is not there, or an artefact that is not the
-            policy; then nothing of it is left.
-        EvaluationFailure: an environment raised, or gave what is not finite.
+        InputError: invalid arguments, a missing run, seed or task, or an artefact that does not act like the policy
+            (then it is removed).
+        EvaluationFailure: an environment raised or returned a non-finite value.
     """
     if format not in get_args(Format):
         raise InputError(f"format {format!r}: choose {', '.join(get_args(Format))}")
@@ -103,40 +103,40 @@ def export_run(
 
 @contextmanager
 def placed(place: Path) -> Iterator[Path]:
-    """Yield a new folder that replaces `place` at the end, or is removed if something is raised."""
+    """Yield a new folder that replaces `place` on exit, or is removed on an exception."""
     with writing(place):
         _check_place(place)
-        place = Path(os.path.realpath(place))  # a link stays one
+        place = Path(os.path.realpath(place))  # replace the target of a symbolic link, not the link
         place.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as aside:
-            new = Path(aside, "new")
+        with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as temporary:
+            new = Path(temporary, "new")
             new.mkdir()
             yield new
             if place.exists():
-                os.rename(place, Path(aside, "old"))
+                os.rename(place, Path(temporary, "old"))
             os.rename(new, place)
 
 
 def _check_place(place: Path) -> None:
     names = {entry.name for entry in place.iterdir()} if place.exists() else set()
     fields = read_json(place / CONTRACT) if CONTRACT in names else {}
-    if names and (names - _KNOWN or not isinstance(fields, dict) or "format" not in fields):
+    if names and (names - _ARTEFACT_FILES or not isinstance(fields, dict) or "format" not in fields):
         raise InputError(f"{place} holds something else than an artefact: choose a new or an empty folder")
 
 
 def provenance(runs: RunSet, run: RunDirectory, policy: Policy, which: Which) -> dict[str, Any]:
-    """Return where a policy comes from and how good it was in training, for its artefact's contract.
+    """Return the origin of a policy and its performance in training, for the artefact's contract.
 
-    `evaluation` is the run's newest evaluation up to the policy, which is `steps` old, and its interval is over
-    episodes. `all_seeds` is over the last evaluations of the seeds that did not fail. `learnt_weights` are the last
-    ones in metrics.csv of the weights that the hyperparameters leave to be learnt.
+    `steps` is the policy's training step. `evaluation` summarises the episodes of the run's latest evaluation up to
+    it, `all_seeds` the last evaluations of all seeds that did not fail. `learnt_weights` are the latest values in
+    metrics.csv of the weights whose hyperparameter is "auto".
     """
     manifest, config = run.manifest, run.config
     steps = manifest.steps_done if policy.step is None else policy.step
-    own = run.evaluations
-    own = own[own["step"] <= steps]
-    own = own[own["step"] == own["step"].max(initial=0)]
-    sound = list(last_evaluations(runs.sound_evaluations, points=1).values())
+    evaluations = run.evaluations
+    evaluations = evaluations[evaluations["step"] <= steps]
+    latest = evaluations[evaluations["step"] == evaluations["step"].max(initial=0)]
+    last_returns = list(last_evaluations(runs.sound_evaluations, points=1).values())
     return {
         "task": config.task,
         "environment_arguments": config.environment_arguments,
@@ -152,8 +152,8 @@ def provenance(runs: RunSet, run: RunDirectory, policy: Policy, which: Which) ->
         "versions": manifest.versions,
         "command": manifest.command,
         "created": manifest.created,
-        "evaluation": {"step": int(own["step"][0]), **summary(own["return"])} if len(own) else None,
-        "all_seeds": summary(np.array(sound)) if sound else None,
+        "evaluation": {"step": int(latest["step"][0]), **summary(latest["return"])} if len(latest) else None,
+        "all_seeds": summary(np.array(last_returns)) if last_returns else None,
     }
 
 
@@ -165,66 +165,67 @@ def _learnt_weights(run: RunDirectory, steps: int) -> dict[str, float]:
 
 
 def summary(returns: np.ndarray) -> dict[str, Any]:
-    """Return the count of returns, their mean, standard deviation and 95 % t-interval; None if there are too few."""
-    over, count = mean_and_interval(returns), len(returns)
+    """Return count, mean, standard deviation and 95 % t-interval of returns; None where there are too few."""
+    statistics, count = mean_and_interval(returns), len(returns)
     return {
         "count": count,
-        "mean_return": float(over.mean),
+        "mean_return": float(statistics.mean),
         "standard_deviation": float(returns.std(ddof=1)) if count > 1 else None,
-        "interval_95": [float(over.low), float(over.high)] if count >= FEWEST_FOR_INTERVAL else None,
+        "interval_95": [float(statistics.low), float(statistics.high)] if count >= FEWEST_FOR_INTERVAL else None,
     }
 
 
 def _verify(
     artefact: Artefact, policy: Policy, task: Task | None, arguments: dict[str, Any], episodes: int
 ) -> dict[str, Any]:
-    """Return what is found beside the policy; without a task in no closed loop."""
+    """Return how the artefact compares with the policy: in actions and, given a task, in closed loop."""
     found, recorded = {}, None
     if task:
-        watched = _Watched(policy)
-        before = evaluate(watched, task, episodes, environment_arguments=arguments)
-        after = evaluate(artefact, task, episodes, environment_arguments=arguments)
+        recording = _RecordingPolicy(policy)
+        policy_returns = evaluate(recording, task, episodes, environment_arguments=arguments)
+        artefact_returns = evaluate(artefact, task, episodes, environment_arguments=arguments)
         if artefact.guards.fallback is None:
-            check_returns(before, after)
-        found, recorded = {"returns": summary(after), "returns_of_the_run": summary(before)}, np.array(watched.seen)
+            check_returns(policy_returns, artefact_returns)
+        found = {"returns": summary(artefact_returns), "returns_of_the_run": summary(policy_returns)}
+        recorded = np.array(recording.observations)
     compared = compare_actions(artefact, policy, recorded)
     return {**found, "observations": compared.observations, "largest_difference": compared.largest}
 
 
-class _Watched:
-    """A policy that keeps what it sees, flat."""
+class _RecordingPolicy:
+    """A policy that records its flattened observations."""
 
     def __init__(self, policy: Policy) -> None:
-        self.policy, self.seen = policy, []
+        self.policy, self.observations = policy, []
 
     def predict(self, observation: Any, **options: Any) -> tuple[np.ndarray, Any]:
-        self.seen.append(self.policy.contract.flatten(observation))
+        self.observations.append(self.policy.contract.flatten(observation))
         return self.policy.predict(observation, **options)
 
 
-def check_returns(before: np.ndarray, after: np.ndarray) -> None:
-    """Raise InputError if chance does not explain how far apart the mean returns of equal policies are.
+def check_returns(policy_returns: np.ndarray, artefact_returns: np.ndarray) -> None:
+    """Raise InputError if Welch's t-test finds the mean returns too far apart for the same policy.
 
-    Tasks are chaotic: from the last bit on, episodes go their own way, and only their statistics can agree. Episodes
-    with one and the same return say nothing: they may be one episode, played again and again.
+    Tasks are chaotic: a difference in the last bit makes episodes diverge, so that only their statistics can agree.
+    Returns that are all the same are not tested: they may come from one repeated episode.
     """
     from scipy import stats  # slow to import
 
-    if len(before) < 2 or not (before.std() > 0 or after.std() > 0):
+    if len(policy_returns) < 2 or not (policy_returns.std() > 0 or artefact_returns.std() > 0):
         return
-    welch: Any = stats.ttest_ind(before, after, equal_var=False)
+    welch: Any = stats.ttest_ind(policy_returns, artefact_returns, equal_var=False)
     if welch.pvalue < IMPLAUSIBLE:
         raise InputError(
-            f"in closed loop the artefact is not the policy of the run: its mean return is {after.mean():.6g}, the "
-            f"policy's {before.mean():.6g}; nothing was written"
+            f"in closed loop the artefact is not the policy of the run: its mean return is "
+            f"{artefact_returns.mean():.6g}, the policy's {policy_returns.mean():.6g}; nothing was written"
         )
 
 
 def control_rate(raw: Any) -> float | None:
-    """Return how many actions a Gymnasium environment takes a second, or None if it does not say.
+    """Return the actions per second of a Gymnasium environment, or None if it does not define them.
 
-    By PyFlyt's number of physics steps, 120 a second, in one of its own; else by the time step of MuJoCo's and classic
-    tasks; else by the frames per second that it is shown at.
+    They follow from PyFlyt's number of physics steps per environment step (at 120 Hz), else from `dt`, the time step
+    of MuJoCo and classic control tasks, else from the render frames per second.
     """
     if isinstance(ratio := getattr(raw.unwrapped, "env_step_ratio", None), int):
         return 120.0 / ratio

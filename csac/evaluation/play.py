@@ -1,4 +1,4 @@
-"""The policies of a finished run again, on fresh episodes: played for the eye, evaluated for the numbers."""
+"""Evaluate a run's policies on fresh episodes, or play them in a window or into a video."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from csac.checks import check_flag, check_whole
 from csac.deploy.choosing import has_policy, load, load_run
-from csac.evaluation.episode import EvaluationFailure, Playing
+from csac.evaluation.episode import EvaluationFailure, RunningEpisode
 from csac.evaluation.evaluator import LONGEST_EPISODE, Evaluator, check_contract
 from csac.evaluation.pool import EvaluationPool, choose_processes
 from csac.record.sets import RunSet
@@ -30,11 +30,10 @@ if TYPE_CHECKING:
     from csac.evaluation.episode import EvaluationEpisode
     from csac.evaluation.pool import OnProgress
     from csac.record.run import Which
-    from csac.tasks.failures import message
-from csac.tasks.perturbations import Perturbation
+    from csac.tasks.perturbations import Perturbation
 
 DEFAULT_FRAMES_PER_SECOND = 30
-SECONDS_ON_SCREEN = 1.0  # that an episode has at least: its last picture stays for as long as it takes
+SECONDS_ON_SCREEN = 1.0  # minimum duration of an episode in a video: its last frame is repeated to fill it
 
 
 def evaluate_run(
@@ -48,19 +47,19 @@ def evaluate_run(
     trust_task: bool = False,
     which: Which = "last",
 ) -> Iterator[tuple[int, list[EvaluationEpisode]]]:
-    """Yield (seed, episodes) for the last policy of each seed of a run, or of the one asked for, or for the best one.
+    """Yield (seed, episodes) for each seed of a run, or for one `seed`; `which` is the last or the best policy.
 
-    The episodes are the same for every seed, and none that training or its evaluations have seen. The task is the one
-    that the run began with, but for these `perturbations`, which last from beginning to end. The episodes are shared by
-    `processes`, by default as many as pay; 1 is this one. Whatever their number, the results are the same. What was
-    trained with `evaluation_environments=0` has one environment at a time here too.
-    `on_progress(episodes done, of how many)` is called after each batch of episodes. `trust_task` lets the task import
-    its module though nobody has named it here (`csac.tasks.trust`).
+    The episodes are the same for every seed, and occur neither in training nor in its evaluations. The task is the
+    run's unperturbed task with these `perturbations`, which hold throughout. `processes` share the episodes, by default
+    as many as are worthwhile; 1 means this process. The results do not depend on their number. A run trained with
+    `evaluation_environments=0` opens one environment at a time here too. `on_progress(episodes done, episodes in all)`
+    is called after each batch of episodes. `trust_task` allows importing the task's module even if the user has never
+    named it on this machine (`csac.tasks.trust`).
 
     Raises:
-        InputError: no run there, no such seed, a damaged file, a task that can no longer be made or perturbed so, or
-            one whose module has never been named here.
-        EvaluationFailure: an environment raised, or gave what is not finite.
+        InputError: a missing run or seed, a damaged file, a task that can no longer be created, does not support the
+            perturbations, or whose module the user has never named.
+        EvaluationFailure: an environment raised or returned a non-finite value.
     """
     check_flag("deterministic", deterministic)
     runs = _open(directory, trust_task)
@@ -69,8 +68,8 @@ def evaluate_run(
     if not chosen:
         raise InputError(f"{runs.path} holds no {which} policies: an evaluation writes them")
     policies = {run.seed: load_run(run, which) for run in chosen}
-    given = task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events
-    evaluator = Evaluator(*given, environments=runs.config.evaluation_environments or 1)
+    evaluator_arguments = task, arguments, episodes, FRESH_EVALUATION_SEED, runs.config.events
+    evaluator = Evaluator(*evaluator_arguments, environments=runs.config.evaluation_environments or 1)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     with closing(Environment(task, arguments)) as environment:
         environment.perturb(evaluator.perturbed)
@@ -96,15 +95,15 @@ def play(
     trust_task: bool = False,
     which: Which = "last",
 ) -> Iterator[EvaluationEpisode]:
-    """Yield the episodes that a run's policy plays, in a window or, with `video`, into an .mp4 file.
+    """Play a run's policy in a window or, with `video`, into an .mp4 file; yield the episodes.
 
-    Without `seed` it is the seed with the best last evaluations; `which` is as in `csac.load`. The video is there once
-    the last episode was yielded. `on_progress(steps done, of how many at most)` is called after each step. An episode
-    that reaches `LONGEST_EPISODE` steps is broken off there. `perturbations` and `trust_task` are as in `evaluate_run`.
+    The default `seed` is the one with the best last evaluations; `which` is as in `csac.load`. The video is complete
+    once the iterator is exhausted. `on_progress(steps done, steps at most)` is called after each step. An episode is
+    cut off at `LONGEST_EPISODE` steps. `perturbations` and `trust_task` are as in `evaluate_run`.
 
     Raises:
-        InputError: as `evaluate_run`, or nothing to draw with: the message says what to do.
-        EvaluationFailure: the environment raised, or gave what is not finite.
+        InputError: as `evaluate_run`, or rendering is not possible; the message says what to do.
+        EvaluationFailure: the environment raised or returned a non-finite value.
     """
     run, perturbed = _open(directory, trust_task), values_at(constant_perturbations(perturbations), 0)
     check_whole("episodes", episodes, 1, LONGEST_EPISODE)
@@ -116,7 +115,7 @@ def play(
         environment.perturb(perturbed)
         with nullcontext() if video is None else _filming(environment, run.config.task, video) as film:
             for number in range(episodes):
-                episode = Playing(environment, number, FRESH_EVALUATION_SEED + number, longest)
+                episode = RunningEpisode(environment, number, FRESH_EVALUATION_SEED + number, longest)
                 observation = episode.start()
                 if film:
                     film.add()
@@ -136,22 +135,22 @@ def play(
 def perturbation_notes(
     directory: str | Path, perturbations: str | Perturbation | Iterable[str | Perturbation]
 ) -> list[str]:
-    """Return the lines that say what is changed in a test of a run, or what was in its training and is not here."""
-    if given := constant_perturbations(perturbations):
-        return [f"perturbed: {', '.join(item.label for item in given)}"]
+    """Return a line on the perturbations of an evaluation, or else on those that only its training had, if any."""
+    if parsed := constant_perturbations(perturbations):
+        return [f"perturbed: {', '.join(item.label for item in parsed)}"]
     trained = RunSet.open(directory).config.perturbations
     return [f"{line}: see --perturb" for line in unlike_training(trained)]
 
 
 def _open(directory: str | Path, trust_task: bool) -> RunSet:
-    """Open a run whose task is to be made."""
+    """Open a run and check that its task may be created here. Raise InputError if not."""
     run = RunSet.open(directory)
     named_task(run.config, run.path, trust_task, "evaluate it in Python, with csac.load and csac.evaluate")
     return run
 
 
 def _drawn_environment(run: RunSet, video: str | Path | None) -> Environment:
-    """Return the task of a run with something to draw it with. Raises InputError where there is nothing."""
+    """Create the environment of a run for rendering. Raise InputError if it cannot be rendered."""
     task, arguments = run.config.task, run.config.environment_arguments
     has_display = not sys.platform.startswith("linux") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     if video is None and not has_display:
@@ -160,7 +159,7 @@ def _drawn_environment(run: RunSet, video: str | Path | None) -> Environment:
         raise InputError(f"the video is an .mp4 file: name it so, not {video}")
     if not has_display:
         os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is first imported
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame would complain that there is no display
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # without it, pygame complains that there is no display
     adapter = adapter_of(task)
     if adapter and video is not None:
         arguments = {**adapter.picture_arguments, **arguments}
@@ -169,8 +168,8 @@ def _drawn_environment(run: RunSet, video: str | Path | None) -> Environment:
     except InputError as error:
         raise _cannot_be_drawn(task, error) from error
     renderer = getattr(environment.raw.unwrapped, "mujoco_renderer", None)
-    if renderer and renderer.camera_id == -1:  # Gymnasium's free camera stays behind, whatever body it is to track
-        with suppress(KeyError):  # the model has no camera that follows its body
+    if renderer and renderer.camera_id == -1:  # Gymnasium's default free camera does not follow the body
+        with suppress(KeyError):  # the model has no such camera
             renderer.camera_id = renderer.model.camera("track").id
     return environment
 
@@ -183,7 +182,7 @@ def _cannot_be_drawn(task: str, error: Exception) -> InputError:
 
 
 class _Film:
-    """Pictures of an environment, written into a video."""
+    """Write rendered frames of an environment into a video."""
 
     def __init__(self, environment: Environment, task: str, path: Path) -> None:
         adapter, raw = adapter_of(task), environment.raw
@@ -191,11 +190,11 @@ class _Film:
         speed = (adapter and adapter.pictures_per_second) or raw.metadata.get("render_fps") or DEFAULT_FRAMES_PER_SECOND
         self._frames_per_second, self._task, self._path = round(speed), task, path
         self._writer: Any = None
-        self._shown = 0  # pictures of this episode
+        self._frames_written = 0  # in this episode
         self._last = np.zeros((0, 0, 3), np.uint8)
 
     def add(self) -> None:
-        """Add the present picture. Raises InputError where there is none."""
+        """Render and write a frame. Raise InputError if rendering fails."""
         try:
             pixels = np.asarray(self._picture())
         except Exception as error:
@@ -206,10 +205,10 @@ class _Film:
         self._write()
 
     def end_episode(self) -> None:
-        """Keep the last picture for as long as the episode is too short to be seen."""
-        while self._shown < round(SECONDS_ON_SCREEN * self._frames_per_second):
+        """Repeat the last frame until the episode lasts `SECONDS_ON_SCREEN`."""
+        while self._frames_written < round(SECONDS_ON_SCREEN * self._frames_per_second):
             self._write()
-        self._shown = 0
+        self._frames_written = 0
 
     def close(self) -> None:
         if self._writer:
@@ -225,26 +224,26 @@ class _Film:
             )
             self._writer.send(None)
         self._writer.send(self._last)
-        self._shown += 1
+        self._frames_written += 1
 
 
 @contextmanager
 def _filming(environment: Environment, task: str, video: str | Path) -> Iterator[_Film]:
-    """Yield what takes the pictures; a video gets its name once it is whole."""
-    path = Path(video).absolute()  # a task may change where we are
-    aside = path.with_name(f".{os.getpid()}.{path.name}")
-    film = _Film(environment, task, aside)
+    """Yield a film that is written to a temporary file, and renamed to `video` once it is complete."""
+    path = Path(video).absolute()  # a task may change the working directory
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    film = _Film(environment, task, temporary)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        aside.touch()
+        temporary.touch()
         yield film
         film.close()
-        if not aside.stat().st_size:  # it may end before anybody writes to it
+        if not temporary.stat().st_size:  # ffmpeg may exit before anything is written
             raise OSError("ffmpeg failed")
-        aside.replace(path)
+        temporary.replace(path)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or 'ffmpeg failed'}; choose another place") from error
     finally:
         film.close()
-        with suppress(OSError):  # what was raised is told
-            aside.unlink()
+        with suppress(OSError):  # renamed already, or another error is on its way
+            temporary.unlink()

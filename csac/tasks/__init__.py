@@ -1,1 +1,1 @@
-"""Where it is learnt: Gymnasium tasks in, flat arrays out, and their changes. Nothing here imports JAX."""
+"""Wrap Gymnasium tasks as environments with flat arrays; perturb, vectorise and save them. No JAX."""

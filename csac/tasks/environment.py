@@ -1,4 +1,4 @@
-"""Gymnasium in, arrays out: flat observations, actions in [-1, 1], both end flags, the true final observation."""
+"""Wrap a Gymnasium environment: flat observations, actions in [-1, 1], both end flags, true final observations."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _log = logging.getLogger(__name__)
 class Environment:
     """One Gymnasium environment with flat float32 observations and actions in [-1, 1].
 
-    A task is a Gymnasium id, `module:Id` (the module is imported first), or a callable that makes an environment. What
-    an environment raises, be it a panic of native code, is an EnvironmentFailure.
+    A task is a Gymnasium id, `module:Id` (the module is imported first), or a callable that returns an environment.
+    Whatever an environment raises, even a panic of native code, becomes an EnvironmentFailure.
     """
 
     def __init__(
@@ -51,15 +51,15 @@ class Environment:
         self._parts, self._action_shape, low, high = self.contract_parts
         self.spec = Spec(size(self._parts), math.prod(self._action_shape))
         self.bounds = ActionBounds(low, high)
-        self.raw_observation: Any = None  # the last one, as the environment gave it
+        self.raw_observation: Any = None  # the latest, as returned by the environment
         self._physics: Physics | None = None
         self._noise: Noise | None = None
         self._seed: int | None = None  # of the last reset
 
     def perturb(self, values: Mapping[str, float]) -> None:
-        """Change the task from its next step on, for good: a value for each of `perturbations.KINDS`, 1 or 0 for none.
+        """Perturb the task from its next step on, permanently. `values` are by kind (`perturbations.KINDS`).
 
-        Raises InputError where the task has no such physics.
+        A factor of 1, a noise of 0 and a missing kind mean none. Raise InputError if the task has no such physics.
         """
         physics = {kind: values[kind] for kind in PHYSICS if kind in values}
         noise = {kind: values[kind] for kind in NOISES if kind in values}
@@ -73,7 +73,7 @@ class Environment:
     def reset(self, seed: int) -> np.ndarray:
         """Start an episode and return its first observation, float32 [observation].
 
-        Raises EnvironmentFailure also where that is not finite or misshapen, or the physics of `perturb` is taken back.
+        Raise EnvironmentFailure also if it is non-finite or has a wrong shape, or if the reset undoes `perturb`.
         """
         self._seed = seed
         if self._noise:
@@ -91,14 +91,14 @@ class Environment:
             raise EnvironmentFailure(f"{error} after reset") from error.__cause__
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply an action in [-1, 1], [action]: observation [observation], reward, terminated, truncated, info."""
+        """Apply an action [action] in [-1, 1]; return observation [observation], reward, both end flags and `info`."""
         return self.step_environment_scale(self.bounds.scale(action).reshape(self._action_shape))
 
     def step_environment_scale(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply an action of the environment's own shape and scale; returns the same as `step`.
+        """Apply an action of the environment's own shape and scale; return the same as `step`.
 
-        `info` is a copy: PyFlyt gives the same dict at every step of an episode. Raises EnvironmentFailure also where
-        action, observation or reward is not finite or misshapen.
+        `info` is a copy: PyFlyt returns the same dict at every step of an episode. Raise EnvironmentFailure also if
+        action, observation or reward is non-finite or has a wrong shape.
         """
         action = part(action, self._action_shape, "action")
         if self._noise:
@@ -112,10 +112,10 @@ class Environment:
         return self._flatten(observation), scalar(reward), terminated, truncated, info
 
     def relabel(self, achieved: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return rewards [n] of flat goals [n, goal] that were achieved where others were desired.
+        """Return the rewards [n] for flat achieved and desired goals [n, goal], and whether these terminate an episode.
 
-        And whether that terminates an episode, [n] bool, where the task has `compute_terminated`; else None. Both are
-        asked for one pair at a time, with an empty info: not every task takes several.
+        The latter is [n] bool, or None if the task has no `compute_terminated`. Both are computed one pair at a time,
+        with an empty info, since not every task accepts batches.
         """
         shape = dict(self._parts)["achieved_goal"]
         pairs = [(a.reshape(shape), d.reshape(shape)) for a, d in zip(achieved, desired, strict=True)]
@@ -130,9 +130,9 @@ class Environment:
         return np.array([scalar(reward) for reward in rewards], np.float32), terminated
 
     def snapshot(self) -> Snapshot | None:
-        """Return what the episode in progress needs to go on exactly, or None where the environment cannot tell.
+        """Return the state of the episode in progress for an exact resume, or None if the environment has no snapshots.
 
-        Raises EnvironmentFailure also for what cannot be saved.
+        Raise EnvironmentFailure also if the snapshot cannot be saved.
         """
         try:
             saved = snapshots.snapshot(self.raw)
@@ -145,7 +145,7 @@ class Environment:
         return saved
 
     def restore(self, seed: int, saved: Snapshot) -> None:
-        """Go on where `saved` was taken, in an episode that was reset with `seed`."""
+        """Continue from the snapshot `saved` of an episode that was reset with `seed`."""
         self.reset(seed)
         try:
             snapshots.restore(self.raw, saved)
@@ -155,7 +155,7 @@ class Environment:
             raise failure_of("restoring its snapshot", error) from error
 
     def close(self) -> None:
-        """Close the Gymnasium environment. What that raises is logged: it takes nothing back of what was done."""
+        """Close the Gymnasium environment. Exceptions are only logged, since earlier results remain valid."""
         try:
             with self._quietly():
                 self.raw.close()
@@ -164,7 +164,7 @@ class Environment:
             _log.warning("%s: close raised %s", self.task_name, one_line(error))
 
     def _flatten(self, observation: Any) -> np.ndarray:
-        """Copy the observation, since environments may reuse their array."""
+        """Flatten an observation into a copy, since environments may reuse their array."""
         self.raw_observation = observation
         key, shape = self._parts[0]
         if key is None:
@@ -174,7 +174,7 @@ class Environment:
         return self._with_noise(flat) if self._noise else flat
 
     def _with_noise(self, flat: np.ndarray) -> np.ndarray:
-        """Return the flat observation with its noise, and let `raw_observation` be the same in the task's own shape."""
+        """Return the flat observation with noise, and set `raw_observation` to the same in the task's own structure."""
         assert self._noise
         noisy = self._noise.on_observation(flat)
         check_finite(noisy, noisy.shape, "the observation with its noise")
@@ -185,7 +185,7 @@ class Environment:
 
 
 def _check_savable(saved: Snapshot) -> None:
-    """Raise EnvironmentFailure where an environment gave what a file of arrays and JSON cannot hold."""
+    """Raise EnvironmentFailure if a snapshot cannot be stored as numeric arrays and JSON."""
     for name, array in saved.arrays.items():
         if array.dtype.kind not in "biuf":
             raise EnvironmentFailure(f"get_snapshot gave {name.removeprefix('own.')!r}, which is no array of numbers")

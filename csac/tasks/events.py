@@ -1,4 +1,4 @@
-"""What `info` says in an episode under the names that a user asked for."""
+"""Extract the events that a user requested by name from an episode's `info` dicts."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 
 class EpisodeEvents:
-    """The events of one episode: a number of its last step's `info`, or of all, as `NAME:sum` or `NAME:mean`.
+    """The events of one episode: numbers in the last step's `info`, or over all steps as `NAME:sum` or `NAME:mean`.
 
-    An episode that goes on has its `sums` so far.
+    `sums` are those of an episode in progress, for resuming it.
     """
 
     def __init__(self, names: Sequence[str], sums: Mapping[str, float] | None = None) -> None:
@@ -20,34 +20,34 @@ class EpisodeEvents:
         self.sums: dict[str, float] = dict(sums or {})
 
     def add(self, info: Mapping[str, Any]) -> None:
-        """Take the `info` of a step."""
+        """Add the `info` of a step to the sums."""
         for name in self._summed:
             value = number(info.get(name.rpartition(":")[0]))
             if value is not None:
                 self.sums[name] = self.sums.get(name, 0.0) + float(value)
 
     def of(self, info: Mapping[str, Any], length: int) -> dict[str, bool | float | None]:
-        """Return them by name after `length` steps, of which the last gave this `info`; None where it is silent."""
-        said: dict[str, bool | float | None] = {name: number(info.get(name)) for name in self._names}
+        """Return the events by name after `length` steps, the last of which returned `info`; None for missing ones."""
+        events: dict[str, bool | float | None] = {name: number(info.get(name)) for name in self._names}
         for name in self._summed:
             if name in self.sums:
-                said[name] = self.sums[name] / (length if name.endswith(":mean") else 1)
-        return said
+                events[name] = self.sums[name] / (length if name.endswith(":mean") else 1)
+        return events
 
 
 def info_name(event: str) -> str:
-    """Return the name in `info` that an event is of."""
+    """Return the key in `info` of an event: its name without `:sum` or `:mean`."""
     return event.rpartition(":")[0] if event.endswith((":sum", ":mean")) else event
 
 
 def numbers_in(info: Mapping[Any, Any]) -> dict[str, bool | float]:
-    """Return the numbers of an `info` by name."""
+    """Return the entries of an `info` that are numbers, by name."""
     named = {name: number(value) for name, value in info.items() if isinstance(name, str)}
     return {name: value for name, value in named.items() if value is not None}
 
 
 def number(value: Any) -> bool | float | None:
-    """Return a boolean or a finite number out of `info` as Python's own, and None for anything else."""
+    """Return a boolean or a finite number from `info` as a Python scalar, and None for anything else."""
     array = numbers(value)
     return None if array is None or array.size != 1 else array.item()
 

@@ -1,7 +1,7 @@
-"""Changes of a task in the middle of training: friction and other physics of MuJoCo tasks, and noise on any task.
+"""Perturbations of a task during training: friction and other physics of MuJoCo tasks, and noise on any task.
 
-What a perturbation with step S changes is every environment step after the first S: the step that makes S + 1 is the
-first that differs, and an evaluation at step S still shows the task as it was.
+A perturbation with step S changes every environment step after the first S: step S + 1 is the first that differs, and
+an evaluation at step S still uses the task as it was before.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
     import gymnasium
 
-# The arrays of MjModel that are multiplied. The pairs are contacts that a model lists one by one: their friction
-# replaces that of their geoms. No task of Gymnasium's has any.
+# The arrays of MjModel that each kind scales. Pairs are contacts that a model lists explicitly; their friction replaces
+# that of their geoms. No Gymnasium task has any.
 _SCALED = {
     "friction": ("geom_friction", "pair_friction"),
     "gravity": ("opt.gravity",),
@@ -40,16 +40,16 @@ NOISES = ("observation_noise", "action_noise")
 KINDS = (*PHYSICS, *NOISES)
 
 _EXAMPLE = "friction=1.5@300000"
-_WRITTEN = re.compile(r"(?P<kind>[^=@]+?)\s*=(?P<value>[^=@]+)(?:@(?P<step>[^=@]+))?")
+_PATTERN = re.compile(r"(?P<kind>[^=@]+?)\s*=(?P<value>[^=@]+)(?:@(?P<step>[^=@]+))?")
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """One change of a task after `step` environment steps, written `KIND=VALUE@STEP`; without `@STEP` from the start.
+    """A change of a task after `step` environment steps, written `KIND=VALUE@STEP`; without `@STEP` from the start.
 
-    `value` is a factor on the task's own physics (`friction`, `gravity`, `mass`, `gain`), never on an earlier
-    perturbation's, or a standard deviation: of `observation_noise` in units of the observation, of `action_noise` in
-    those of an action in [-1, 1].
+    `value` is a factor on the unperturbed physics (`friction`, `gravity`, `mass`, `gain`), whatever earlier
+    perturbations did, or a standard deviation: of `observation_noise` in units of the observation, of `action_noise`
+    in units of an action in [-1, 1].
     """
 
     kind: str
@@ -65,10 +65,10 @@ class Perturbation:
 
     @classmethod
     def parse(cls, text: str) -> Perturbation:
-        """Return the perturbation that `KIND=VALUE@STEP` or `KIND=VALUE` describes. Raises InputError."""
-        match = _WRITTEN.fullmatch(text.strip())
+        """Return the perturbation that `KIND=VALUE@STEP` or `KIND=VALUE` describes. Raise InputError if malformed."""
+        match = _PATTERN.fullmatch(text.strip())
         value, step = (_number(match[name] or "0") if match else math.nan for name in ("value", "step"))
-        if match is None or math.isnan(value) or not step.is_integer():  # a step may be written 3e5 too
+        if match is None or math.isnan(value) or not step.is_integer():  # a step may be written as 3e5
             raise InputError(
                 f"a perturbation is written KIND=VALUE or KIND=VALUE@STEP, as {_EXAMPLE}, not {text!r:.60}"
             )
@@ -79,19 +79,19 @@ class Perturbation:
 
     @property
     def label(self) -> str:
-        """What it does, in few words: `friction x 1.5`, `observation noise 0.1`."""
+        """A short description: `friction x 1.5`, `observation noise 0.1`."""
         times = "x " if self.kind in PHYSICS else ""
         return f"{self.kind.replace('_', ' ')} {times}{self.value:g}"
 
 
 def unlike_training(trained: Iterable[str | Perturbation]) -> list[str]:
-    """Return the line that says of an unperturbed test that the training was perturbed; none where it was not."""
-    told = ", ".join(map(str, perturbations_of(trained)))
-    return [f"not perturbed, unlike its training ({told})"] if told else []
+    """Return a line saying that an unperturbed test differs from its perturbed training; [] if that was unperturbed."""
+    listed = ", ".join(map(str, perturbations_of(trained)))
+    return [f"not perturbed, unlike its training ({listed})"] if listed else []
 
 
 def perturbations_of(given: str | Perturbation | Iterable[str | Perturbation]) -> tuple[Perturbation, ...]:
-    """Return perturbations, written out or not, in the order of their steps."""
+    """Return perturbations, given as text or objects, sorted by step. Raise InputError for invalid ones."""
     several = [given] if isinstance(given, str | Perturbation) or not isinstance(given, Iterable) else given
     parsed = [Perturbation.parse(item) if isinstance(item, str) else item for item in several]
     if not all(isinstance(item, Perturbation) for item in parsed):
@@ -104,7 +104,7 @@ def perturbations_of(given: str | Perturbation | Iterable[str | Perturbation]) -
 
 
 def constant_perturbations(given: str | Perturbation | Iterable[str | Perturbation]) -> tuple[Perturbation, ...]:
-    """As `perturbations_of`, where nothing is learnt and so there is no step to wait for. Raises InputError."""
+    """Return the perturbations of an evaluation, which hold throughout. Raise InputError for one with a step."""
     perturbations = perturbations_of(given)
     for item in perturbations:
         if item.step:
@@ -113,16 +113,15 @@ def constant_perturbations(given: str | Perturbation | Iterable[str | Perturbati
 
 
 def values_at(perturbations: Iterable[Perturbation], step: int) -> dict[str, float]:
-    """Return the value of each kind that the environment step after the first `step` ones has."""
+    """Return the values by kind that are in force after `step` environment steps."""
     ordered = sorted(perturbations, key=lambda item: item.step)
     return {item.kind: item.value for item in ordered if item.step <= step}
 
 
 def continued(before: Sequence[Perturbation], given: Sequence[Perturbation], begin: int) -> tuple[Perturbation, ...]:
-    """Return the perturbations of a run that goes on at step `begin` from one that had those of `before`.
+    """Return the perturbations of a fork at step `begin`: those of `before` until then, the `given` ones from there on.
 
-    What happened before that step stays; what comes from it on is as `given`. Raises InputError for a given one
-    before it that was not there.
+    Raise InputError for a given one with an earlier step that the source run did not have.
     """
     past = [item for item in before if item.step < begin]
     for item in given:
@@ -132,9 +131,9 @@ def continued(before: Sequence[Perturbation], given: Sequence[Perturbation], beg
 
 
 def refuse_late(perturbations: Iterable[Perturbation], steps: int, planned: bool = False) -> None:
-    """Raise InputError for what would only change steps that a run of `steps` does not make.
+    """Raise InputError for a perturbation that starts only when a run of `steps` is over.
 
-    Those that were `planned` in the run that this one begins with have nobody who asked for them now.
+    `planned` says that the perturbations come from the source run of a fork, not from the user.
     """
     hint = "the source run planned it: --perturb none leaves it out" if planned else "give an earlier step"
     for item in perturbations:
@@ -143,7 +142,7 @@ def refuse_late(perturbations: Iterable[Perturbation], steps: int, planned: bool
 
 
 def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:
-    """Return (step, what changes there in few words) for each step at which something does, in order."""
+    """Return (step, labels of the perturbations that start there), in order of the steps."""
     labels: dict[int, list[str]] = {}
     for item in perturbations_of(perturbations):
         labels.setdefault(item.step, []).append(item.label)
@@ -151,7 +150,7 @@ def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:
 
 
 def _checked(kind: str, value: object) -> float:
-    """Return the value of a perturbation. Raises InputError for one that its kind cannot have."""
+    """Return the value of a perturbation as a float. Raise InputError if it is invalid for its kind."""
     number = math.nan if isinstance(value, str | bool) else _number(value)
     if not 0 <= number < math.inf or (kind == "mass" and not number):
         what = "factor" if kind in PHYSICS else "standard deviation"
@@ -161,7 +160,7 @@ def _checked(kind: str, value: object) -> float:
 
 
 def _number(value: object) -> float:
-    """Return a float, or nan for what is none."""
+    """Return a value as a float, or nan if it is not a number."""
     try:
         return float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError, OverflowError):
@@ -169,31 +168,31 @@ def _number(value: object) -> float:
 
 
 class Physics:
-    """The model of a MuJoCo task, scaled. Factors are on what the model was when this object was made.
+    """Scales the physics of a MuJoCo task. Factors are relative to the model at the time this object is created.
 
-    A reset leaves it scaled where it only renews the state, as those of Gymnasium's tasks do; `undone` finds out.
+    The scaling survives resets that only renew the state, as those of Gymnasium's tasks do; `undone` checks this.
     """
 
     def __init__(self, environment: gymnasium.Env, task_name: str) -> None:
         self._environment: Any = environment.unwrapped
-        self._mujoco: Any = sys.modules.get("mujoco")  # a task that it simulates has imported it
+        self._mujoco: Any = sys.modules.get("mujoco")  # a MuJoCo task has imported it
         self._model: Any = getattr(self._environment, "model", None)
         if self._mujoco is None or not isinstance(self._model, self._mujoco.MjModel):
             raise InputError(f"{task_name} is no MuJoCo task: of it only {' and '.join(NOISES)} can be perturbed")
         self._task_name = task_name
         self._original = copy.copy(self._model)
         self._factors = dict.fromkeys(PHYSICS, 1.0)
-        self._scaled: dict[str, np.ndarray] = {}  # what was written of the kinds whose factor is not 1, by its array
+        self._scaled: dict[str, np.ndarray] = {}  # scaled values by array name, of the kinds whose factor is not 1
 
     def set(self, factors: Mapping[str, float]) -> None:
-        """Scale the model from the next step on; a kind that is not named has the factor 1.
+        """Scale the model from the next step on; a kind that is missing has the factor 1.
 
-        Raises InputError for actuators with a gain that is not proportional to their parameters.
+        Raise InputError if `gain` is to change and an actuator's gain is not proportional to its parameters.
         """
         wanted = {**dict.fromkeys(PHYSICS, 1.0), **factors}
         changed = {kind: factor for kind, factor in wanted.items() if factor != self._factors[kind]}
         if "gain" in changed:
-            self._refuse_curved_actuators()
+            self._refuse_nonlinear_actuators()
         for kind, factor in changed.items():
             for name in _SCALED[kind]:
                 attrgetter(name)(self._model)[...] = attrgetter(name)(self._original) * factor
@@ -204,9 +203,9 @@ class Physics:
         self._scaled = {name: attrgetter(name)(self._model).copy() for name in names}
 
     def undone(self) -> str | None:
-        """Return what to say where a reset has taken back what was scaled, and None where it has not.
+        """Return an error message if a reset has undone the scaling, else None.
 
-        A task does so that draws other physics for each episode. To see it takes a few microseconds.
+        Tasks that randomise their physics at each reset do so. The check takes a few microseconds.
         """
         is_same = not self._scaled or getattr(self._environment, "model", None) is self._model
         if is_same and all((attrgetter(name)(self._model) == array).all() for name, array in self._scaled.items()):
@@ -215,25 +214,25 @@ class Physics:
         return f"{self._task_name} sets its own physics at reset: {kinds} cannot be perturbed"
 
     def _renew_constants(self) -> None:
-        """Have MuJoCo derive anew what it derives of masses, with data of its own: the episode's is not touched."""
+        """Recompute the model constants derived from masses, using separate MjData to leave the episode untouched."""
         model, original = self._model, self._original
         self._mujoco.mj_setConst(model, self._mujoco.MjData(model))
-        # The mean of the mass matrix's diagonal, a scale of the solver's tolerance, which only the compiler sets.
+        # Only MuJoCo's compiler sets the mean of the mass matrix's diagonal, a scale of the solver's tolerance.
         ratio = model.dof_M0.mean() / original.dof_M0.mean() if model.nv else 1.0
         model.stat.meaninertia = original.stat.meaninertia * ratio
 
-    def _refuse_curved_actuators(self) -> None:
+    def _refuse_nonlinear_actuators(self) -> None:
         gains, biases = self._mujoco.mjtGain, self._mujoco.mjtBias
-        straight = np.isin(self._model.actuator_gaintype, [int(gains.mjGAIN_FIXED), int(gains.mjGAIN_AFFINE)])
-        straight &= np.isin(self._model.actuator_biastype, [int(biases.mjBIAS_NONE), int(biases.mjBIAS_AFFINE)])
-        if not straight.all():
+        is_linear = np.isin(self._model.actuator_gaintype, [int(gains.mjGAIN_FIXED), int(gains.mjGAIN_AFFINE)])
+        is_linear &= np.isin(self._model.actuator_biastype, [int(biases.mjBIAS_NONE), int(biases.mjBIAS_AFFINE)])
+        if not is_linear.all():
             raise InputError(f"{self._task_name} has actuators, such as muscles, whose gain cannot be scaled")
 
 
 class Noise:
-    """Gaussian noise on one environment, drawn for each episode from generators of its reset seed.
+    """Gaussian noise for one environment, drawn from generators that each episode's reset seed determines.
 
-    One generator per kind, so that neither kind changes what the other draws. They are part of a snapshot.
+    There is one generator per kind, so that the kinds are independent. Snapshots contain the generators.
     """
 
     def __init__(self) -> None:
@@ -241,31 +240,31 @@ class Noise:
         self._generators: dict[str, np.random.Generator] = {}
 
     def set(self, levels: Mapping[str, float], seed: int | None) -> None:
-        """Have these standard deviations from now on, in an episode that was reset with `seed`."""
+        """Use these standard deviations from now on, in an episode that was reset with `seed`."""
         self._levels = dict(levels)
         if seed is not None:
             self._generators = {**_generators(levels, seed), **self._generators}
 
     def begin(self, seed: int) -> None:
-        """Begin an episode that is reset with `seed`."""
+        """Start an episode that is reset with `seed`."""
         self._generators = _generators(self._levels, seed)
 
     def on_observation(self, observation: np.ndarray) -> np.ndarray:
-        """Return a float32 [observation] with its noise."""
+        """Return a float32 [observation] with noise added."""
         return self._noisy("observation_noise", observation, 1.0)
 
     def on_action(self, action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return a flat action on the environment's scale with its noise, within its bounds [action]."""
+        """Return a flat action on the environment's scale with noise added, clipped to the bounds [action]."""
         if not self._levels.get("action_noise"):
             return action
         return np.clip(self._noisy("action_noise", action, 0.5 * high - 0.5 * low), low, high)
 
     def state(self) -> dict[str, Any]:
-        """Return what JSON can hold of the generators."""
+        """Return the state of the generators as JSON values."""
         return {kind: generator.bit_generator.state for kind, generator in self._generators.items()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on drawing where `state` was taken."""
+        """Set the generators to a `state` saved earlier."""
         for kind in self._generators.keys() & state.keys():
             self._generators[kind].bit_generator.state = state[kind]
 
@@ -278,5 +277,5 @@ class Noise:
 
 
 def _generators(kinds: Iterable[str], seed: int) -> dict[str, np.random.Generator]:
-    """Return a generator for each kind, of a stream that neither the task nor a stochastic policy draws from."""
+    """Return a generator for each kind, with a stream separate from those of the task and of a stochastic policy."""
     return {kind: np.random.default_rng([seed, 1 + NOISES.index(kind)]) for kind in kinds}

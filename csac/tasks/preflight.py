@@ -1,4 +1,4 @@
-"""What is looked at once, before a run begins: the task's API, its seeds and its wrappers."""
+"""Check a task once before a run: its API, seeds, time limit and wrappers. Seed the global generators."""
 
 from __future__ import annotations
 
@@ -21,10 +21,9 @@ if TYPE_CHECKING:
 
 
 def try_task(environment: Environment, arguments: Mapping[str, Any] | None = None) -> None:
-    """Reset a task and make one step, so that one of another API, or an argument of a wrong type, is told at once.
+    """Reset a task and make one step, to detect an incompatible API or an argument of a wrong type early.
 
-    Any other failure is left to the run, whose log has the traceback. Raises InputError for a TypeError or
-    ValueError.
+    Raise InputError for a TypeError or ValueError; any other failure is left to the run, which logs the traceback.
     """
     try:
         environment.reset(0)
@@ -36,36 +35,36 @@ def try_task(environment: Environment, arguments: Mapping[str, Any] | None = Non
 
 
 def seed_warning(environment: Environment) -> str | None:
-    """Return a line where a task does not begin as its reset seed says, and None where it does or cannot be reset."""
+    """Return a warning if the reset seed does not determine the first observation, or never changes it; else None."""
     try:
         first, second, other = (environment.reset(seed) for seed in (1, 1, 2))
     except EnvironmentFailure:
         return None
     if not np.array_equal(first, second):
-        told = "gives other observations for the same seed: runs do not repeat"
+        problem = "gives other observations for the same seed: runs do not repeat"
     elif np.array_equal(first, other):
-        told = "gives the same observation for every seed: episodes may be one"
+        problem = "gives the same observation for every seed: episodes may be one"
     else:
         return None
-    return f"{environment.task_name}: reset(seed=...) {told}"
+    return f"{environment.task_name}: reset(seed=...) {problem}"
 
 
 def limit_warning(environment: Environment, task: Task, longest: int) -> str | None:
-    """Return a line where no time limit is known, so that an evaluation episode may take `longest` steps, else None."""
+    """Return a warning if the task has no known time limit, so that an episode may take `longest` steps; else None."""
     wrapper, spec = environment.raw, environment.raw.spec
     while isinstance(wrapper, gymnasium.Wrapper) and not isinstance(wrapper, TimeLimit):
         wrapper = wrapper.env
     if isinstance(wrapper, TimeLimit) or (spec and spec.max_episode_steps) or adapter_of(task):
         return None
-    how = "--env-kwargs '{\"max_episode_steps\": 1000}'" if isinstance(task, str) else "gymnasium.wrappers.TimeLimit"
+    remedy = "--env-kwargs '{\"max_episode_steps\": 1000}'" if isinstance(task, str) else "gymnasium.wrappers.TimeLimit"
     return (
         f"{environment.task_name} has no time limit: an evaluation episode that does not end by itself takes "
-        f"{longest:,} steps ({how} sets one)"
+        f"{longest:,} steps ({remedy} sets one)"
     )
 
 
 def wrapper_warnings(environment: Environment) -> list[str]:
-    """Return a line for each wrapper that learns something by itself, which csac neither saves nor exports."""
+    """Return a warning for each wrapper that learns statistics, which csac neither saves nor exports."""
     lines, wrapper = [], environment.raw
     while isinstance(wrapper, gymnasium.Wrapper):
         if isinstance(wrapper, NormalizeObservation | NormalizeReward):
@@ -79,7 +78,7 @@ def wrapper_warnings(environment: Environment) -> list[str]:
 
 @contextmanager
 def globals_seeded(seed: int) -> Iterator[None]:
-    """Seed Python's and NumPy's global generators in this block, after which they go on as before."""
+    """Seed Python's and NumPy's global generators in this block, and restore their state afterwards."""
     states = random.getstate(), np.random.get_state()
     seed_globals(seed)
     try:

@@ -1,4 +1,4 @@
-"""PyBullet's tasks: adapters for panda-gym and PyFlyt, pictures of them, and their output kept from the terminal."""
+"""Support PyBullet tasks: adapters for panda-gym and PyFlyt, cameras, and keeping their output off the terminal."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from gymnasium.spaces import Box
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-_CONTEXT = 2  # waypoints that the policy sees: the one it flies to and the next
+_CONTEXT = 2  # waypoints in the observation: the current one and the next
 _EYE = np.array([0.0, 0.0, 0.5])  # metres above the drone
 _BESIDE = np.array([-0.6, -0.6, 0.3])  # metres from the drone
 
-# What PyBullet prints, the second half with a window alone, and with what PyFlyt's Aviary clears it from a terminal. It
-# need not begin a line: what a display has left may stand before it.
+# What PyBullet prints (the second half only with a window), and the escape codes with which PyFlyt's Aviary erases it.
+# It may follow other output, such as a progress display, on the same line.
 _CHATTER = re.compile(
     r"(?:pybullet build time: [^\n]*|arg[cv](?:\[\d+\])? ?=[^\n]*|\x1b\[A *\x1b\[A|b3(?:Printf|Warning|Error)[^\n]*"
     r"|startThreads creating [^\n]*|start(?:ed|ing) thread \d+[^\n]*|numActiveThreads = \d+|stopping threads"
     r"|GL_[A-Z_]+=[^\n]*|MotionThreadFunc: [^\n]*|Thread with taskId [^\n]*|Thread TERMINATED)\r?\n"
 )
 
-_lock = threading.RLock()  # the descriptors belong to the whole process
+_lock = threading.RLock()  # file descriptors are shared by the whole process
 _log = logging.getLogger(__name__)
 
 
 class Adapter(NamedTuple):
-    """What one task needs.
+    """Settings of a known task.
 
-    `module` registers the task when it is imported. `wrap` makes its observation one array. `events` are names in the
-    `info` of an episode's last step. With `has_memory` what an episode gives depends on those before it in the same
-    environment. The rest is for pictures: the environment's arguments, how many a second, and how to take one.
+    Importing `module` registers the task. `wrap` turns its observation into one array. `events` are names in the
+    `info` of an episode's last step. `has_memory` says that an episode depends on earlier ones in the same environment.
+    The rest is for videos: the environment's arguments, frames per second, and a function that returns a camera.
     """
 
     module: str
@@ -55,9 +55,9 @@ class Adapter(NamedTuple):
 
 
 class FlatWaypoints(gymnasium.ObservationWrapper):
-    """PyFlyt's waypoint tasks with one array as observation: attitude, then the next waypoints, zeros after the last.
+    """Flattens the observation of PyFlyt's waypoint tasks: attitude, then the next waypoints, zeros after the last.
 
-    The numbers are those of PyFlyt's own `FlattenWaypointEnv(context_length=2)`, whose space has the wrong size.
+    The values equal those of PyFlyt's `FlattenWaypointEnv(context_length=2)`, whose space has the wrong size.
     """
 
     def __init__(self, environment: gymnasium.Env) -> None:
@@ -76,7 +76,7 @@ class FlatWaypoints(gymnasium.ObservationWrapper):
 
 
 def follow(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
-    """Return what takes a picture of a drone from beside it, always from the same side: uint8 [480, 640, 4].
+    """Return a camera that shows a drone from beside it, always from the same side: uint8 [480, 640, 4].
 
     PyFlyt's own camera sits in the drone's nose: it never shows the drone.
     """
@@ -90,7 +90,7 @@ def follow(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
 
 
 def chase(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
-    """Return what takes a picture from behind the drone, towards its next waypoint: uint8 [480, 640, 4].
+    """Return a camera that looks from behind the drone towards its next waypoint: uint8 [480, 640, 4].
 
     PyFlyt's own camera sits in the drone's nose and mostly sees the ground.
     """
@@ -103,7 +103,7 @@ def chase(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
         if len(drone.waypoints.targets):
             offset = drone.waypoints.targets[0] - position
             wanted = offset / max(float(np.linalg.norm(offset)), 1e-6)
-            # A new waypoint turns the camera by and by; a new episode, at once.
+            # Turn gradually towards a new waypoint, but at once in a new episode.
             direction = wanted if drone.step_count == 0 else 0.9 * direction + 0.1 * wanted
         level = direction * np.array([1.0, 1.0, 0.3])
         return _photograph(drone.env, position - 1.2 * level + _EYE, position + level)
@@ -112,7 +112,7 @@ def chase(environment: gymnasium.Env) -> Callable[[], np.ndarray]:
 
 
 def _photograph(client: Any, eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return what PyBullet sees from `eye`, above the ground, towards `target`, in metres: uint8 [480, 640, 4]."""
+    """Render the view from `eye`, kept above the ground, towards `target`, in metres: uint8 [480, 640, 4]."""
     eye = np.maximum(eye, (-np.inf, -np.inf, 0.1))
     view = client.computeViewMatrix(eye.tolist(), target.tolist(), [0.0, 0.0, 1.0])
     projection = client.computeProjectionMatrixFOV(fov=60.0, aspect=640 / 480, nearVal=0.05, farVal=60.0)
@@ -125,7 +125,7 @@ _WAYPOINTS = Adapter(
     events=("out_of_bounds", "collision", "env_complete", "num_targets_reached"),
 )
 _PYFLYT = Adapter("PyFlyt.gym_envs")
-# Pushing, lifting and stacking leave something in PyBullet's solver that a reset does not remove.
+# Pushing, lifting and stacking leave state in PyBullet's solver that a reset does not clear.
 _PANDA = Adapter(
     "panda_gym",
     has_memory=True,
@@ -145,27 +145,27 @@ ADAPTERS: Mapping[str, Adapter] = {
         for reward in ("", "Dense")
     },
 }
-FAMILIES = {"PyFlyt/": _PYFLYT, "Panda": Adapter("panda_gym")}  # what other ids of that name take is not known
+FAMILIES = {"PyFlyt/": _PYFLYT, "Panda": Adapter("panda_gym")}  # for other ids with these prefixes
 
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Send what PyBullet prints in this block to the log, at level DEBUG.
+    """Redirect what PyBullet prints in this block to the log, at level DEBUG.
 
-    PyBullet prints from C, where Python's streams do not see it, and PyFlyt from Python, whose streams need not end in
-    the descriptors (a notebook's do not). Whatever else is written meanwhile comes out at the end of the block.
+    PyBullet prints from C, past Python's streams, and PyFlyt from Python, whose streams need not write to the file
+    descriptors (a notebook's do not). Any other output is passed on at the end of the block.
     """
-    with _lock, _descriptor_kept(1), _descriptor_kept(2), _stream_kept("stdout"), _stream_kept("stderr"):
+    with _lock, _filter_descriptor(1), _filter_descriptor(2), _filter_stream("stdout"), _filter_stream("stderr"):
         yield
 
 
 @contextmanager
-def _descriptor_kept(descriptor: int) -> Iterator[None]:
-    """Let a descriptor point to a file during this block, and pass on what is not chatter."""
+def _filter_descriptor(descriptor: int) -> Iterator[None]:
+    """Redirect a file descriptor to a file during this block, then pass on what is not chatter."""
     _flush()
     try:
         original = os.dup(descriptor)
-    except OSError:  # closed: nobody can be disturbed
+    except OSError:  # closed: there is nothing to redirect
         yield
         return
     with tempfile.TemporaryFile() as file:
@@ -178,23 +178,23 @@ def _descriptor_kept(descriptor: int) -> Iterator[None]:
             os.close(original)
             file.seek(0)
             rest = _without_chatter(file.read().decode(errors="surrogateescape")).encode(errors="surrogateescape")
-            with suppress(OSError):  # nobody reads any more
+            with suppress(OSError):  # the reader is gone
                 while rest:
                     rest = rest[os.write(descriptor, rest) :]
 
 
 @contextmanager
-def _stream_kept(name: str) -> Iterator[None]:
-    """Let Python's stream of this name be another during this block, and pass on what is not chatter."""
-    stream, aside = getattr(sys, name), io.StringIO()
-    setattr(sys, name, aside)
+def _filter_stream(name: str) -> Iterator[None]:
+    """Replace Python's stream of this name by a buffer during this block, then pass on what is not chatter."""
+    stream, buffer = getattr(sys, name), io.StringIO()
+    setattr(sys, name, buffer)
     try:
         yield
     finally:
-        if getattr(sys, name) is aside:
+        if getattr(sys, name) is buffer:
             setattr(sys, name, stream)
-        with suppress(OSError, ValueError, AttributeError):  # nobody reads any more, or there is no stream
-            stream.write(_without_chatter(aside.getvalue()))
+        with suppress(OSError, ValueError, AttributeError):  # the reader is gone, or there is no stream
+            stream.write(_without_chatter(buffer.getvalue()))
 
 
 def _without_chatter(written: str) -> str:
@@ -204,7 +204,7 @@ def _without_chatter(written: str) -> str:
 
 
 def _flush() -> None:
-    """Write what the streams of Python and C hold back."""
+    """Flush the standard streams of Python and C."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError, AttributeError):
             stream.flush()

@@ -1,4 +1,4 @@
-"""From a task's name to a Gymnasium environment: ids, modules and callables, and what known tasks need besides."""
+"""Create Gymnasium environments from ids, modules and callables, and look up the settings of known tasks."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from csac.types import InputError
 Task = str | Callable[..., gymnasium.Env]
 
 INSTALL = "pip install '.[robots]' in a clone of csac"
-# Columns of evaluations.csv and tags of TensorBoard that there are anyway.
+# Columns of evaluations.csv and TensorBoard tags that always exist.
 _RESERVED = {"seed", "step", "episode", "return", "length", "success", "mean_reward", "mean_ep_length", "success_rate"}
 
 _log = logging.getLogger(__name__)
 
 
 def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
-    """Return a new environment. Raises InputError where there is no such task or it refuses its arguments."""
+    """Return a new environment. Raise InputError if the task does not exist or rejects its arguments."""
     if isinstance(task, gymnasium.Env) or not (isinstance(task, str) or callable(task)):
         raise InputError(f"a task is a Gymnasium id or a function that makes an environment, not {task!r:.60}")
     name = task if isinstance(task, str) else _name_of(task) or "the task"
     adapter = adapter_of(task)
     _silence_mujoco()
-    with _undisturbed(bool(adapter) or "pybullet" in sys.modules):
+    with _isolated(bool(adapter) or "pybullet" in sys.modules):
         known = registered(task) if isinstance(task, str) else task
         try:
             if isinstance(known, str):
@@ -46,7 +46,7 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
             if adapter and adapter.wrap:
                 environment = adapter.wrap(environment)
         except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
-            raise InputError(_missing(name, error, adapter)) from error
+            raise InputError(_missing_package(name, error, adapter)) from error
         except BaseException as error:
             raise_interrupt(error)
             given = f" with the arguments {arguments}" if arguments else ""
@@ -59,7 +59,7 @@ def make(task: Task, arguments: dict[str, Any]) -> gymnasium.Env:
 
 
 def registered(task: str) -> str:
-    """Return the registered id of a task, after importing its module where one is named. Raises InputError."""
+    """Return the registered id of a task, after importing its module if it names one. Raise InputError if unknown."""
     module, _, name = task.rpartition(":")
     if module:
         import_module_of(task)
@@ -73,10 +73,10 @@ def registered(task: str) -> str:
 
 
 def import_module_of(name: str) -> Any:
-    """Import and return the module of a task, or of an algorithm, which the user has named. Raises InputError.
+    """Import and return the module of a task or an algorithm that the user has named. Raise InputError if that fails.
 
-    The working directory is searched last, and stays on the path for what the module imports later. What the user has
-    not named is never looked for there.
+    The working directory is appended to `sys.path`, so that it is searched last, and stays there for later imports of
+    the module. Modules that the user has not named are never looked up there.
     """
     module = module_of(name)
     with suppress(OSError):  # a folder that is gone
@@ -90,14 +90,14 @@ def import_module_of(name: str) -> Any:
 
 
 def adapter_of(task: object) -> Adapter | None:
-    """Return the adapter of a task given by its id, with or without the module in front, or None."""
+    """Return the adapter for a task id, with or without its module, or None."""
     name = task.rpartition(":")[2] if isinstance(task, str) else ""
     families = (adapter for prefix, adapter in FAMILIES.items() if name.startswith(prefix))
     return ADAPTERS.get(name) or next(families, None)
 
 
 def _register_known(name: str) -> None:
-    """Import what registers a known task. Raises InputError where its package is not installed, or another version."""
+    """Import the module that registers a known task. Raise InputError if its package is missing or lacks the task."""
     adapter = adapter_of(name)
     if adapter is None or name in gymnasium.registry:
         return
@@ -105,18 +105,18 @@ def _register_known(name: str) -> None:
         importlib.import_module(adapter.module)
     except ImportError as error:
         if name in ADAPTERS:
-            raise InputError(_missing(name, error, adapter)) from error
+            raise InputError(_missing_package(name, error, adapter)) from error
     if name in ADAPTERS and name not in gymnasium.registry:
         raise InputError(f"the {adapter.module.partition('.')[0]} that is installed has no {name}: {INSTALL}")
 
 
-def _missing(name: str, error: Exception, adapter: Adapter | None) -> str:
+def _missing_package(name: str, error: Exception, adapter: Adapter | None) -> str:
     hint = f": {INSTALL}" if adapter else ""
     return f"{name} needs a package that is not installed ({message(error)}){hint}"
 
 
 def task_name(task: Task, environment: gymnasium.Env) -> str:
-    """Return the id, or what a callable or its environment is called."""
+    """Return the id, or the name of the callable or of its environment."""
     if isinstance(task, str):
         return task
     return _name_of(task) or (environment.spec.id if environment.spec else type(environment.unwrapped).__name__)
@@ -127,12 +127,12 @@ def _name_of(task: Callable[..., gymnasium.Env]) -> str:
 
 
 def is_pybullet(environment: gymnasium.Env) -> bool:
-    """Whether this is one of PyFlyt's or panda-gym's environments, or derived from one."""
+    """Return whether this is an environment of PyFlyt or panda-gym, or derived from one."""
     return bool(_packages(environment) & {"PyFlyt", "panda_gym"})
 
 
 def has_memory(task: object, environment: gymnasium.Env) -> bool:
-    """Whether what an episode gives depends on those before it: so a task of panda-gym's that is not known not to."""
+    """Return whether an episode depends on earlier ones; assume so for panda-gym tasks without an adapter."""
     adapter = ADAPTERS.get(task.rpartition(":")[2]) if isinstance(task, str) else None
     return adapter.has_memory if adapter else "panda_gym" in _packages(environment)
 
@@ -142,13 +142,13 @@ def _packages(environment: gymnasium.Env) -> set[str]:
 
 
 def events_of(task: object, more: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return the names of a task's own events, then `more`, each once."""
+    """Return the names of a known task's default events, then `more`, without duplicates."""
     adapter = adapter_of(task)
     return tuple(dict.fromkeys([*(adapter.events if adapter else ()), *more]))
 
 
 def check_events(events: Sequence[str]) -> None:
-    """Raise InputError for a name that cannot be a column of evaluations.csv and a tag of TensorBoard."""
+    """Raise InputError for a name that cannot be a column of evaluations.csv and a TensorBoard tag."""
     if isinstance(events, str) or not isinstance(events, Iterable):
         raise InputError(f"events are a list of names such as ('collision',), not {events!r:.40}")
     for name in events:
@@ -157,16 +157,16 @@ def check_events(events: Sequence[str]) -> None:
 
 
 def is_column(name: object) -> bool:
-    """Return whether a name can be a column beside those that tables and TensorBoard have anyway."""
+    """Return whether a name can be a new column: a plain word that is not reserved."""
     is_word = isinstance(name, str) and name.isprintable() and name and not {*name} & {*" ,;\"'#"}
     return bool(is_word) and name not in _RESERVED
 
 
 @contextmanager
-def _undisturbed(is_pybullet: bool) -> Iterator[None]:
-    """Hide Gymnasium's warnings and PyBullet's output while a task is made, and stay in the working directory."""
+def _isolated(is_pybullet: bool) -> Iterator[None]:
+    """Hide Gymnasium's warnings and PyBullet's output in this block, and restore the working directory afterwards."""
     with ExitStack() as stack, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=r".*WARN: ")  # Gymnasium's: an id has a newer version
+        warnings.filterwarnings("ignore", message=r".*WARN: ")  # such as: an id has a newer version
         with suppress(OSError):  # a folder that is gone
             stack.callback(os.chdir, os.getcwd())
         if is_pybullet:
@@ -175,12 +175,12 @@ def _undisturbed(is_pybullet: bool) -> Iterator[None]:
 
 
 def _silence_mujoco() -> None:
-    """Send MuJoCo's warnings to the log: by itself it prints them, and writes MUJOCO_LOG.TXT where the user works."""
+    """Send MuJoCo's warnings to the log instead of the terminal and MUJOCO_LOG.TXT in the working directory."""
     try:
-        with safe_path():  # GLFW, which draws for MuJoCo and for Gymnasium, asks a Python of its own for its version
+        with safe_path():  # importing GLFW, the renderers' library, starts another Python to find its version
             mujoco = importlib.import_module("mujoco")
             importlib.import_module("glfw")
-    except Exception:  # a task that needs it says so
+    except Exception:  # a task that needs MuJoCo reports it
         return
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(_log.info)

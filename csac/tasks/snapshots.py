@@ -1,8 +1,8 @@
-"""What a Gymnasium environment needs to go on exactly in the middle of an episode: arrays by name and JSON values.
+"""Save and restore a Gymnasium environment in the middle of an episode, as named arrays and JSON values.
 
-An environment offers it with `get_snapshot() -> (arrays, values)` and `set_snapshot(arrays, values)`, the latter called
-after a `reset` with the seed of the episode. For Gymnasium's own MuJoCo tasks both are built in. The time limit and the
-random generator are taken care of here.
+An environment supports this with `get_snapshot() -> (arrays, values)` and `set_snapshot(arrays, values)`, which is
+called after a `reset` with the seed of the episode. For Gymnasium's own MuJoCo tasks both are built in. The time limit
+and the random generator are handled here.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from csac.types import Snapshot
 if TYPE_CHECKING:
     import gymnasium
 
-# MuJoCo makes these anew in every step, in sizes that depend on the contacts of the moment.
-_MADE_ANEW = ("efc_", "iefc_", "island_", "iacc", "ifrc_", "map_")
+# MuJoCo recomputes these in every step; their sizes depend on the current contacts.
+_RECOMPUTED = ("efc_", "iefc_", "island_", "iacc", "ifrc_", "map_")
 _KNOWN_WRAPPERS = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
 
 
 def snapshot(environment: gymnasium.Env) -> Snapshot | None:
-    """Return the episode in progress, or None where it cannot be had whole."""
+    """Return the state of the episode in progress, or None if it cannot be saved completely."""
     inner = environment.unwrapped
     if _time_limits(environment) is None:
         return None
@@ -41,7 +41,7 @@ def snapshot(environment: gymnasium.Env) -> Snapshot | None:
 
 
 def restore(environment: gymnasium.Env, saved: Snapshot) -> None:
-    """Let an environment that was just reset go on where `saved` was taken. Raises where it does not fit."""
+    """Restore a snapshot in an environment that was just reset. Raise an exception if it does not fit."""
     inner, values = environment.unwrapped, saved.values
     if "own" in values:
         arrays = {name.removeprefix("own."): array for name, array in saved.arrays.items()}
@@ -54,7 +54,7 @@ def restore(environment: gymnasium.Env, saved: Snapshot) -> None:
 
 
 def _time_limits(environment: gymnasium.Env) -> list[TimeLimit] | None:
-    """Return the time limits around an environment, or None where another wrapper could hold anything."""
+    """Return the time limits around an environment, or None if another wrapper may hold state of its own."""
     limits = []
     while environment is not environment.unwrapped:
         if type(environment) not in _KNOWN_WRAPPERS:
@@ -66,26 +66,26 @@ def _time_limits(environment: gymnasium.Env) -> list[TimeLimit] | None:
 
 
 def _is_mujoco(environment: gymnasium.Env) -> bool:
-    """Whether this is one of Gymnasium's own MuJoCo tasks: a class derived from one may hold more than its physics."""
+    """Return whether this is one of Gymnasium's own MuJoCo tasks. A subclass may have state beyond its physics."""
     return type(environment).__module__.startswith("gymnasium.envs.mujoco.") and hasattr(environment, "data")
 
 
 def _mujoco_arrays(environment: Any) -> dict[str, np.ndarray]:
-    """Return views of the arrays of MjData that last from step to step.
+    """Return views of all arrays of MjData that persist from step to step.
 
-    All of them, since positions and velocities are not enough: Ant's reward reads body positions that are a step old.
+    Positions and velocities are not enough: Ant's reward reads body positions of the previous step.
     """
     data = environment.data
-    names = (name for name in dir(data) if not name.startswith(("_", *_MADE_ANEW)))
+    names = (name for name in dir(data) if not name.startswith(("_", *_RECOMPUTED)))
     arrays = ((name, getattr(data, name)) for name in names)
     return {name: array for name, array in arrays if isinstance(array, np.ndarray) and array.size}
 
 
 def _set_mujoco(environment: Any, saved: Snapshot) -> None:
     arrays = _mujoco_arrays(environment)
-    given = {name.removeprefix("mujoco."): array for name, array in saved.arrays.items()}
-    if {name: array.shape for name, array in arrays.items()} != {name: array.shape for name, array in given.items()}:
+    stored = {name.removeprefix("mujoco."): array for name, array in saved.arrays.items()}
+    if {name: array.shape for name, array in arrays.items()} != {name: array.shape for name, array in stored.items()}:
         raise ValueError("its physics has other arrays: MuJoCo or the task has changed")
     for name, array in arrays.items():
-        array[...] = given[name]
+        array[...] = stored[name]
     environment.data.time = saved.values["mujoco_time"]

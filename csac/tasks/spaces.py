@@ -1,4 +1,4 @@
-"""Which spaces are accepted, and the order of their parts in one vector, which `Environment` and `Contract` join."""
+"""Check spaces, and define the order of their parts in the flat vectors of `Environment` and `Contract`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
 
 
 class ContractParts(NamedTuple):
-    """What a `Contract` records of an environment, in the order in which it takes them."""
+    """The fields of a `Contract` that come from an environment, in its order."""
 
     observation_parts: Parts
     action_shape: tuple[int, ...]
@@ -26,7 +26,7 @@ class ContractParts(NamedTuple):
 
 
 def contract_parts(environment: gymnasium.Env) -> ContractParts:
-    """Return the parts of an environment's spaces. Raises InputError for spaces that csac does not take."""
+    """Return the parts of an environment's spaces. Raise InputError for spaces that csac does not support."""
     try:
         observation, action = environment.observation_space, environment.action_space
     except Exception as error:
@@ -35,7 +35,7 @@ def contract_parts(environment: gymnasium.Env) -> ContractParts:
 
 
 def observation_parts(space: object) -> Parts:
-    """Return the parts of a Box or Dict of Boxes in their flat order. Raises InputError for any other space."""
+    """Return the parts of a Box or Dict of Boxes in their flat order. Raise InputError for any other space."""
     named: dict[Any, object] = dict(space.spaces) if isinstance(space, spaces.Dict) else {None: space}
     parts = []
     for key, part in sorted(named.items(), key=lambda item: str(item[0])):
@@ -56,7 +56,7 @@ def observation_parts(space: object) -> Parts:
 
 
 def action_parts(space: object) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
-    """Return shape and flat float32 bounds of a bounded Box of floats. Raises InputError for any other space."""
+    """Return shape and flat float32 bounds of a bounded Box of floats. Raise InputError for any other space."""
     if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating) or not space.low.size:
         raise InputError(f"the action space is {space}, and csac takes continuous actions, gymnasium's Box of floats")
     low, high = _float32_within(space.low.reshape(-1), space.high.reshape(-1))
@@ -69,9 +69,9 @@ def action_parts(space: object) -> tuple[tuple[int, ...], np.ndarray, np.ndarray
 
 
 def _float32_within(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Round bounds to float32 towards the inside, so that a float64 Box holds what we send.
+    """Round bounds inwards to float32, so that a float64 Box contains the actions sent to it.
 
-    Where no float32 lies between them, both are the nearest.
+    If no float32 lies between them, round both to the nearest.
     """
     with np.errstate(over="ignore"):
         nearest_low, nearest_high = low.astype(np.float32), high.astype(np.float32)
@@ -82,28 +82,28 @@ def _float32_within(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _moved(rounded: np.ndarray, outside: np.ndarray, direction: float) -> np.ndarray:
-    """Return float32 numbers, those that lie outside as the next one in this direction."""
+    """Return float32 numbers, with finite ones that lie `outside` moved to the next float in `direction`."""
     return np.where(outside & np.isfinite(rounded), np.nextafter(rounded, np.float32(direction)), rounded)
 
 
 def size(parts: Parts) -> int:
-    """Return how many numbers all parts have together."""
+    """Return the total size of all parts."""
     return sum(math.prod(shape) for _, shape in parts)
 
 
 def dict_part(observation: Any, key: str | None, shape: tuple[int, ...]) -> np.ndarray:
-    """Return one part of a Dict observation, as `part`. Raises EnvironmentFailure."""
+    """Return one part of a Dict observation, as `part` does. Raise EnvironmentFailure if it is missing or invalid."""
     if not isinstance(observation, dict) or key not in observation:
         raise EnvironmentFailure(f"observation has no {key!r}")
     return part(observation[key], shape, f"observation[{key!r}]")
 
 
 def part(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Return a float32 copy of one part of an observation, flat and finite. Raises EnvironmentFailure."""
+    """Return a flat float32 copy of an array. Raise EnvironmentFailure if it is non-finite or has a wrong shape."""
     try:
         array = np.asarray(value)
         flat = array.reshape(-1)
-        # One product finds a nan, an inf or what float32 cannot hold in a third of the time of np.isfinite().all().
+        # One dot product detects nan, inf and float32 overflow in a third of the time of np.isfinite().all().
         if array.shape == shape and float(flat.dot(flat)) <= FLOAT32_MAX:
             return flat.astype(np.float32)
         with np.errstate(over="ignore"):
@@ -117,7 +117,7 @@ def part(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def check_finite(flat: np.ndarray, shape: tuple[int, ...], name: str) -> None:
-    """Raise EnvironmentFailure, with its place in an array of this shape, for the first number that is not finite."""
+    """Raise EnvironmentFailure for the first non-finite number, with its index in an array of this `shape`."""
     bad = np.flatnonzero(~np.isfinite(flat))
     if bad.size:
         place = ", ".join(str(i) for i in np.unravel_index(bad[0], shape))
@@ -125,7 +125,7 @@ def check_finite(flat: np.ndarray, shape: tuple[int, ...], name: str) -> None:
 
 
 def scalar(reward: Any) -> float:
-    """Return a reward as a float. Raises EnvironmentFailure where it is not one finite number."""
+    """Return a reward as a float. Raise EnvironmentFailure if it is not one finite number."""
     if isinstance(reward, np.ndarray) and reward.ndim:
         raise EnvironmentFailure(f"reward has shape {reward.shape} and is to be one number")
     try:

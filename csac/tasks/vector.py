@@ -1,4 +1,4 @@
-"""The environments of all seeds of a program, stepped together; each episode is reset with a seed of its own."""
+"""Step the environments of all seeds of a program together; each episode is reset with its own seed."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from csac.tasks.registry import Task
 from csac.tasks.workers import Workers
 from csac.types import InputError, Snapshot
 
-Place = tuple[int, ...]  # of an environment: its seed's, and its own where a seed has several
+Place = tuple[int, ...]  # index of an environment: (seed,), or (seed, environment) if a seed has several
 
 
 class FinishedEpisode(NamedTuple):
-    """A training episode that ended; `seed_index` is the seed's position in the group."""
+    """A training episode that ended; `seed_index` is the index of its seed in the group."""
 
     seed_index: int
     episode_return: float
@@ -32,7 +32,7 @@ class FinishedEpisode(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """A seed whose environment failed: why in one line, and the traceback where something raised."""
+    """A seed whose environment failed: the reason in one line, and the traceback if an exception caused it."""
 
     seed_index: int
     reason: str
@@ -40,26 +40,26 @@ class Failure(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """One step of every environment, in new arrays to be read only; where one failed they keep its last good values.
+    """One step of every environment, in new arrays, to be read only; failed environments keep their last valid values.
 
-    Their first axis is of seeds, and the second of environments where a seed has several.
+    The first axis is over seeds, the second over environments if a seed has several.
     """
 
-    next_observation: np.ndarray  # [seed, observation] what the step gave, also where the episode ended
+    next_observation: np.ndarray  # [seed, observation] returned by the step, also where the episode ended
     reward: np.ndarray  # [seed] float32
     terminated: np.ndarray  # [seed] bool
     truncated: np.ndarray  # [seed] bool
-    observation: np.ndarray  # [seed, observation] what to act on next: a first observation where an episode ended
+    observation: np.ndarray  # [seed, observation] to act on next: the next episode's first where one ended
     episodes: list[FinishedEpisode]
     failures: list[Failure]
 
 
 class SeedEnvironments:
-    """The environments of each seed, reset by themselves where an episode ends, each episode with its own derived seed.
+    """The environments of each seed, reset automatically when an episode ends, each episode with its own derived seed.
 
-    A seed fails alone: where one of its environments raises or gives what is not finite, it is reported once and never
-    stepped again. `alive` [seed] says which seeds still step; it turns false with the report. So many `processes` share
-    the environments; 0 steps them here. What they compute is the same.
+    A failure affects only one seed: if one of its environments raises or returns a non-finite value, the seed is
+    reported once and never stepped again. `alive` [seed] says which seeds are still stepped; it becomes False with the
+    report. `processes` share the environments; 0 steps them in this process. Their number does not change the results.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class SeedEnvironments:
             while len(self.environments) < len(self._places):
                 self.environments.append(Environment(task, environment_arguments))
             stack.pop_all()
-        self._at = dict(zip(self._places, self.environments, strict=True))
+        self._by_place = dict(zip(self._places, self.environments, strict=True))
         first = self.environments[0]
         self.spec = first.spec._replace(environments=environments)
         self.contract_parts, self.task_name = first.contract_parts, first.task_name
@@ -92,18 +92,18 @@ class SeedEnvironments:
         self.alive = np.ones(len(seeds), bool)
         self._running = self._places
         self._action_axes = *axes, *first.contract_parts.action_shape
-        self.observations = np.zeros((*axes, self.spec.observation_size), np.float32)  # what to act on next
+        self.observations = np.zeros((*axes, self.spec.observation_size), np.float32)  # to act on next
         self._reward = np.zeros(axes, np.float32)
-        self._begun = dict.fromkeys(self._places, 0)
+        self._episodes_begun = dict.fromkeys(self._places, 0)
         self._returns = dict.fromkeys(self._places, 0.0)
         self._lengths = dict.fromkeys(self._places, 0)
         self._events = events
-        self._said = {place: EpisodeEvents(events) for place in self._places}
+        self._episode_events = {place: EpisodeEvents(events) for place in self._places}
         self._failures: list[Failure] = []
-        self.refused: dict[int, str] = {}  # why the episode saved of the seed at this place was not restored
+        self.refused: dict[int, str] = {}  # by seed index: why the saved episode was not restored
 
     def reset(self) -> np.ndarray:
-        """Start the next episode of every environment: observations [seed, observation].
+        """Start the next episode of every environment; return observations [seed, observation].
 
         A seed that fails here is reported by the next `step`.
         """
@@ -112,15 +112,15 @@ class SeedEnvironments:
         return self.observations
 
     def perturb(self, values: Mapping[str, float]) -> None:
-        """Change every seed's task, as `Environment.perturb`."""
+        """Perturb every seed's task, as `Environment.perturb` does."""
         for place in self._running:
             try:
-                self._at[place].perturb(values)
+                self._by_place[place].perturb(values)
             except EnvironmentFailure as error:
                 self._fail(place, error)
 
     def step(self, actions: np.ndarray) -> Steps:
-        """Step every environment of the seeds that are alive with its action in [-1, 1], [seed, action]."""
+        """Step every environment of the seeds that are alive, with actions [seed, action] in [-1, 1]."""
         scaled = self._bounds.scale(actions).reshape(self._action_axes)
         next_observation, reward = self.observations.copy(), self._reward.copy()
         terminated, truncated = np.zeros(reward.shape, bool), np.zeros(reward.shape, bool)
@@ -128,10 +128,10 @@ class SeedEnvironments:
         episodes: list[FinishedEpisode] = []
         if self._workers:
             for place in self._running:
-                self._at[place].ask("step_environment_scale", scaled[place])
+                self._by_place[place].ask("step_environment_scale", scaled[place])
         for place in self._running:
             try:
-                step = self._at[place].step_environment_scale(scaled[place])
+                step = self._by_place[place].step_environment_scale(scaled[place])
             except EnvironmentFailure as error:
                 self._fail(place, error)
                 continue
@@ -139,10 +139,10 @@ class SeedEnvironments:
             self._returns[place] += step[1]
             self._lengths[place] += 1
             if self._events:
-                self._said[place].add(info)
+                self._episode_events[place].add(info)
             if step[2] or step[3]:
-                said = self._said[place].of(info, self._lengths[place])
-                episodes.append(FinishedEpisode(place[0], self._returns[place], self._lengths[place], said))
+                events = self._episode_events[place].of(info, self._lengths[place])
+                episodes.append(FinishedEpisode(place[0], self._returns[place], self._lengths[place], events))
                 ended.append(place)
         self.observations, self._reward = next_observation.copy(), reward
         self._reset([place for place in ended if place in self._running])
@@ -154,24 +154,24 @@ class SeedEnvironments:
     def relabel(
         self, place: Place, achieved: np.ndarray, desired: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None] | None:
-        """Return what `Environment.relabel` does; None where it fails, which the next `step` reports."""
+        """Return the result of `Environment.relabel`, or None if it fails, which the next `step` reports."""
         try:
-            return self._at[place].relabel(achieved, desired)
+            return self._by_place[place].relabel(achieved, desired)
         except EnvironmentFailure as error:
             self._fail(place, error)
             return None
 
     def stop(self, index: int) -> None:
-        """Step the seed at this place in the group no more."""
+        """Stop stepping the seed with this index."""
         self.alive[index] = False
-        self._rest(index)
+        self._stop_stepping(index)
 
     def save(self, index: int) -> Snapshot:
-        """Return what the seed at this place needs to go on; unless "exact", from the start of its episodes.
+        """Return a snapshot of the seed with this index. Unless "exact", restoring it restarts the current episodes.
 
-        "problem" says what is wrong with an environment that offers to be saved and cannot.
+        "problem" says why an environment that supports snapshots could not be saved.
         """
-        saved = {str(place[-1]): self._save(place) for place in self._of(index)}
+        saved = {str(place[-1]): self._save(place) for place in self._places_of(index)}
         if self.spec.environments == 1:
             return next(iter(saved.values()))
         joined, all_values = Snapshot.joined(saved), [one.values for one in saved.values()]
@@ -181,27 +181,27 @@ class SeedEnvironments:
         return joined
 
     def _save(self, place: Place) -> Snapshot:
-        inner, problem = None, ""
+        snapshot, problem = None, ""
         try:
-            inner = self._at[place].snapshot() if self.alive[place[0]] else None
+            snapshot = self._by_place[place].snapshot() if self.alive[place[0]] else None
         except EnvironmentFailure as error:
             problem = str(error)
-        arrays = {"observation": self.observations[place].copy(), **(inner.arrays if inner else {})}
+        arrays = {"observation": self.observations[place].copy(), **(snapshot.arrays if snapshot else {})}
         values = {
             "alive": bool(self.alive[place[0]]),
             "reward": float(self._reward[place]),
-            "episodes_begun": self._begun[place],
+            "episodes_begun": self._episodes_begun[place],
             "episode_return": self._returns[place],
             "episode_length": self._lengths[place],
-            **({"events": self._said[place].sums} if self._said[place].sums else {}),
-            "exact": inner is not None,
+            **({"events": self._episode_events[place].sums} if self._episode_events[place].sums else {}),
+            "exact": snapshot is not None,
             "problem": problem,
-            "environment": inner.values if inner else {},
+            "environment": snapshot.values if snapshot else {},
         }
         return Snapshot(arrays, values)
 
     def refuse_incompatible(self, saved: Snapshot, actions: np.ndarray) -> None:
-        """Raise InputError where `save` was of a task with other sizes; `actions` are those that were to come next."""
+        """Raise InputError if `saved` is of a task with other sizes; `actions` are the saved ones to apply next."""
         first = "observation" if self.spec.environments == 1 else "0.observation"
         before, now = (saved.arrays[first].size, actions.shape[-1]), (self.spec.observation_size, self.spec.action_size)
         if before != now:
@@ -211,46 +211,46 @@ class SeedEnvironments:
             )
 
     def restore(self, index: int, saved: Snapshot) -> bool:
-        """Let the seed at this place go on from `save`; return false where an episode of it had to start anew.
+        """Restore the seed with this index from `save`; return False if any of its episodes had to be restarted.
 
-        That is so as well where the environment does not take the snapshot, which `refused` then says. A seed whose
-        environment cannot be reset either is reported by the next `step`.
+        An environment that rejects its snapshot restarts too, and `refused` says why. A seed whose environment cannot
+        be reset either is reported by the next `step`.
         """
         if self.spec.environments == 1:
             return self._restore((index,), saved, saved.values["exact"])
-        parts = {place: saved.part(str(place[-1])) for place in self._of(index)}
-        gone_on = [self._restore(place, part, saved.values["exact"]) for place, part in parts.items()]
-        return all(gone_on)
+        parts = {place: saved.part(str(place[-1])) for place in self._places_of(index)}
+        are_restored = [self._restore(place, part, saved.values["exact"]) for place, part in parts.items()]
+        return all(are_restored)
 
     def _restore(self, place: Place, saved: Snapshot, is_exact: bool) -> bool:
         arrays, values = dict(saved.arrays), saved.values
-        self._begun[place] = values["episodes_begun"]
+        self._episodes_begun[place] = values["episodes_begun"]
         self.observations, self._reward = self.observations.copy(), self._reward.copy()
         self.observations[place], self._reward[place] = arrays.pop("observation"), values["reward"]
         if not values["alive"]:
             self.stop(place[0])
         elif is_exact and self._is_restored(place, Snapshot(arrays, values["environment"])):
             self._returns[place], self._lengths[place] = values["episode_return"], values["episode_length"]
-            self._said[place] = EpisodeEvents(self._events, values.get("events"))
+            self._episode_events[place] = EpisodeEvents(self._events, values.get("events"))
         else:
-            self._begun[place] -= 1
+            self._episodes_begun[place] -= 1
             self._reset([place])
             return False
         return True
 
     def begin_again(self) -> np.ndarray:
-        """Start the episodes in progress anew: observations [seed, observation]."""
-        self._begun = {place: begun - 1 for place, begun in self._begun.items()}
+        """Restart the episodes in progress; return observations [seed, observation]."""
+        self._episodes_begun = {place: begun - 1 for place, begun in self._episodes_begun.items()}
         return self.reset()
 
     @property
     def is_at_start(self) -> bool:
-        """Whether no environment has made a step of its episode."""
+        """Whether every environment is at the start of its episode."""
         return not any(self._lengths.values())
 
     @property
     def is_any_alive(self) -> bool:
-        """Whether a seed still steps, or its failure is yet to be reported."""
+        """Whether a seed is still stepped, or has a failure that is not reported yet."""
         return bool(self._running or self._failures)
 
     def close(self) -> None:
@@ -260,39 +260,39 @@ class SeedEnvironments:
         if self._workers:
             self._workers.close()
 
-    def _of(self, index: int) -> list[Place]:
-        """Return the places of the environments of the seed at this place."""
+    def _places_of(self, index: int) -> list[Place]:
+        """Return the places of the environments of the seed with this index."""
         return [place for place in self._places if place[0] == index]
 
     def _reset(self, places: Sequence[Place]) -> None:
-        seeds = [training_seed(self.seeds[place[0]], self._begun[place], *place[1:]) for place in places]
+        seeds = [training_seed(self.seeds[place[0]], self._episodes_begun[place], *place[1:]) for place in places]
         for place, seed in zip(places, seeds, strict=True):
             self._returns[place], self._lengths[place] = 0.0, 0
-            self._said[place] = EpisodeEvents(self._events)
-            self._begun[place] += 1
+            self._episode_events[place] = EpisodeEvents(self._events)
+            self._episodes_begun[place] += 1
             if self._workers:
-                self._at[place].ask("reset", seed)
+                self._by_place[place].ask("reset", seed)
         for place, seed in zip(places, seeds, strict=True):
             try:
-                self.observations[place] = self._at[place].reset(seed)
+                self.observations[place] = self._by_place[place].reset(seed)
             except EnvironmentFailure as error:
                 self._fail(place, error)
 
     def _is_restored(self, place: Place, saved: Snapshot) -> bool:
-        """Return whether the environment goes on with its episode; one that was saved by another task may not."""
-        seed = training_seed(self.seeds[place[0]], self._begun[place] - 1, *place[1:])
+        """Restore an environment's snapshot; return whether it accepts it: the task may have changed since."""
+        seed = training_seed(self.seeds[place[0]], self._episodes_begun[place] - 1, *place[1:])
         try:
-            self._at[place].restore(seed, saved)
+            self._by_place[place].restore(seed, saved)
         except EnvironmentFailure as error:
             self.refused[place[0]] = str(error)
             return False
         return True
 
-    def _rest(self, index: int) -> None:
+    def _stop_stepping(self, index: int) -> None:
         self._running = [place for place in self._running if place[0] != index]
 
     def _fail(self, place: Place, error: EnvironmentFailure) -> None:
-        self._rest(place[0])
+        self._stop_stepping(place[0])
         details = "".join(traceback.format_exception(error)) if error.__cause__ else ""
         if all(failure.seed_index != place[0] for failure in self._failures):
             self._failures.append(Failure(place[0], str(error), details))

@@ -1,4 +1,4 @@
-"""Environments in processes of their own: what a seed's slow environments compute, they compute side by side."""
+"""Step slow environments in parallel worker processes."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from csac.tasks.registry import Task
 from csac.tasks.spaces import ContractParts
 from csac.types import Spec
 
-SECONDS_THAT_PAY = 3e-4  # of a step: asking a process for it takes a fifth of that
+SECONDS_THAT_PAY = 3e-4  # per step; the round trip to a process takes a fifth of that
 STEPS_TRIED = 10
 
 
 class Workers:
-    """Processes with so many environments each, and an `Environment` here for each of those.
+    """Worker processes with `counts` of environments each, and a `RemoteEnvironment` for each of these.
 
-    Of a step's `info` only the numbers that `events` are of come back.
+    A step returns only those entries of `info` that `events` need, if they are numbers.
     """
 
     def __init__(
         self,
         task: Task,
         environment_arguments: dict[str, Any] | None,
-        numbers: list[int],
+        counts: list[int],
         seed: int,
         events: Sequence[str] = (),
     ) -> None:
         self._workers: list[Worker] = []
         try:
-            for index, number in enumerate(numbers):
-                work = _serve, task, environment_arguments, number, seed + index, events
+            for index, count in enumerate(counts):
+                work = _serve, task, environment_arguments, count, seed + index, events
                 self._workers.append(Worker(*work))
-            facts = [worker.answer() for worker in self._workers]
+            descriptions = [worker.answer() for worker in self._workers]
         except BaseException:
             self.close()
             raise
         self.environments = [
-            RemoteEnvironment(worker, i, *of_worker)
-            for worker, number, of_worker in zip(self._workers, numbers, facts, strict=True)
-            for i in range(number)
+            RemoteEnvironment(worker, i, *description)
+            for worker, count, description in zip(self._workers, counts, descriptions, strict=True)
+            for i in range(count)
         ]
 
     def close(self) -> None:
@@ -63,33 +63,33 @@ class Workers:
 
 
 class RemoteEnvironment:
-    """An `Environment` in another process, with its methods; what is asked ahead is computed meanwhile.
+    """An `Environment` in a worker process, with its methods; `ask` starts a call without waiting for the result.
 
-    A worker answers in order: of the environments that it has, what is asked ahead of all is answered before more is
-    asked. Its death is an EnvironmentFailure of each.
+    A worker answers in order: after `ask` on several of its environments, collect their results in the same order
+    before calling anything else. If it dies, every call raises EnvironmentFailure.
     """
 
-    def __init__(self, worker: Worker, number: int, spec: Spec, parts: ContractParts, task_name: str) -> None:
+    def __init__(self, worker: Worker, index: int, spec: Spec, parts: ContractParts, task_name: str) -> None:
         self.spec, self.contract_parts, self.task_name = spec, parts, task_name
-        self._worker, self._number, self._is_asked = worker, number, False
+        self._worker, self._index, self._is_pending = worker, index, False
 
     def ask(self, method: str, *arguments: Any) -> None:
-        """Begin to compute what the next call of this method returns."""
-        with suppress(OSError):  # of a dead process; it is seen when it does not answer
-            self._worker.tell((self._number, method, arguments))
-        self._is_asked = True
+        """Start a call in the worker; the next call of the method returns its result."""
+        with suppress(OSError):  # the process is dead: `answer` reports it
+            self._worker.tell((self._index, method, arguments))
+        self._is_pending = True
 
     def __getattr__(self, method: str) -> Callable[..., Any]:
-        """Return a method of the environment, which is called in its process."""
+        """Return a method of the environment, to be run in the worker."""
         return partial(self._answer, method)
 
     def close(self) -> None:
-        """Do nothing: `Workers.close` closes all."""
+        """Do nothing: `Workers.close` closes all environments."""
 
     def _answer(self, method: str, *arguments: Any) -> Any:
-        if not self._is_asked:
+        if not self._is_pending:
             self.ask(method, *arguments)
-        self._is_asked = False
+        self._is_pending = False
         return self._worker.answer()
 
 
@@ -97,7 +97,7 @@ class Worker(Child):
     """The parent's end of a process that steps environments."""
 
     def answer(self) -> Any:
-        """Return the next answer, or raise what was raised there; EnvironmentFailure where the process is gone."""
+        """Return the next answer or raise the worker's exception; raise EnvironmentFailure if the process is gone."""
         try:
             answer, error, details = self.connection.recv()
         except (EOFError, OSError):
@@ -111,42 +111,42 @@ def _serve(
     connection: Connection,
     task: Task,
     environment_arguments: dict[str, Any] | None,
-    number: int,
+    count: int,
     seed: int,
     events: Sequence[str],
 ) -> None:
-    """Do what environments are asked, until there is no more or the parent is gone."""
+    """Run the requested calls on environments until the parent sends None or is gone."""
     seed_globals(seed)
     environments: list[Environment] = []
     names = {info_name(event) for event in events}
     with ExitStack() as stack, suppress(EOFError, OSError):
 
         def make() -> tuple[Any, ...]:
-            for _ in range(number):
+            for _ in range(count):
                 environments.append(Environment(task, environment_arguments))
                 stack.callback(environments[-1].close)
             return environments[0].spec, environments[0].contract_parts, environments[0].task_name
 
         connection.send(_outcome(names, make))
-        while asked := connection.recv():
-            place, method, arguments = asked
-            connection.send(_outcome(names, getattr(environments[place], method), *arguments))
+        while request := connection.recv():
+            index, method, arguments = request
+            connection.send(_outcome(names, getattr(environments[index], method), *arguments))
 
 
 def _outcome(names: set[str], function: Any, *arguments: Any) -> tuple[Any, Exception | None, str]:
-    """Return what a call returns, or raises, with the traceback of its cause."""
+    """Return (result, exception, traceback of the exception's cause) of a call."""
     try:
         result = function(*arguments)
         if function.__name__ == "step_environment_scale":
-            told = {name: result[-1][name] for name in names & result[-1].keys()}
-            result = (*result[:-1], numbers_in(told))  # its info may hold what cannot be sent
+            wanted = {name: result[-1][name] for name in names & result[-1].keys()}
+            result = (*result[:-1], numbers_in(wanted))  # `info` may hold objects that cannot be pickled
         return result, None, ""
     except Exception as error:
         return None, error, "".join(traceback.format_exception(error)) if error.__cause__ else ""
 
 
 def choose_processes(task: Task, environment_arguments: dict[str, Any] | None, environments: int, cores: int) -> int:
-    """Return how many processes pay for so many environments: one for each core where a step takes long, else none."""
+    """Return how many processes are worthwhile: if a step is slow, one per environment up to `cores`, else 0."""
     processes = min(environments, cores)
     if processes < 2:
         return 0
