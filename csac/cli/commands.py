@@ -1,4 +1,4 @@
-"""What each sub-command does."""
+"""Implement the sub-commands of `csac`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def run(name: str, words: list[str]) -> int:
-    """Run a sub-command and return its exit code. Raises InputError, Failure, and on a signal KeyboardInterrupt."""
+    """Run a sub-command and return its exit code. Raises InputError, Failure, and KeyboardInterrupt on a signal."""
     command = shlex.join(["csac", name, *words])
     try:
         if name == "study":
@@ -54,13 +54,13 @@ def _resume(options: Resume, command: str) -> int:
 
 
 def _leaving_at_once() -> Any:
-    from csac.training.signals import leaving_at_once  # NumPy comes with it
+    from csac.training.signals import leaving_at_once  # imports NumPy
 
     return leaving_at_once()
 
 
 def _trained(training: Callable[..., RunSet], *given: Any, **options: Any) -> int:
-    """Train, and return the exit code; where it was stopped, print the line to type next."""
+    """Train and return the exit code; if training was stopped, print the command that resumes it."""
     from csac.console.tables import program
     from csac.training.signals import Interrupted
 
@@ -84,7 +84,7 @@ def _evaluate(options: Evaluate, _: str) -> int:
 
     given, console, runs = dict(vars(options)), tables.make_console(), RunSet.open(options.directory)
     file, deterministic = given.pop("csv"), not given.pop("stochastic")
-    target = file and file.absolute()  # a task may change where we are
+    target = file and file.absolute()  # a task may change the working directory
     notes = perturbation_notes(options.directory, options.perturbations)
     if file:
         check_new(file)
@@ -146,7 +146,7 @@ def _export(options: Export, _: str) -> int:
 
 
 def _unlearnt(runs: RunSet) -> list[str]:
-    """Return what to say of policies that are as they began, since their runs were stopped in the warm-up."""
+    """Return a note if the policies are untrained because their runs were stopped during the warm-up."""
     manifest = runs.runs[0].manifest
     warmup = manifest.config.hyperparameters.get("warmup_steps", 0)
     if manifest.steps_done >= warmup or manifest.forked_from:
@@ -163,7 +163,7 @@ def _latency(options: Latency, _: str) -> int:
 
     console, measured = make_console(), {}
     for name, artefact in {str(path): open_artefact(path, optimise=True) for path in options.artefacts}.items():
-        print_lines(console, [f"measuring {name}"])  # once: what moves on a terminal takes time from a core
+        print_lines(console, [f"measuring {name}"])  # no live display: it would take CPU time
         measured[name] = measure(artefact, options.calls, options.rate, options.seconds)
     console.print(latency_table(measured))
     return 0
