@@ -1,4 +1,4 @@
-"""Reports: one self-contained HTML file, or Markdown with its pictures beside it, of runs side by side."""
+"""Write reports that compare runs: one self-contained HTML file, or Markdown with its pictures beside it."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ if TYPE_CHECKING:
 
     from csac.studies.arms import Arm
 
-MOST_CURVES = 7  # that are told apart in one picture
+MOST_CURVES = 7  # in one picture
 POINTS = 3  # evaluations at the end of a run that count as its score
 
 
 class Picture(NamedTuple):
-    """A figure and what it is called."""
+    """A figure and its title."""
 
     title: str
     figure: Figure
 
 
 class Commands(NamedTuple):
-    """Lines to type."""
+    """Command lines to show."""
 
     lines: tuple[str, ...]
 
 
 class Heading(NamedTuple):
-    """The title of what follows."""
+    """The heading of a section."""
 
     text: str
 
@@ -57,7 +57,7 @@ Part = str | Heading | Table | Picture | Commands
 
 
 def report_of(arms: Sequence[Arm], commands: Sequence[str], analyses: Sequence[str]) -> list[Part]:
-    """Return the report of these arms, with these sections among others."""
+    """Return the parts of a report on these arms; `analyses` names its optional sections."""
     shown = [arm for arm in arms if len(arm.rows)]
     parts = list(overview(arms))
     for name, section in SECTIONS.items():
@@ -69,7 +69,7 @@ def report_of(arms: Sequence[Arm], commands: Sequence[str], analyses: Sequence[s
 
 
 def write(path: Path, title: str, parts: Sequence[Part]) -> None:
-    """Write a report as `path`, an .html or an .md file. Raises InputError where it is another or cannot be written."""
+    """Write a report to `path`, an .html or .md file. Raises InputError for another kind, or if writing fails."""
     if path.suffix not in (".html", ".md"):
         raise InputError(f"a report is an .html or an .md file: name it {path.with_suffix('.html')}")
     with writing(path):
@@ -107,7 +107,7 @@ def _markdown(path: Path, title: str, parts: Sequence[Part]) -> str:
 
 
 def overview(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Which runs there are, which of them failed and which are incomplete."""
+    """Yield a table of the runs, and notes on those that failed or are incomplete."""
     yield Heading("Runs")
     rows = []
     for arm in arms:
@@ -126,7 +126,7 @@ def overview(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def curves(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Learning curves, task by task."""
+    """Yield the learning curves, task by task."""
     yield Heading("Learning curves")
     looks = looks_of(arm.label for arm in arms)
     for place, own in by_place(arms).items():
@@ -136,7 +136,7 @@ def curves(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def returns(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Scores with their intervals, maximum average returns and the paper's, worst seeds and drawdowns."""
+    """Yield tables of scores with intervals, maximum average returns and the paper's, worst seeds and drawdowns."""
     yield Heading("Returns")
     for place, own in by_place(arms).items():
         runs = [(arm.label, arm.rows) for arm in own]
@@ -164,7 +164,7 @@ def _extremes(arm: Arm) -> Row:
 
 
 def efficiency(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Steps to the lowest of the maximum average returns."""
+    """Yield tables of the steps to the lowest of the maximum average returns."""
     yield Heading("Steps to the lower boundary of the maximum average returns")
     for place, own in by_place(arms).items():
         if len(own) < 2:
@@ -182,7 +182,7 @@ def efficiency(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def robustness(arms: Sequence[Arm]) -> Iterator[Part]:
-    """What each perturbation cost, as far as the next."""
+    """Yield tables of what each perturbation cost, measured up to the next one."""
     if any(arm.marks for arm in arms):
         yield Heading("Perturbations")
     for own in by_place(arm for arm in arms if arm.marks).values():
@@ -193,7 +193,7 @@ def robustness(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def cases(arms: Sequence[Arm]) -> Iterator[Part]:
-    """How often success and events came in the last evaluations."""
+    """Yield tables of how often success and events occurred in the last evaluations."""
     tables = []
     for place, own in by_place(arms).items():
         if table := report_tables.case_comparison_table([(arm.label, last_rows(arm.rows, POINTS)) for arm in own]):
@@ -204,7 +204,7 @@ def cases(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def success(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Curves of the share of successful episodes."""
+    """Yield curves of the share of successful episodes."""
     telling = [arm for arm in arms if is_case(arm.rows["success"])]
     looks = looks_of(arm.label for arm in arms)
     if telling:
@@ -229,11 +229,11 @@ SECTIONS: Mapping[str, Callable[[Sequence[Arm]], Iterator[Part]]] = {
 }
 
 
-ANALYSES = ("curves", "returns", "robustness", "success", "cases")  # of runs that are no study's
+ANALYSES = ("curves", "returns", "robustness", "success", "cases")  # of runs outside a study
 
 
 def over_tasks(arms: Sequence[Arm]) -> Iterator[Part]:
-    """The methods over all tasks, where they have the same seeds on several: shares of one method's mean scores."""
+    """Yield a table of scores over all tasks, as shares of one method's means, if methods share tasks and seeds."""
     unchanged = [arm for arm in arms if not arm.condition]
     tasks = list(dict.fromkeys(arm.task for arm in unchanged))
     scores = {(arm.label, arm.task): last_evaluations(arm.rows, POINTS) for arm in unchanged}
@@ -260,7 +260,7 @@ def over_tasks(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def the_papers(arms: Sequence[Arm]) -> Iterator[Part]:
-    """How the paper's claims stand."""
+    """Yield the verdicts on the paper's claims."""
     if not (found := paper.claims(arms)):
         return
     rows = []
@@ -276,7 +276,7 @@ def the_papers(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
-    """What differs among the methods, and what is the same in all of them."""
+    """Yield the hyperparameters that differ between the methods, and those that are the same in all of them."""
     methods: dict[str, list[dict[str, str]]] = {}
     for arm in arms:
         if arm.runs:
@@ -297,7 +297,7 @@ def hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def provenance(arms: Sequence[Arm], commands: Sequence[str]) -> Iterator[Part]:
-    """Versions, machines and times of the runs, and the commands that make them again."""
+    """Yield the versions, machines and times of the runs, and the commands that reproduce them."""
     runs = [run for arm in arms for run in arm.runs]
     if runs:
         manifests = [run.manifest for run in runs]

@@ -1,6 +1,6 @@
-"""`csac tune`: Optuna chooses hyperparameters, csac trains a set of runs with them, and the worst end early.
+"""`csac tune`: Optuna chooses hyperparameters, csac trains a set of runs with them, and bad trials are pruned.
 
-Any number of processes may share a directory: the study is a journal in it, and each trial a folder, `trial-<n>`.
+Any number of processes may share a directory: Optuna's study is a journal in it, and each trial a folder, `trial-<n>`.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-STARTUP_TRIALS = 5  # that are never pruned, and that must be complete before any is
-SHARE_UNPRUNED = 0.25  # of a trial's steps, at its beginning
+STARTUP_TRIALS = 5  # that must be complete before any trial is pruned
+SHARE_UNPRUNED = 0.25  # of a trial's steps, from its beginning
 SHOWN = 10  # trials in the table at the end
 
 
 class Trial(NamedTuple):
-    """A trial that this process runs, for as long as it holds the lock."""
+    """A trial that this process runs while it holds the lock."""
 
     trial: optuna.Trial
     folder: Path
@@ -53,10 +53,10 @@ class Trial(NamedTuple):
 
 
 def tune(search: Search, directory: Path, trials: int, command: str | None, console: Console) -> int:
-    """Run trials until the directory has so many, show the best, and return the exit code.
+    """Run trials until the directory has `trials` of them, show the best, and return the exit code.
 
-    Raises InputError where Optuna is missing, the task cannot be made, or the directory holds another search, and
-    StorageFailure where it can no longer be written.
+    Raises InputError if Optuna is missing, the task cannot be made, or the directory holds another search, and
+    StorageFailure if it can no longer be written.
     """
     check_whole("trials", trials, 1, 100_000)
     directory = directory.absolute()
@@ -74,7 +74,7 @@ def tune(search: Search, directory: Path, trials: int, command: str | None, cons
 
 
 def _open(search: Search, directory: Path) -> optuna.Study:
-    """Open the study, or begin it; its first trial is the configuration that the search begins with."""
+    """Open Optuna's study, or create it with the search's initial configuration as its first trial."""
     try:
         import optuna
         from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
@@ -109,9 +109,9 @@ def _open(search: Search, directory: Path) -> optuna.Study:
 
 
 def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> Trial | None:
-    """Return the next trial to run, or None once there are so many.
+    """Return the next trial to run, or None once there are `trials` of them.
 
-    A trial that says that it is running, and whose lock nobody holds, goes back to the queue first.
+    Before that, a trial that is marked as running but whose lock nobody holds goes back to the queue.
     """
     import optuna
 
@@ -124,7 +124,7 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
         known = study.get_trials(deepcopy=False)
         if sum(trial.state.name in ("COMPLETE", "PRUNED", "RUNNING") for trial in known) >= trials:
             return None
-        study.sampler = optuna.samplers.TPESampler(seed=len(known))  # the same for the same trials before it
+        study.sampler = optuna.samplers.TPESampler(seed=len(known))  # reproducible given the earlier trials
         trial = study.ask()
         latest = max((other.user_attrs.get("trial", -1) for other in known), default=-1)
         trial.set_user_attr("trial", trial.user_attrs.get("trial", latest + 1))
@@ -132,7 +132,7 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
         folder.mkdir(exist_ok=True)
         lock = kept_from_children(open(folder / ".lock", "a+"))  # noqa: SIM115  held for as long as the trial runs
         take(lock, folder)
-        with warnings.catch_warnings(action="ignore"):  # of a beginning outside the space
+        with warnings.catch_warnings(action="ignore"):  # the first trial may lie outside the space
             values = {name: draw(trial, name, dimension) for name, dimension in search.space.items()}
         trial.set_user_attr("values", values)
         return Trial(trial, folder, values, lock)
@@ -140,7 +140,7 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
 
 @contextmanager
 def _alone(directory: Path) -> Iterator[None]:
-    """Keep other processes from choosing a trial meanwhile; what a dead one has left is removed after a while."""
+    """Keep other processes from choosing a trial meanwhile; the lock of a dead process is removed after a while."""
     from optuna.storages.journal import JournalFileOpenLock
 
     mutex = JournalFileOpenLock(str(directory / "next"))
@@ -156,7 +156,7 @@ def _folder(directory: Path, trial: optuna.Trial | optuna.trial.FrozenTrial) -> 
 
 
 def _requeue(study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
-    """Put the configuration of a trial that was stopped back into the queue, to go on in its folder."""
+    """Put the configuration of a stopped trial back into the queue, to continue in its folder."""
     if "trial" in trial.user_attrs:
         params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
         study.enqueue_trial(params, user_attrs={"trial": trial.user_attrs["trial"]})
@@ -164,7 +164,7 @@ def _requeue(study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
 
 
 def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None, console: Console) -> None:
-    """Train a trial from where it is, and tell the study what came of it."""
+    """Train a trial from its newest checkpoint, and tell Optuna the result."""
     from optuna.trial import TrialState
 
     label = trial.folder.name
@@ -183,7 +183,7 @@ def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None,
         return is_pruned or bool(runs.failures)
 
     try:
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of seeds that fail: told below
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # failed seeds are reported below
             runs = train(
                 dataclasses.replace(search.algorithm, **trial.values),  # pyright: ignore[reportArgumentType]
                 search.config.task,
@@ -210,12 +210,12 @@ def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None,
         score = float(np.mean(list(last_evaluations(runs.evaluations).values())))
         study.tell(trial.trial, score)
         console.print(f"{label}: {number(score)}, best {number(study.best_value)}")
-    for run in runs.runs:  # nobody goes on with it any more, and the replay takes most of the room
+    for run in runs.runs:  # the trial is over, and the replay buffer takes most of the space
         shutil.rmtree(run.checkpoints, ignore_errors=True)
 
 
 def _scores(rows: np.ndarray, seeds: int, until: int) -> dict[int, float]:
-    """Return the score as it was at each step until this one at which every seed was evaluated."""
+    """Return the score at each step up to `until` at which every seed was evaluated."""
     steps = [step for step in np.unique(rows["step"]).tolist() if step <= until]
     steps = [step for step in steps if len(np.unique(rows["seed"][rows["step"] == step])) == seeds]
     return {step: float(np.mean([*last_evaluations(rows[rows["step"] <= step]).values()])) for step in steps}
@@ -226,7 +226,7 @@ def _complete(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
 
 
 def _conclude(study: optuna.Study, search: Search, directory: Path, console: Console) -> None:
-    """Show the best trials and the command to train the best, and draw Optuna's pictures."""
+    """Print the best trials and the command that trains the best one, and draw Optuna's pictures."""
     if not (complete := _complete(study)):
         console.print("no trial is complete")
         return
@@ -245,7 +245,7 @@ def _conclude(study: optuna.Study, search: Search, directory: Path, console: Con
 
 
 def _draw(study: optuna.Study, directory: Path) -> None:
-    """Draw what Optuna draws: the scores over the trials, and how much each hyperparameter matters."""
+    """Save Optuna's pictures: the scores over the trials, and how much each hyperparameter matters."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -256,6 +256,6 @@ def _draw(study: optuna.Study, directory: Path) -> None:
             ("history", pictures.plot_optimization_history),
             ("importances", pictures.plot_param_importances),
         ):
-            with suppress(ValueError, RuntimeError):  # of too few trials, or equal ones
+            with suppress(ValueError, RuntimeError):  # too few trials, or equal scores
                 axes: Any = draw(study)
                 axes.figure.savefig(directory / f"{name}.png", bbox_inches="tight", dpi=150)
