@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = _run(words)
     finally:
         failure = _flush()
-    return complain(_unwritten(failure), 1) if failure and not code else code
+    return complain(_write_error_message(failure), 1) if failure and not code else code
 
 
 def _run(words: list[str]) -> int:
@@ -66,7 +66,7 @@ def _run(words: list[str]) -> int:
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        return complain(_unwritten(error), 1)
+        return complain(_write_error_message(error), 1)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -86,7 +86,7 @@ def _dispatch(words: list[str]) -> int:
     return run(words[0], words[1:])
 
 
-def _unwritten(error: OSError) -> str:
+def _write_error_message(error: OSError) -> str:
     return f"not all of the output could be written: {error.strerror}"
 
 

@@ -121,8 +121,8 @@ class Train(_Training):
         planned = () if "none" in self.perturbations else self.perturbations or None  # None: keep the source's
         others = ("task", "algorithm", _field_of(self.algorithm), "preset", "hyperparameters", "seed")
         others += ("task_is_callable", "given")
-        given = {name: value for name, value in vars(self).items() if name not in others}
-        return {**given, "perturbations": planned, "events": self.events or None, "demonstrations": self.given}
+        arguments = {name: value for name, value in vars(self).items() if name not in others}
+        return {**arguments, "perturbations": planned, "events": self.events or None, "demonstrations": self.given}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,9 +265,9 @@ class List:
 def parse_training(base: type[Any], words: list[str], program: str) -> Any:
     """Return the parsed `Train` or `Tune`; its defaults come from the preset or from the runs given by `--from`."""
     first = "" if not words or words[0].startswith("-") else words[0]
-    options = parse(_with_algorithm(base, words, first), words, program, _elsewhere)
+    options = parse(_with_algorithm(base, words, first), words, program, _other_algorithms_hint)
     if options.preset and options.task != first:  # a preset's values can depend on the task
-        options = parse(_with_algorithm(base, words, options.task), words, program, _elsewhere)
+        options = parse(_with_algorithm(base, words, options.task), words, program, _other_algorithms_hint)
     return options
 
 
@@ -302,14 +302,14 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
     hints: dict[str, Any] = get_type_hints(base, include_extras=True)
     names = tuple(dict.fromkeys([*ALGORITHMS, name]))
     hints |= {"algorithm": Literal[names], "preset": Annotated[Literal[PRESETS] | None, hint]}  # pyright: ignore[reportInvalidTypeForm]
-    fields = [(item, hints[item], _defaulting(value)) for item, value in defaults.items()]
+    fields = [(item, hints[item], _field_with_default(value)) for item, value in defaults.items()]
     fields.append((_field_of(name), OmitArgPrefixes[type(learner)], field(default=learner)))
     return dataclasses.make_dataclass(
         base.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace={"__doc__": base.__doc__}
     )
 
 
-def _defaulting(value: Any) -> Any:
+def _field_with_default(value: Any) -> Any:
     return field(default_factory=lambda: value) if isinstance(value, dict) else field(default=value)
 
 
@@ -326,7 +326,7 @@ def _source(words: list[str]) -> RunSet | None:
     return RunSet.open(name if at and not Path(where).exists() else where)
 
 
-def _elsewhere(option: str) -> str:
+def _other_algorithms_hint(option: str) -> str:
     """Return a hint that names the algorithms with this option, or an empty string."""
     from csac.algorithms import ALGORITHMS
 

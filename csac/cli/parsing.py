@@ -31,11 +31,11 @@ class HelpShown(Exception):
 
 
 def parse(
-    command: type[Command], words: list[str], program: str, elsewhere: Callable[[str], str] = lambda option: ""
+    command: type[Command], words: list[str], program: str, hint_for: Callable[[str], str] = lambda option: ""
 ) -> Command:
     """Parse `words` into a `command`; if they ask for help, print it and raise HelpShown.
 
-    `elsewhere(option)` returns a hint for an option that the command lacks, or an empty string.
+    `hint_for(option)` returns a hint for an option that the command lacks, or an empty string.
     """
     rules: Any = {"prog": program, "args": words, "registry": _numbers(), "config": (DisallowNone,)}
     if {"-h", "--help"} & {*words}:
@@ -48,7 +48,7 @@ def parse(
         with patch.dict(os.environ, COLUMNS="10000"), redirect_stderr(complaint), redirect_stdout(io.StringIO()):
             return tyro.cli(command, **rules)
     except SystemExit:
-        raise InputError(f"{_one_line(complaint.getvalue(), command, elsewhere)} ({program} --help)") from None
+        raise InputError(f"{_one_line(complaint.getvalue(), command, hint_for)} ({program} --help)") from None
 
 
 def value_of(words: list[str], option: str) -> Any:
@@ -137,7 +137,7 @@ def options_of(kind: type[Any]) -> set[str]:
     return options
 
 
-def _one_line(complaint: str, command: type[Any], elsewhere: Callable[[str], str]) -> str:
+def _one_line(complaint: str, command: type[Any], hint_for: Callable[[str], str]) -> str:
     """Return tyro's error in one line. It writes a title, the error and suggestions, with rules between them."""
     _, what, more, *_ = [*re.split(r"^ *-{5,} *$", complaint, flags=re.MULTILINE), "", ""]
     what = " ".join(what.split())
@@ -148,6 +148,6 @@ def _one_line(complaint: str, command: type[Any], elsewhere: Callable[[str], str
         return re.sub(r"^Missing from [^:]*: (\S+).*", r"\1 is missing", what)
     option = unknown[1].partition("=")[0].replace("_", "-") if unknown[1].startswith("-") else unknown[1]
     meant = re.findall(r"^ *(--[a-z-]+)", more, re.MULTILINE)[:2]
-    hint = called_here(option, options_of(command)) or elsewhere(option)
+    hint = called_here(option, options_of(command)) or hint_for(option)
     hint = hint or (f"did you mean {' or '.join(meant)}?" if meant else "")
     return f"there is no {option} here" + (f": {hint}" if hint else "")

@@ -53,17 +53,17 @@ class Reporter:
         self._clock, self._speed = clock, Speed(clock)
         self._live: Live | None = None
         self._seeds: dict[int, _Seed] = {}
-        self._steps = self._shown = 0  # steps per run; step of the newest evaluation printed as a line
+        self._steps = self._printed = 0  # steps per run; step of the newest evaluation printed as a line
         self._warmup = 0.0  # steps before the first update, whose speed says nothing about later steps
-        self._began = self._spoke = clock()
+        self._started = self._last_output = clock()
 
     def start(self, runs: RunSet, notes: Sequence[str] = ()) -> None:
         """Print what is trained, its directory and the notes, and start the live display on a terminal."""
         config = runs.config
         self._steps, self._seeds = config.steps, {run.seed: _Seed(run) for run in runs.runs}
         self._warmup = config.hyperparameters.get("warmup_steps", 0)
-        self._shown = self._passed()
-        self._began = self._spoke = self._clock()
+        self._printed = self._newest_common_step()
+        self._started = self._last_output = self._clock()
         title = Text.assemble((f"{config.algorithm} on {config.task}", "bold"))
         self._print(title.append(f", {seeds_told(runs.seeds)}, {config.steps:,} steps{' each' * (len(runs.runs) > 1)}"))
         for line in (str(runs.path), *notes):
@@ -77,20 +77,20 @@ class Reporter:
         """Record the current steps of some seeds."""
         for seed, step in steps.items():
             self._seeds[seed].step = max(step, self._seeds[seed].step) if step > self._seeds[seed].begin else step
-        if self._is_warming():
+        if self._is_warming_up():
             self._speed = Speed(self._clock)
         self._speed.add(sum(one.step for one in self._seeds.values()))
-        if not self._live and self._clock() - self._spoke >= SECONDS_OF_SILENCE:
-            self._print(Text(f"step {self._range()} of {self._steps:,}{self._pace()}{self._news()}"))
+        if not self._live and self._clock() - self._last_output >= SECONDS_OF_SILENCE:
+            self._print(Text(f"step {self._range()} of {self._steps:,}{self._pace()}{self._newer_returns()}"))
 
     def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
         """Record the mean returns of some seeds' evaluations at `step`; print a line once no seed is behind."""
         for seed, value in returns.items():
             one = self._seeds[seed]
             one.returns[step], one.step = value, max(step, one.step)
-        passed = self._passed()
-        if not self._live and passed > self._shown:
-            self._shown = passed
+        passed = self._newest_common_step()
+        if not self._live and passed > self._printed:
+            self._printed = passed
             living = {seed: one.returns[passed] for seed, one in self._living().items() if passed in one.returns}
             mean = float(np.mean(list(living.values())))
             self._print(
@@ -110,7 +110,7 @@ class Reporter:
         """Replace the display by the results, and print where they are and what to type next."""
         self.close()
         self._print(Text())
-        self._print(Text(_outcome(runs, duration(self._clock() - self._began)), "bold"))
+        self._print(Text(_outcome(runs, duration(self._clock() - self._started)), "bold"))
         has_curve = bool(len(runs.evaluations))
         for table in result_tables(runs) if has_curve else [Text("no evaluations yet")]:
             self._print(table)
@@ -129,40 +129,42 @@ class Reporter:
     def _print(self, renderable: RenderableType) -> None:
         # A path or a command that is wrapped could not be copied.
         self.console.print(renderable, soft_wrap=isinstance(renderable, Text))
-        self._spoke = self._clock()
+        self._last_output = self._clock()
 
     def _living(self) -> dict[int, _Seed]:
         return {seed: one for seed, one in self._seeds.items() if not one.failure}
 
-    def _passed(self) -> int:
+    def _newest_common_step(self) -> int:
         """Return the newest step at which all seeds that have not failed are evaluated, 0 before the first."""
         newest = [max(one.returns, default=0) for one in self._living().values()]
         return min(newest, default=0)
 
-    def _is_warming(self) -> bool:
+    def _is_warming_up(self) -> bool:
         return any(one.step < min(self._warmup, self._steps) for one in self._living().values())
 
     def _range(self) -> str:
         steps = [one.step for one in (self._living() or self._seeds).values()]
         return f"{min(steps):,}" + (f" to {max(steps):,}" if max(steps) > min(steps) else "")
 
-    def _news(self) -> str:
+    def _newer_returns(self) -> str:
         """Return the last return of each seed that has an evaluation newer than the last one printed."""
         ahead = {
-            seed: max(one.returns) for seed, one in self._living().items() if max(one.returns, default=0) > self._shown
+            seed: max(one.returns)
+            for seed, one in self._living().items()
+            if max(one.returns, default=0) > self._printed
         }
-        told = [f"seed {seed} {number(self._seeds[seed].returns[step])} at {step:,}" for seed, step in ahead.items()]
-        return f"; last returns: {', '.join(told)}" if told and len(told) <= MOST_SEEDS_SHOWN else ""
+        returns = [f"seed {seed} {number(self._seeds[seed].returns[step])} at {step:,}" for seed, step in ahead.items()]
+        return f"; last returns: {', '.join(returns)}" if returns and len(returns) <= MOST_SEEDS_SHOWN else ""
 
     def _pace(self) -> str:
         """Return the speed and the time left, or the phase: compiling, warm-up or finishing."""
         living = self._living().values()
         if living and all(one.step <= one.begin for one in living):
-            return f", compiling for {duration(self._clock() - self._began)}"
+            return f", compiling for {duration(self._clock() - self._started)}"
         left = sum(self._steps - one.step for one in living)
         if living and not left:
             return ", finishing"
-        if self._is_warming():
+        if self._is_warming_up():
             return f", {self._warmup:,} random steps before learning"
         speed = self._speed.per_second()
         unit = "steps/s" if len(self._seeds) == 1 else "seed-steps/s"

@@ -53,21 +53,21 @@ def progress_shown(
 
     On a terminal this is one updating line with the time left; elsewhere a line every `SECONDS_OF_SILENCE`.
     """
-    speed, spoke = Speed(clock), clock()
+    speed, last_output = Speed(clock), clock()
     speed.add(0)
     status = console.status(doing) if console.is_interactive else None
 
     def show(done: int, total: int) -> None:
-        nonlocal spoke
+        nonlocal last_output
         speed.add(done)
         pace = speed.per_second()
         left = f", {duration((total - done) / pace)} left" if pace and done < total else ""
         text = f"{doing}: {done:,} of {total:,} {unit}{left}"
         if status:
             status.update(text)
-        elif clock() - spoke >= SECONDS_OF_SILENCE:
+        elif clock() - last_output >= SECONDS_OF_SILENCE:
             console.print(text, soft_wrap=True)
-            spoke = clock()
+            last_output = clock()
 
     with status or nullcontext():
         yield show

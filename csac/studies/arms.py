@@ -104,8 +104,8 @@ def gather(study: Study, directory: Path) -> list[Arm]:
     for wanted in study.runs():
         method, config, _ = wanted
         key = config.task, config.perturbations, method.label
-        made = Arm(method.label, config.task, config.perturbations, published=method.published)
-        arm = arms.setdefault(key, made)
+        new_arm = Arm(method.label, config.task, config.perturbations, published=method.published)
+        arm = arms.setdefault(key, new_arm)
         if run := wanted.open(directory):
             arm.runs.append(run)
         else:
@@ -156,16 +156,16 @@ def labels(arms: Sequence[Arm]) -> list[str]:
     A setting that distinguishes arms on one task is named on every task, so that a method has one label.
     """
     names = [arm.label or name_of(arm.config) for arm in arms]
-    apart: dict[str, list[str]] = {}
+    distinguishing: dict[str, list[str]] = {}
     for name in names:
-        own = [arm for arm, its in zip(arms, names, strict=True) if its == name and not arm.label]
-        by_place = itertools.groupby(sorted(own, key=lambda arm: arm.place), key=lambda arm: arm.place)
-        told = [item for _, beside in by_place for item in differing([settings(arm.config) for arm in beside])]
-        if own and name == own[0].config.title:  # no preset: its values may differ between tasks
-            told += differing([arm.config.hyperparameters for arm in own])
-        apart[name] = list(dict.fromkeys(told))
+        namesakes = [arm for arm, its in zip(arms, names, strict=True) if its == name and not arm.label]
+        by_place = itertools.groupby(sorted(namesakes, key=lambda arm: arm.place), key=lambda arm: arm.place)
+        differences = [item for _, beside in by_place for item in differing([settings(arm.config) for arm in beside])]
+        if namesakes and name == namesakes[0].config.title:  # no preset: its values may differ between tasks
+            differences += differing([arm.config.hyperparameters for arm in namesakes])
+        distinguishing[name] = list(dict.fromkeys(differences))
     full = [
-        ", ".join([name, *(f"{item} {plain(settings(arm.config).get(item))}" for item in apart[name])])
+        ", ".join([name, *(f"{item} {plain(settings(arm.config).get(item))}" for item in distinguishing[name])])
         for arm, name in zip(arms, names, strict=True)
     ]
     keys = [(label, arm.place) for arm, label in zip(arms, full, strict=True)]
@@ -177,22 +177,22 @@ def labels(arms: Sequence[Arm]) -> list[str]:
 
 def name_of(config: RunConfig) -> str:
     """Return the algorithm, the preset that a run follows, if any, and the `FITTED` values that differ from it."""
-    name, own, make = config.title, config.hyperparameters, ALGORITHMS.get(config.algorithm)
+    name, actual, make = config.title, config.hyperparameters, ALGORITHMS.get(config.algorithm)
     for preset in PRESETS:
         with suppress(InputError):  # a preset may lack the algorithm
             given: Any = hyperparameters(preset, config.algorithm, config.task)
             values: Any = dataclasses.asdict(make(**given)) if make else {}
-            changed = differing([own, values])
+            changed = differing([actual, values])
             if values and set(changed) <= set(FITTED):
-                return ", ".join([f"{name} ({preset})", *(f"{item} {plain(own.get(item))}" for item in changed)])
+                return ", ".join([f"{name} ({preset})", *(f"{item} {plain(actual.get(item))}" for item in changed)])
     return name
 
 
 def settings(config: RunConfig) -> dict[str, Any]:
     """Return the settings that a run's results depend on, apart from task, algorithm and perturbations."""
-    own = {name: value for name, value in vars(config).items() if name not in NO_SETTING}
+    options = {name: value for name, value in vars(config).items() if name not in NO_SETTING}
     arguments = {f"environment: {name}": value for name, value in config.environment_arguments.items()}
-    return {**config.hyperparameters, **own, **arguments}
+    return {**config.hyperparameters, **options, **arguments}
 
 
 def differing(several: Sequence[dict[str, Any]]) -> list[str]:
@@ -251,15 +251,15 @@ def _option(name: str, value: Any) -> list[str]:
 
 def seconds_per_step(run: RunDirectory) -> float | None:
     """Return the median seconds per step between evaluations in a run's log; interruptions do not count."""
-    told = []
+    evaluations = []
     with suppress(OSError, ValueError):
         for line in (run.path / "log.txt").read_text(encoding="utf-8").splitlines():
             moment, word, step, *_ = [*line.split(" "), "", ""]
             if word == "step" and step.endswith(":"):
-                told.append((datetime.fromisoformat(moment), int(step[:-1])))
+                evaluations.append((datetime.fromisoformat(moment), int(step[:-1])))
     paces = [
         (later - before).total_seconds() / (step - start)
-        for (before, start), (later, step) in itertools.pairwise(told)
+        for (before, start), (later, step) in itertools.pairwise(evaluations)
         if step > start
     ]
     return median(paces) if paces else None

@@ -28,7 +28,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from csac.studies.run import How
+    from csac.studies.run import Execution
     from csac.studies.study import Study
 
 HELP = """\
@@ -124,10 +124,10 @@ class Run(Show):
         """Return the chosen study on the chosen device."""
         return dataclasses.replace(super().study(), device=self.device)
 
-    def how(self) -> How:
+    def execution(self) -> Execution:
         """Return the execution options. Raises InputError for options that conflict."""
         from csac.studies.ray import Cluster
-        from csac.studies.run import How
+        from csac.studies.run import Execution
 
         workers = cores_to_use() if self.workers is None else self.workers
         check_whole("--workers", workers, 1, 10_000)
@@ -140,7 +140,7 @@ class Run(Show):
         if self.wandb:
             import_wandb()
         one_at_a_time = self.engine == "local" or self.cell is not None or (self.device == "gpu" and not self.workers)
-        return How(
+        return Execution(
             1 if one_at_a_time else workers,
             cluster if self.engine == "ray" else None,
             self.wandb,
@@ -201,8 +201,8 @@ def show(options: Show) -> int:
         rows.append((str(index), run.name, f"{short(steps)} / {short(run.config.steps)}", state, time))
     _print_table(("run", "what", "steps", "state", "such runs take"), rows)
     counts = Counter(row[3] for row in rows)
-    told = ", ".join(f"{count} {state}" for state, count in counts.items())
-    make_console().print(f"runs in {directory}: {told}", soft_wrap=True)
+    summary = ", ".join(f"{count} {state}" for state, count in counts.items())
+    make_console().print(f"runs in {directory}: {summary}", soft_wrap=True)
     return 0
 
 
@@ -215,13 +215,13 @@ def run(options: Run) -> int:
         check_whole("--cell", options.cell, 0, len(runs) - 1)
         runs = [runs[options.cell]]
     try:
-        stopped = run_study(runs, directory, options.how(), console)
+        stopped = run_study(runs, directory, options.execution(), console)
     except StorageFailure as failure:
         print(f"csac: {failure}; the same line goes on once that is mended", file=sys.stderr)
         return 1
     states = Counter(existing.state if (existing := one.open(directory)) else "waiting" for one in runs)
-    told = ", ".join(f"{count} {state}" for state, count in states.items())
-    console.print(f"runs in {directory}: {told}", soft_wrap=True)
+    summary = ", ".join(f"{count} {state}" for state, count in states.items())
+    console.print(f"runs in {directory}: {summary}", soft_wrap=True)
     for one in runs:
         if (existing := one.open(directory)) and existing.state == "failed":
             console.print(f"{one.name} failed at {existing.manifest.failure} ({existing.path})", soft_wrap=True)

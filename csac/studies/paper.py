@@ -93,15 +93,15 @@ class Claim(NamedTuple):
         """Return the verdict and the reason, from the interval of the probability that a seed of ours is better."""
         probability = probability_of_improvement(self.ours, self.others)
         interval = improvement_interval(self.ours, self.others)
-        told = f"better in {probability:.0%} of the pairs of seeds"
+        reason = f"better in {probability:.0%} of the pairs of seeds"
         if interval is None:
-            return "not yet decidable", f"{told}; fewer than five seeds"
+            return "not yet decidable", f"{reason}; fewer than five seeds"
         low, high = interval
         verdict = "reproduced" if low > 0.5 else "not reproduced" if high < 0.5 else "not yet decidable"
-        told += f", 95 % interval {low:.0%} to {high:.0%}"
+        reason += f", 95 % interval {low:.0%} to {high:.0%}"
         if self.needs_whole_runs and not (_is_whole(self.arm) and _is_whole(self.other)):
-            return "not yet decidable", f"runs shorter than the paper's: {told}"
-        return verdict, told
+            return "not yet decidable", f"runs shorter than the paper's: {reason}"
+        return verdict, reason
 
 
 def claims(arms: Sequence[Arm]) -> list[Claim]:
@@ -137,8 +137,8 @@ def _compared(arm: Arm, other: Arm, beside: Sequence[Arm]) -> Iterator[Claim]:
 
 def returns(arm: Arm, other: Arm) -> Iterator[Claim]:
     """Yield the claim of a higher maximum average return, where the paper reports one."""
-    told = RETURNS[arm.task]
-    if told["CSAC"].mean > told[other.published or ""].mean:
+    published = RETURNS[arm.task]
+    if published["CSAC"].mean > published[other.published or ""].mean:
         yield Claim("a higher maximum average return", arm, other, arm.best()[0], other.best()[0])
 
 
@@ -162,8 +162,8 @@ def efficiency(arm: Arm, other: Arm, arms: Sequence[Arm]) -> Iterator[Claim]:
 
     A seed that never reaches it is censored: two such seeds count as equal.
     """
-    told = INTERACTIONS.get(arm.task)
-    if told and told["CSAC"] < told[other.published or ""]:
+    published = INTERACTIONS.get(arm.task)
+    if published and published["CSAC"] < published[other.published or ""]:
         boundary, is_the_papers = lower_boundary(arms), not _has_ppo(arms)
         ours, others = -interactions(arm, boundary), -interactions(other, boundary)
         yield Claim("fewer steps to the lower boundary", arm, other, ours, others, not is_the_papers)
@@ -171,9 +171,9 @@ def efficiency(arm: Arm, other: Arm, arms: Sequence[Arm]) -> Iterator[Claim]:
 
 def cases(arm: Arm, other: Arm) -> Iterator[Claim]:
     """Yield the claims of fewer crashes and more complete flights on the quadrotor, where the paper reports so."""
-    for name, told in CASES.items() if arm.task == QUADX else ():
+    for name, row in CASES.items() if arm.task == QUADX else ():
         sign = 1 if name == "env_complete" else -1
-        if sign * (told["CSAC"].mean - told[other.published or ""].mean) > 0 and name in (arm.rows.dtype.names or ()):
+        if sign * (row["CSAC"].mean - row[other.published or ""].mean) > 0 and name in (arm.rows.dtype.names or ()):
             text = f"{'more' if sign > 0 else 'fewer'} episodes with {name}"
             yield Claim(text, arm, other, sign * _shares(arm, name), sign * _shares(other, name))
 

@@ -64,7 +64,7 @@ def report_of(arms: Sequence[Arm], commands: Sequence[str], analyses: Sequence[s
         if shown and name in analyses:
             parts += section(shown)
     if shown:
-        parts += [*over_tasks(shown), *the_papers(shown)]
+        parts += [*over_tasks(shown), *paper_claims(shown)]
     return [*parts, *hyperparameters(arms), *provenance(arms, commands)]
 
 
@@ -121,42 +121,42 @@ def overview(arms: Sequence[Arm]) -> Iterator[Part]:
         for seed, reason in arm.failures.items():
             yield f"Failed: {arm.label} on {arm.place}, seed {seed}: {reason}. It is in no number below."
         if arm.incomplete:
-            told = ", ".join(f"seed {seed} at step {step:,}" for seed, step in arm.incomplete.items())
-            yield f"Incomplete, in no number below: {arm.label} on {arm.place}, {told}."
+            incomplete = ", ".join(f"seed {seed} at step {step:,}" for seed, step in arm.incomplete.items())
+            yield f"Incomplete, in no number below: {arm.label} on {arm.place}, {incomplete}."
 
 
 def curves(arms: Sequence[Arm]) -> Iterator[Part]:
     """Yield the learning curves, task by task."""
     yield Heading("Learning curves")
     looks = looks_of(arm.label for arm in arms)
-    for place, own in by_place(arms).items():
-        for start in range(0, len(own), MOST_CURVES):
-            runs = [(arm.label, arm.rows) for arm in own[start : start + MOST_CURVES]]
-            yield Picture(place, figure_of(runs, place, own[0].marks, looks=looks))
+    for place, group in by_place(arms).items():
+        for start in range(0, len(group), MOST_CURVES):
+            runs = [(arm.label, arm.rows) for arm in group[start : start + MOST_CURVES]]
+            yield Picture(place, figure_of(runs, place, group[0].marks, looks=looks))
 
 
 def returns(arms: Sequence[Arm]) -> Iterator[Part]:
     """Yield tables of scores with intervals, maximum average returns and the paper's, worst seeds and drawdowns."""
     yield Heading("Returns")
-    for place, own in by_place(arms).items():
-        runs = [(arm.label, arm.rows) for arm in own]
-        yield report_tables.comparison_table(runs, [list(arm.failures) for arm in own], POINTS)._replace(title=place)
+    for place, group in by_place(arms).items():
+        runs = [(arm.label, arm.rows) for arm in group]
+        yield report_tables.comparison_table(runs, [list(arm.failures) for arm in group], POINTS)._replace(title=place)
         yield Table(
             ("method", "maximum average return", "the paper's", "worst seed", "largest drawdown"),
-            tuple(map(_extremes, own)),
+            tuple(map(_extremes, group)),
             note="mean ± standard deviation over seeds",
         )
 
 
 def _extremes(arm: Arm) -> Row:
-    told = paper.RETURNS.get(arm.task, {}).get(arm.published or "") if not arm.condition else None
+    published = paper.RETURNS.get(arm.task, {}).get(arm.published or "") if not arm.condition else None
     last = last_evaluations(arm.rows, POINTS)
     worst = min(last, key=lambda seed: last[seed])
     return Row(
         (
             Cell(arm.label),
             report_tables.plus_minus(over_seeds(arm.best()[0])),
-            Cell(f"{told.mean:,.2f} ± {told.std:,.2f}", told.mean) if told else EMPTY,
+            Cell(f"{published.mean:,.2f} ± {published.std:,.2f}", published.mean) if published else EMPTY,
             Cell(f"{number(last[worst])} (seed {worst})", last[worst]),
             report_tables.plus_minus(over_seeds(map(drawdown, evaluation_matrix(arm.rows)[2]))),
         )
@@ -166,16 +166,16 @@ def _extremes(arm: Arm) -> Row:
 def efficiency(arms: Sequence[Arm]) -> Iterator[Part]:
     """Yield tables of the steps to the lowest of the maximum average returns."""
     yield Heading("Steps to the lower boundary of the maximum average returns")
-    for place, own in by_place(arms).items():
-        if len(own) < 2:
+    for place, group in by_place(arms).items():
+        if len(group) < 2:
             continue
-        boundary, rows = paper.lower_boundary(own), []
-        for arm in own:
+        boundary, rows = paper.lower_boundary(group), []
+        for arm in group:
             steps = paper.interactions(arm, boundary)
             middle, reached = float(np.median(steps)), int(np.isfinite(steps).sum())
-            told = paper.INTERACTIONS.get(arm.task, {}).get(arm.published or "", math.nan)
+            published = paper.INTERACTIONS.get(arm.task, {}).get(arm.published or "", math.nan)
             cells = [Cell("not reached" if math.isinf(middle) else f"{middle:,.0f}", middle)]
-            cells += [Cell(f"{reached} of {len(steps)}", reached), numeric(told, f"{told:,.0f}")]
+            cells += [Cell(f"{reached} of {len(steps)}", reached), numeric(published, f"{published:,.0f}")]
             rows.append(Row((Cell(arm.label), *cells)))
         headings = ("method", "steps of the median seed", "seeds that get there", "the paper's")
         yield Table(headings, tuple(rows), f"{place}, return {number(boundary)}")
@@ -185,18 +185,18 @@ def robustness(arms: Sequence[Arm]) -> Iterator[Part]:
     """Yield tables of what each perturbation cost, measured up to the next one."""
     if any(arm.marks for arm in arms):
         yield Heading("Perturbations")
-    for own in by_place(arm for arm in arms if arm.marks).values():
-        steps = [-1, *(step for step, _ in own[0].marks), None]
-        for index, (step, text) in enumerate(own[0].marks):
-            found = [recoveries(arm.label, arm.rows, step, steps[index + 2], steps[index] or -1) for arm in own]
-            yield report_tables.recovery_table(found)._replace(title=f"{own[0].task}, {text} after step {step:,}")
+    for group in by_place(arm for arm in arms if arm.marks).values():
+        steps = [-1, *(step for step, _ in group[0].marks), None]
+        for index, (step, text) in enumerate(group[0].marks):
+            found = [recoveries(arm.label, arm.rows, step, steps[index + 2], steps[index] or -1) for arm in group]
+            yield report_tables.recovery_table(found)._replace(title=f"{group[0].task}, {text} after step {step:,}")
 
 
 def cases(arms: Sequence[Arm]) -> Iterator[Part]:
     """Yield tables of how often success and events occurred in the last evaluations."""
     tables = []
-    for place, own in by_place(arms).items():
-        if table := report_tables.case_comparison_table([(arm.label, last_rows(arm.rows, POINTS)) for arm in own]):
+    for place, group in by_place(arms).items():
+        if table := report_tables.case_comparison_table([(arm.label, last_rows(arm.rows, POINTS)) for arm in group]):
             tables.append(table._replace(title=place))
     if tables:
         yield Heading("How episodes end, in the last three evaluations")
@@ -205,17 +205,17 @@ def cases(arms: Sequence[Arm]) -> Iterator[Part]:
 
 def success(arms: Sequence[Arm]) -> Iterator[Part]:
     """Yield curves of the share of successful episodes."""
-    telling = [arm for arm in arms if is_case(arm.rows["success"])]
+    with_success = [arm for arm in arms if is_case(arm.rows["success"])]
     looks = looks_of(arm.label for arm in arms)
-    if telling:
+    if with_success:
         yield Heading("Success")
-    for place, own in by_place(telling).items():
+    for place, group in by_place(with_success).items():
         runs = []
-        for arm in own:
+        for arm in group:
             rows = arm.rows.copy()
             rows["return"] = np.nan_to_num(rows["success"], nan=0.0)
             runs.append((arm.label, rows))
-        figure = figure_of(runs, place, own[0].marks, "share of episodes with success", (-0.05, 1.05), looks)
+        figure = figure_of(runs, place, group[0].marks, "share of episodes with success", (-0.05, 1.05), looks)
         yield Picture(f"{place}, success", figure)
 
 
@@ -254,12 +254,12 @@ def over_tasks(arms: Sequence[Arm]) -> Iterator[Part]:
         middle = report_tables.middle(own / reference, ".2f")
         rows.append(Row((Cell(label), middle, above, Cell(str(own.size), own.size))))
     yield Heading("Over all tasks")
-    told = f"{', '.join(tasks)}; seeds {', '.join(map(str, seeds))}; scores as shares of the mean of {first}"
+    note = f"{', '.join(tasks)}; seeds {', '.join(map(str, seeds))}; scores as shares of the mean of {first}"
     headings = ("method", "IQM (95 % bootstrap interval)", f"above {first}, probability (95 %)", "runs")
-    yield Table(headings, tuple(rows), told)
+    yield Table(headings, tuple(rows), note)
 
 
-def the_papers(arms: Sequence[Arm]) -> Iterator[Part]:
+def paper_claims(arms: Sequence[Arm]) -> Iterator[Part]:
     """Yield the verdicts on the paper's claims."""
     if not (found := paper.claims(arms)):
         return
@@ -270,8 +270,8 @@ def the_papers(arms: Sequence[Arm]) -> Iterator[Part]:
         rows.append(Row(tuple(map(Cell, texts))))
     yield Heading("The paper's claims")
     counts = Counter(row.cells[2].text for row in rows)
-    told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
-    yield f"Of {len(rows)}: {told}. Not corrected for their number."
+    summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
+    yield f"Of {len(rows)}: {summary}. Not corrected for their number."
     yield Table(("task", "claim", "verdict", "because"), tuple(rows))
 
 
@@ -280,8 +280,8 @@ def hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
     methods: dict[str, list[dict[str, str]]] = {}
     for arm in arms:
         if arm.runs:
-            told = {name: plain(value) for name, value in settings(arm.config).items()}
-            methods.setdefault(arm.label, []).append(told)
+            texts = {name: plain(value) for name, value in settings(arm.config).items()}
+            methods.setdefault(arm.label, []).append(texts)
     if not methods:
         return
     every = [own for several in methods.values() for own in several]

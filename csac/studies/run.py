@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from csac.studies.study import StudyRun
 
 
-class How(NamedTuple):
+class Execution(NamedTuple):
     """Options for executing the runs of a study."""
 
     workers: int = 1
@@ -45,26 +45,26 @@ class How(NamedTuple):
     command: str | None = None
 
 
-def run_study(runs: Sequence[StudyRun], directory: Path, how: How, console: Console) -> int | None:
+def run_study(runs: Sequence[StudyRun], directory: Path, execution: Execution, console: Console) -> int | None:
     """Train the unfinished runs. Return the signal that stopped them, if any; every run is then saved."""
     directory = directory.absolute()
     waiting = {directory / run.folder: run for run in runs if not run.is_over(directory)}
     for path in [path for path in waiting if is_run(path) and RunDirectory.open(path).state == "running"]:
         console.print(f"{waiting.pop(path).name}: another process trains it", soft_wrap=True)
-    if how.cluster is None:  # the nodes of a cluster may have tasks that this machine lacks
+    if execution.cluster is None:  # the nodes of a cluster may have tasks that this machine lacks
         try_tasks(waiting.values())
-    programs = [_program(path, run, how) for path, run in waiting.items()]
+    programs = [_program(path, run, execution) for path, run in waiting.items()]
     with (
         stop_requested(lambda text: console.print(text)) as request,
         progress_shown(console, "training", "steps") as show,
     ):
         progress = Progress(waiting, console, show)
-        if programs and how.cluster:
-            how.cluster.run(programs, progress.of, request.is_set)
+        if programs and execution.cluster:
+            execution.cluster.run(programs, progress.of, request.is_set)
         elif programs:
             turns = len(usable_cores()) // programs[0].threads
-            supervise(programs, progress.of, request.is_set, how.workers, turns)
-    if not how.keep_checkpoints:
+            supervise(programs, progress.of, request.is_set, execution.workers, turns)
+    if not execution.keep_checkpoints:
         for path in waiting:
             if RunDirectory.open(path).manifest.state == "finished":  # the replay buffer takes most of the space
                 shutil.rmtree(path / "checkpoint", ignore_errors=True)
@@ -84,10 +84,10 @@ def try_tasks(runs: Any) -> None:
                     environment.perturb({change.kind: change.value})
 
 
-def _program(path: Path, run: StudyRun, how: How) -> Program:
+def _program(path: Path, run: StudyRun, execution: Execution) -> Program:
     """Return the program that trains a run, after creating its directory or raising its number of steps."""
-    cores = how.cluster.cores if how.cluster else cores_to_use()
-    threads = cores if how.cluster else max(1, cores // how.workers)
+    cores = execution.cluster.cores if execution.cluster else cores_to_use()
+    threads = cores if execution.cluster else max(1, cores // execution.workers)
     if is_run(path):
         existing = RunDirectory.open(path)
         if run.config.steps > existing.config.steps:
@@ -98,7 +98,9 @@ def _program(path: Path, run: StudyRun, how: How) -> Program:
             threads = min(existing.manifest.machine.cores, cores) or threads
     else:
         RunDirectory.create(path, Manifest(config=run.config, program=(run.config.seed,)))
-    return Program((path,), algorithm_of(run.config), run.config.task, threads, wandb=how.wandb, command=how.command)
+    return Program(
+        (path,), algorithm_of(run.config), run.config.task, threads, wandb=execution.wandb, command=execution.command
+    )
 
 
 class Progress:

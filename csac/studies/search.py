@@ -78,7 +78,7 @@ def _is_tau_idle(algorithm: Any) -> bool:
 
 
 # When a hyperparameter has an effect; those that are not listed always do.
-_WORKS: Mapping[str, Callable[[Any], bool]] = {
+_HAS_EFFECT: Mapping[str, Callable[[Any], bool]] = {
     "relative_entropy_weight": lambda algorithm: not _is_tau_idle(algorithm),
     "reference_period": lambda algorithm: algorithm.reference_policy == "periodic" and algorithm.reference_period > 1,
     "reference_rate": lambda algorithm: algorithm.reference_policy == "average",
@@ -95,7 +95,7 @@ def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: S
     free = {
         name: dimension
         for name, dimension in space.items()
-        if name not in given and values[name] != "auto" and _WORKS.get(name, lambda _: True)(algorithm)
+        if name not in given and values[name] != "auto" and _HAS_EFFECT.get(name, lambda _: True)(algorithm)
     }
     for name in wanted or ():
         if name not in space:
@@ -127,11 +127,11 @@ class Search:
         if not self.config.evaluation_interval:
             raise InputError("a search goes by evaluations: evaluation_interval cannot be 0")
 
-    def told(self) -> dict[str, Any]:
+    def definition(self) -> dict[str, Any]:
         """Return the search as JSON-compatible values."""
         searched = {name: f"searched, {' '.join(map(str, dimension))}" for name, dimension in self.space.items()}
-        own = {name: value for name, value in vars(self.config).items() if name != "device"}
-        return as_json("the search", {**own, "seeds": self.seeds, **self._hyperparameters(searched)})
+        settings = {name: value for name, value in vars(self.config).items() if name != "device"}
+        return as_json("the search", {**settings, "seeds": self.seeds, **self._hyperparameters(searched)})
 
     def command(self, values: Mapping[str, Any]) -> str:
         """Return the command that trains a configuration with seeds that the search has not used."""

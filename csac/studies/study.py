@@ -228,11 +228,11 @@ def find(name: str) -> Study:
 def read_study(path: Path) -> Study:
     """Read a study from a TOML file; docs/studies.md describes the format. Raises InputError."""
     try:
-        told = tomllib.loads(without_controls(path.read_bytes()).decode("utf-8-sig"))
-        _refuse_unknown(told, _names(Study), "a study has no")
-        for method in manifests.value(tuple[dict[str, Any], ...], told.get("methods", []), "methods"):
+        fields = tomllib.loads(without_controls(path.read_bytes()).decode("utf-8-sig"))
+        _refuse_unknown(fields, _names(Study), "a study has no")
+        for method in manifests.value(tuple[dict[str, Any], ...], fields.get("methods", []), "methods"):
             _refuse_unknown(method, _names(Method), "a method has no")
-        study = manifests.value(Study, {**told, "name": path.stem}, "")
+        study = manifests.value(Study, {**fields, "name": path.stem}, "")
         _refuse_unknown(study.common, [one.algorithm for one in study.methods], "common: no method has the algorithm")
         study.runs()
     except OSError as error:

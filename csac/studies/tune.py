@@ -88,7 +88,7 @@ def _open(search: Search, directory: Path) -> optuna.Study:
         directory.mkdir(parents=True, exist_ok=True)
     backend = JournalFileBackend(str(journal), JournalFileOpenLock(str(journal)))
     unpruned = max(search.algorithm.cadence.first_update, round(SHARE_UNPRUNED * search.config.steps))
-    with _alone(directory):
+    with _trial_choice_locked(directory):
         study = optuna.create_study(
             storage=optuna.storages.JournalStorage(backend),
             study_name="csac",
@@ -96,14 +96,14 @@ def _open(search: Search, directory: Path) -> optuna.Study:
             load_if_exists=True,
             pruner=optuna.pruners.MedianPruner(STARTUP_TRIALS, unpruned, n_min_trials=3),
         )
-        told = search.told()
-        if found := differences(study.user_attrs.get("search", told), told):
+        definition = search.definition()
+        if found := differences(study.user_attrs.get("search", definition), definition):
             raise InputError(f"{directory} holds another search: {'; '.join(found)}. Choose another --directory")
         if not study.get_trials(deepcopy=False):
-            study.set_user_attr("search", told)
-            own = {name: getattr(search.algorithm, name) for name in search.space}
+            study.set_user_attr("search", definition)
+            initial = {name: getattr(search.algorithm, name) for name in search.space}
             study.enqueue_trial(
-                {n: 1 - v if search.space[n][0] == "below 1" else v for n, v in own.items()}, {"trial": 0}
+                {n: 1 - v if search.space[n][0] == "below 1" else v for n, v in initial.items()}, {"trial": 0}
             )
     return study
 
@@ -115,11 +115,11 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
     """
     import optuna
 
-    with _alone(directory):
+    with _trial_choice_locked(directory):
         known = study.get_trials(deepcopy=False)
         for lost in known:
-            is_begun = "trial" in lost.user_attrs and is_locked(_folder(directory, lost) / ".lock")
-            if lost.state.name == "RUNNING" and not is_begun:
+            is_held = "trial" in lost.user_attrs and is_locked(_folder(directory, lost) / ".lock")
+            if lost.state.name == "RUNNING" and not is_held:
                 _requeue(study, lost)
         known = study.get_trials(deepcopy=False)
         if sum(trial.state.name in ("COMPLETE", "PRUNED", "RUNNING") for trial in known) >= trials:
@@ -139,7 +139,7 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
 
 
 @contextmanager
-def _alone(directory: Path) -> Iterator[None]:
+def _trial_choice_locked(directory: Path) -> Iterator[None]:
     """Keep other processes from choosing a trial meanwhile; the lock of a dead process is removed after a while."""
     from optuna.storages.journal import JournalFileOpenLock
 
