@@ -148,12 +148,11 @@ class Reporter:
 
     def _newer_returns(self) -> str:
         """Return the last return of each seed that has an evaluation newer than the last one printed."""
-        ahead = {
-            seed: max(one.returns)
+        returns = [
+            f"seed {seed} {number(one.returns[max(one.returns)])} at {max(one.returns):,}"
             for seed, one in self._living().items()
             if max(one.returns, default=0) > self._printed
-        }
-        returns = [f"seed {seed} {number(self._seeds[seed].returns[step])} at {step:,}" for seed, step in ahead.items()]
+        ]
         return f"; last returns: {', '.join(returns)}" if returns and len(returns) <= MOST_SEEDS_SHOWN else ""
 
     def _pace(self) -> str:

@@ -6,6 +6,7 @@ import io
 import shlex
 import shutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -231,10 +232,8 @@ class _LenientFile:
             return len(text)
 
     def flush(self) -> None:
-        try:
+        with suppress(OSError, ValueError):
             self._file.flush()
-        except (OSError, ValueError):
-            return
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)

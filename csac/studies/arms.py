@@ -159,8 +159,8 @@ def labels(arms: Sequence[Arm]) -> list[str]:
     distinguishing: dict[str, list[str]] = {}
     for name in names:
         namesakes = [arm for arm, its in zip(arms, names, strict=True) if its == name and not arm.label]
-        by_place = itertools.groupby(sorted(namesakes, key=lambda arm: arm.place), key=lambda arm: arm.place)
-        differences = [item for _, beside in by_place for item in differing([settings(arm.config) for arm in beside])]
+        groups = by_place(sorted(namesakes, key=lambda arm: arm.place)).values()
+        differences = [item for group in groups for item in differing([settings(arm.config) for arm in group])]
         if namesakes and name == namesakes[0].config.title:  # no preset: its values may differ between tasks
             differences += differing([arm.config.hyperparameters for arm in namesakes])
         distinguishing[name] = list(dict.fromkeys(differences))

@@ -24,11 +24,12 @@ from csac.training.supervisor import supervise
 from csac.training.watch import Watcher
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from rich.console import Console
 
+    from csac.record.config import RunConfig
     from csac.studies.ray import Cluster
     from csac.studies.study import StudyRun
 
@@ -52,7 +53,7 @@ def run_study(runs: Sequence[StudyRun], directory: Path, execution: Execution, c
     for path in [path for path in waiting if is_run(path) and RunDirectory.open(path).state == "running"]:
         console.print(f"{waiting.pop(path).name}: another process trains it", soft_wrap=True)
     if execution.cluster is None:  # the nodes of a cluster may have tasks that this machine lacks
-        try_tasks(waiting.values())
+        try_tasks(run.config for run in waiting.values())
     programs = [_program(path, run, execution) for path, run in waiting.items()]
     with (
         stop_requested(lambda text: console.print(text)) as request,
@@ -71,10 +72,10 @@ def run_study(runs: Sequence[StudyRun], directory: Path, execution: Execution, c
     return request.received[0] if request.received else None
 
 
-def try_tasks(runs: Any) -> None:
+def try_tasks(configs: Iterable[RunConfig]) -> None:
     """Make each task once and apply its perturbations, so that mistakes are reported before anything is written."""
     tried: list[tuple[str, dict[str, Any], tuple[str, ...]]] = []
-    for _, config, _ in runs:
+    for config in configs:
         one = config.task, config.environment_arguments, config.perturbations
         if one not in tried:
             tried.append(one)

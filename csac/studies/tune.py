@@ -60,7 +60,7 @@ def tune(search: Search, directory: Path, trials: int, command: str | None, cons
     """
     check_whole("trials", trials, 1, 100_000)
     directory = directory.absolute()
-    try_tasks([(None, search.config, None)])
+    try_tasks([search.config])
     study = _open(search, directory)
     with stop_requested(lambda text: console.print(text)) as request:
         while not request.is_set() and (trial := _next(study, search, directory, trials)):
