@@ -1,4 +1,4 @@
-"""The front door: each sub-command parses its arguments and calls one function."""
+"""Entry point of the `csac` command: dispatch to the sub-commands and turn errors into exit codes."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ To begin: csac train HalfCheetah-v4 --seeds 2 --steps 60_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `csac` with `arguments`, by default the command line's, and return its exit code.
+    """Run `csac` with `arguments`, by default those of `sys.argv`, and return the exit code.
 
-    0 done, 1 a failing environment or disk (internal errors are raised), 2 wrong arguments or input, 3 finished but a
-    seed failed, 130 SIGINT, 143 SIGTERM.
+    0: done. 1: the environment or the disk failed (internal errors are raised). 2: wrong arguments or input.
+    3: finished, but a seed failed. 130: SIGINT. 143: SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = _run(words)
     finally:
         failure = _flush()
-    return complain(_unwritten(failure), 1) if failure and not code else code
+    return complain(_write_error_message(failure), 1) if failure and not code else code
 
 
 def _run(words: list[str]) -> int:
@@ -66,7 +66,7 @@ def _run(words: list[str]) -> int:
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        return complain(_unwritten(error), 1)
+        return complain(_write_error_message(error), 1)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -81,23 +81,23 @@ def _dispatch(words: list[str]) -> int:
 
         print(f"csac {__version__}")
         return 0
-    from csac.cli.commands import run  # tyro and NumPy come with it
+    from csac.cli.commands import run  # imports tyro and NumPy
 
     return run(words[0], words[1:])
 
 
-def _unwritten(error: OSError) -> str:
+def _write_error_message(error: OSError) -> str:
     return f"not all of the output could be written: {error.strerror}"
 
 
 def _prepare_streams() -> None:
-    """Lead streams that were closed to nowhere: the next file to be opened would get what libraries print there."""
+    """Open closed standard streams on /dev/null: the next opened file would receive what libraries print to them."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    with suppress(OSError, ValueError):  # where a caller's stderr is no file
+    with suppress(OSError, ValueError):  # a caller's stderr may not be a real file
         if not faulthandler.is_enabled():
             faulthandler.enable()  # a simulator's native code may crash this process
     for stream in (sys.stdout, sys.stderr):
@@ -106,7 +106,7 @@ def _prepare_streams() -> None:
 
 
 def _flush() -> OSError | None:
-    """Write what waits, or return why that fails; where nobody reads it any more (`csac runs | head`), that is none."""
+    """Flush stdout and return the error, if any; a pipe that its reader closed (`csac runs | head`) is no error."""
     try:
         sys.stdout.flush()
     except OSError as error:

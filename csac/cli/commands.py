@@ -1,4 +1,4 @@
-"""What each sub-command does."""
+"""Implement the sub-commands of `csac`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def run(name: str, words: list[str]) -> int:
-    """Run a sub-command and return its exit code. Raises InputError, Failure, and on a signal KeyboardInterrupt."""
+    """Run a sub-command and return its exit code. Raises InputError, Failure, and KeyboardInterrupt on a signal."""
     command = shlex.join(["csac", name, *words])
     try:
         if name == "study":
@@ -44,28 +44,28 @@ def run(name: str, words: list[str]) -> int:
 def _train(options: Any, command: str) -> int:
     from csac.training.train import train
 
-    return _trained(train, learner_of(options), options.task, **options.options(), command=command)
+    return _run_training(train, learner_of(options), options.task, **options.options(), command=command)
 
 
 def _resume(options: Resume, command: str) -> int:
     from csac.training.train import resume
 
-    return _trained(resume, **vars(options), command=command)
+    return _run_training(resume, **vars(options), command=command)
 
 
 def _leaving_at_once() -> Any:
-    from csac.training.signals import leaving_at_once  # NumPy comes with it
+    from csac.training.signals import leaving_at_once  # imports NumPy
 
     return leaving_at_once()
 
 
-def _trained(training: Callable[..., RunSet], *given: Any, **options: Any) -> int:
-    """Train, and return the exit code; where it was stopped, print the line to type next."""
+def _run_training(training: Callable[..., RunSet], *arguments: Any, **options: Any) -> int:
+    """Train and return the exit code; if training was stopped, print the command that resumes it."""
     from csac.console.tables import program
     from csac.training.signals import Interrupted
 
     try:
-        runs = training(*given, **options)
+        runs = training(*arguments, **options)
     except Interrupted as stop:
         line = f"; to go on, type: {program()} resume {shlex.quote(str(stop.runs.path))}" if stop.can_resume else ""
         return complain(f"{stop}{line}", 128 + stop.signal_number)
@@ -82,14 +82,14 @@ def _evaluate(options: Evaluate, _: str) -> int:
     from csac.record.sets import RunSet
     from csac.record.tables import COLUMNS, check_new, write_rows
 
-    given, console, runs = dict(vars(options)), tables.make_console(), RunSet.open(options.directory)
-    file, deterministic = given.pop("csv"), not given.pop("stochastic")
-    target = file and file.absolute()  # a task may change where we are
+    arguments, console, runs = dict(vars(options)), tables.make_console(), RunSet.open(options.directory)
+    file, deterministic = arguments.pop("csv"), not arguments.pop("stochastic")
+    target = file and file.absolute()  # a task may change the working directory
     notes = perturbation_notes(options.directory, options.perturbations)
     if file:
         check_new(file)
     with progress_shown(console, "evaluating", "episodes") as on_progress:
-        results = dict(evaluate_run(**given, deterministic=deterministic, on_progress=on_progress))
+        results = dict(evaluate_run(**arguments, deterministic=deterministic, on_progress=on_progress))
     tables.print_lines(console, notes)
     for table in tables.evaluation_tables(results, runs.failures):
         console.print(table)
@@ -101,7 +101,7 @@ def _evaluate(options: Evaluate, _: str) -> int:
         notes.append("the policy is deterministic: --stochastic changes nothing")
     untested = [str(seed) for seed in runs.seeds if seed not in results and options.seed is None]
     notes += [f"without such a policy yet: seed {', '.join(untested)}"] * bool(untested)
-    tables.print_lines(console, [f"note: {text}" for text in notes + _unlearnt(runs)])
+    tables.print_lines(console, [f"note: {text}" for text in notes + _untrained_notes(runs)])
     if file:
         rows = []
         for run in sound:
@@ -124,8 +124,8 @@ def _play(options: Play, _: str) -> int:
     print_lines(console, perturbation_notes(options.directory, options.perturbations))
     with progress_shown(console, "playing", "steps at most") as on_progress:
         for episode in play(**vars(options), on_progress=on_progress):
-            told = f"return {number(episode.episode_return)} in {episode.length:,} steps"
-            print_lines(console, [f"episode {episode.episode}: {told}"])
+            outcome = f"return {number(episode.episode_return)} in {episode.length:,} steps"
+            print_lines(console, [f"episode {episode.episode}: {outcome}"])
     print_lines(console, [str(options.video)] * bool(options.video))
     return 0
 
@@ -140,13 +140,13 @@ def _export(options: Export, _: str) -> int:
     with console.status("exporting") if console.is_interactive else nullcontext():
         exported = export_run(**vars(options))
     print_lines(console, [str(exported.place), *export_lines(exported.fields["verification"])])
-    notes = exported.notes + _unlearnt(runs)
+    notes = exported.notes + _untrained_notes(runs)
     print_lines(console, [f"note: {text}" for text in notes])
     return 0
 
 
-def _unlearnt(runs: RunSet) -> list[str]:
-    """Return what to say of policies that are as they began, since their runs were stopped in the warm-up."""
+def _untrained_notes(runs: RunSet) -> list[str]:
+    """Return a note if the policies are untrained because their runs were stopped during the warm-up."""
     manifest = runs.runs[0].manifest
     warmup = manifest.config.hyperparameters.get("warmup_steps", 0)
     if manifest.steps_done >= warmup or manifest.forked_from:
@@ -163,7 +163,7 @@ def _latency(options: Latency, _: str) -> int:
 
     console, measured = make_console(), {}
     for name, artefact in {str(path): open_artefact(path, optimise=True) for path in options.artefacts}.items():
-        print_lines(console, [f"measuring {name}"])  # once: what moves on a terminal takes time from a core
+        print_lines(console, [f"measuring {name}"])  # no live display: it would take CPU time
         measured[name] = measure(artefact, options.calls, options.rate, options.seconds)
     console.print(latency_table(measured))
     return 0
@@ -203,12 +203,12 @@ def _tune(options: Any, command: str) -> int:
     from csac.training.config import labels
 
     learner = learner_of(options)
-    given = [word.partition("=")[0][2:].replace("-", "_") for word in shlex.split(command) if word.startswith("--")]
+    typed = [word.partition("=")[0][2:].replace("-", "_") for word in shlex.split(command) if word.startswith("--")]
     wanted = [name.replace("-", "_") for name in options.search] or None
-    own = {item.name: getattr(options, item.name) for item in dataclasses.fields(RunConfig)}
-    config = RunConfig(**{**own, "seed": options.first_seed, "evaluation_seed": TUNING_EVALUATION_SEED})
+    settings = {item.name: getattr(options, item.name) for item in dataclasses.fields(RunConfig)}
+    config = RunConfig(**{**settings, "seed": options.first_seed, "evaluation_seed": TUNING_EVALUATION_SEED})
     labels(options.seeds, options.first_seed)
-    search = Search(config=config, seeds=options.seeds, algorithm=learner, space=space_of(learner, wanted, given))
+    search = Search(config=config, seeds=options.seeds, algorithm=learner, space=space_of(learner, wanted, typed))
     return tune(search, options.home(), options.trials, command, make_console())
 
 

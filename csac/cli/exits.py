@@ -1,4 +1,4 @@
-"""How a command ends: its last line, and its exit code."""
+"""Print the error line of a command and choose its exit code."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ def complain(message: object, code: int) -> int:
 
 
 def interrupted(error: KeyboardInterrupt) -> int:
-    """Return the exit code of the signal."""
+    """Return the exit code for the signal that raised `error`."""
     return 128 + (signal.SIGTERM if signal.SIGTERM in error.args else signal.SIGINT)

@@ -1,6 +1,6 @@
-"""What may be typed after each sub-command: dataclasses, of which tyro makes the options and their help.
+"""Define each sub-command's options as a dataclass, from which tyro builds the parser and the help.
 
-Fields are called as the arguments of the functions that they are for.
+A field has the name of the function argument that it is passed as.
 """
 
 from __future__ import annotations
@@ -60,16 +60,16 @@ PERTURB = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Training(RunConfig):
-    """What `csac train` and `csac tune` have in common, beside the hyperparameters of the algorithm."""
+    """The options that `csac train` and `csac tune` share, apart from the algorithm's hyperparameters."""
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """A Gymnasium id such as HalfCheetah-v4, or module:Id for an environment that a module registers."""
     preset: str | None = None
-    """paper: the paper's hyperparameters. strong: critics that learn faster (CSAC, SAC). Options given here win."""
+    """paper: the paper's hyperparameters. strong: critics that learn faster (CSAC, SAC). Other options override it."""
     seeds: int = 1
     """Number of independent seeds."""
     first_seed: int = 0
-    """The first seed; the others are numbered from it."""
+    """The first seed; the others count up from it."""
     environment_arguments: Annotated[dict[str, Any], JSON, arg(name="env-kwargs")] = field(default_factory=dict)
     """Keyword arguments for the environment, as a JSON object."""
     hyperparameters: Suppress[dict[str, Any]] = field(default_factory=dict)
@@ -88,51 +88,51 @@ class Train(_Training):
     """
 
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/TASK/ALGORITHM/DATE-TIME)")] = None
-    """The folder of the runs, seed-K each; it must be new or empty."""
+    """The folder for the runs, each in its own seed-K; it must be new or empty."""
     resume: Flag = False
-    """Resume the runs in --directory that are there, and start the others."""
+    """Resume the runs that exist in --directory, and start the others."""
     start_from: Annotated[str | None, arg(name="from", metavar="DIR[@STEP]", help_behavior_hint="(default: none)")] = (
         None
     )
-    """Start from copies of other runs' checkpoints; what is learnt and how it is evaluated stay, unless given here."""
+    """Fork the checkpoints of other runs; their hyperparameters and evaluation settings stay, unless given here."""
     perturbations: Annotated[
         UseAppendAction[tuple[str, ...]], arg(name="perturb", metavar="KIND=VALUE[@STEP]", help=PERTURB)
     ] = ()
     events: Annotated[Names, arg(help_behavior_hint="(default: the task's own)")] = ()
-    """More names to record from the info of an episode's last step, or NAME:sum, NAME:mean over all its steps: each
-    becomes a column and a curve, of evaluations and of training episodes."""
+    """More info entries to record: NAME from an episode's last step, NAME:sum or NAME:mean over all its steps. Each
+    becomes a column and a curve, for evaluations and for training episodes."""
     given: Annotated[
         str | None, arg(name="demonstrations", metavar="FILE.npz", help_behavior_hint="(default: none)")
     ] = None
-    """Begin with these transitions in the replay, actions on the environment's scale; or a Minari data set's id."""
+    """Transitions to start the replay buffer with, actions on the environment's scale; or a Minari data set's id."""
     seeds_per_process: Annotated[int | None, arg(help_behavior_hint="(default: 1 on a CPU, a few on a GPU)")] = None
-    """Seeds that train in one program."""
+    """Seeds that train in one process."""
     evaluation_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
-    """Processes per program that evaluate while it trains on; 0 evaluates in between. The results are the same."""
+    """Worker processes per training process that evaluate while it trains; 0 pauses training. Results are the same."""
     environment_processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by a step's cost)")] = None
-    """Processes per program that share its --environments; 0 steps them in between. The results are the same."""
+    """Worker processes per training process that step its --environments; 0 uses none. Results are the same."""
     wandb: Flag = False
     """Also log to Weights & Biases, in the project WANDB_PROJECT or csac (docs/callbacks-and-logging.md)."""
 
     def options(self) -> dict[str, Any]:
-        """Return what `train` takes as keyword arguments."""
+        """Return the keyword arguments of `train`."""
         if "none" in self.perturbations and len(self.perturbations) > 1:
             raise InputError("--perturb none leaves everything out: give it alone")
-        planned = () if "none" in self.perturbations else self.perturbations or None  # None: as the source has it
+        planned = () if "none" in self.perturbations else self.perturbations or None  # None: keep the source's
         others = ("task", "algorithm", _field_of(self.algorithm), "preset", "hyperparameters", "seed")
         others += ("task_is_callable", "given")
-        given = {name: value for name, value in vars(self).items() if name not in others}
-        return {**given, "perturbations": planned, "events": self.events or None, "demonstrations": self.given}
+        arguments = {name: value for name, value in vars(self).items() if name not in others}
+        return {**arguments, "perturbations": planned, "events": self.events or None, "demonstrations": self.given}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tune(_Training):
-    """Search for good hyperparameters with Optuna: short trials chosen by TPE, hopeless ones pruned.
+    """Search for good hyperparameters with Optuna: short trials chosen by TPE, unpromising ones pruned.
 
     A trial's score is the mean over its seeds of their last three evaluations, on episodes that no other run and no
     report uses. Hyperparameters given below are fixed; the rest of the search space is searched (docs/tuning.md). Any
     number of processes and machines that run the same command share the trials; after Ctrl-C or a crash the same
-    command continues.
+    command continues the search.
 
     Exit codes: 0 done, 1 the directory can no longer be written, 2 wrong arguments, 3 no trial is complete, 130 or 143
     stopped by a signal.
@@ -147,9 +147,9 @@ class Tune(_Training):
     seeds: int = 2
     """Number of independent seeds in each trial, the same for all trials."""
     first_seed: int = 1_000
-    """The first seed; the others are numbered from it. Report results on other seeds."""
+    """The first seed; the others count up from it. Report final results on other seeds."""
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/tune/TASK/ALGORITHM)")] = None
-    """The directory of the search: new, empty, or of the same search."""
+    """The directory of the search: new, empty, or one that holds the same search."""
     perturbations: Suppress[tuple[str, ...]] = ()
     events: Suppress[tuple[str, ...]] = ()
 
@@ -179,11 +179,11 @@ class Evaluate:
     """The seed to test."""
     which: Which = "last"
     episodes: int = 10
-    """Episodes per seed, the same for each."""
+    """Episodes per seed; every seed is tested on the same ones."""
     processes: Annotated[int | None, arg(help_behavior_hint="(default: chosen by the cores)")] = None
-    """Processes that share the episodes; the results do not depend on it."""
+    """Worker processes that share the episodes; the results do not depend on their number."""
     stochastic: Flag = False
-    """Sample actions from the policy instead of taking the deterministic one."""
+    """Sample actions from the policy instead of taking its deterministic action."""
     perturbations: Constant = ()
     csv: Annotated[Path | None, arg(metavar="FILE.csv", help_behavior_hint="(default: none)")] = None
     """Also write one row per episode to this file, as in evaluations.csv."""
@@ -215,10 +215,10 @@ class Export:
 
     directory: Runs
     seed: Annotated[int | None, arg(help_behavior_hint="(default: the one with the best last evaluations)")] = None
-    """The seed whose policy leaves."""
+    """The seed whose policy is exported."""
     which: Which = "last"
     format: Literal["numpy", "onnx", "c"] = "numpy"
-    """numpy: needs only NumPy, with a loader beside it. onnx: a graph. c: one C99 header."""
+    """numpy: arrays and a loader that needs only NumPy. onnx: an ONNX graph. c: one C99 header."""
     place: Annotated[
         Path | None, arg(name="out", metavar="PATH", help_behavior_hint="(default: DIR/export/FORMAT)")
     ] = None
@@ -226,12 +226,12 @@ class Export:
     fallback: Annotated[str | None, arg(metavar="zero|middle|last|X,...", help_behavior_hint="(default: no guard)")] = (
         None
     )
-    """Guard against NaN and infinity: the action to take then."""
+    """The action to take if the observation or the action has a NaN or an infinity."""
     rate_limit: Annotated[float | None, arg(help_behavior_hint="(default: no limit)")] = None
-    """Largest change of an action from one step to the next, as a share of its range; then the fallback is the last
-    action, unless another is given."""
+    """Largest change of an action from one step to the next, as a share of its range. The fallback is then the previous
+    action, unless --fallback is given."""
     episodes: int = 10
-    """Episodes to verify with, the same as those of csac evaluate; 0 if the task cannot be made on this machine."""
+    """Episodes to verify with, the same as those of csac evaluate; 0 if the task cannot run on this machine."""
     card: Flag = False
     """Also write a model card, README.md."""
     trust_task: Trust = False
@@ -239,9 +239,9 @@ class Export:
 
 @dataclass(frozen=True)
 class Latency:
-    """Measure how long artefacts take per action, call by call: as fast as possible and at a fixed rate.
+    """Measure how long artefacts take per action: in calls one after the other, and in calls at a fixed rate.
 
-    A C artefact is timed inside a compiled program, the others around their call in Python.
+    A C artefact is timed inside a compiled program, the others around the Python call.
     """
 
     artefacts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ARTEFACT...", help_behavior_hint="(required)")]
@@ -249,7 +249,7 @@ class Latency:
     calls: int = 100_000
     """Number of calls made one after the other."""
     rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="(default: the task's, or 100)")] = None
-    """Calls per second of the measurement at a fixed rate."""
+    """Calls per second in the measurement at a fixed rate."""
     seconds: float = 10.0
     """Length of the measurement at a fixed rate; 0 skips it."""
 
@@ -259,30 +259,30 @@ class List:
     """List the runs below a directory."""
 
     directory: Annotated[Positional[Path], arg(metavar="[DIR]")] = Path("runs")
-    """Where to look."""
+    """The directory to search."""
 
 
 def parse_training(base: type[Any], words: list[str], program: str) -> Any:
-    """Return a parsed `Train` or `Tune`, whose defaults are those of the preset, or of the runs to begin with."""
+    """Return the parsed `Train` or `Tune`; its defaults come from the preset or from the runs given by `--from`."""
     first = "" if not words or words[0].startswith("-") else words[0]
-    options = parse(_with_algorithm(base, words, first), words, program, _elsewhere)
-    if options.preset and options.task != first:  # what a preset gives can depend on the task
-        options = parse(_with_algorithm(base, words, options.task), words, program, _elsewhere)
+    options = parse(_with_algorithm(base, words, first), words, program, _other_algorithms_hint)
+    if options.preset and options.task != first:  # a preset's values can depend on the task
+        options = parse(_with_algorithm(base, words, options.task), words, program, _other_algorithms_hint)
     return options
 
 
 def learner_of(options: Any) -> Any:
-    """Return the algorithm with its hyperparameters, as `parse_training` has parsed them."""
+    """Return the algorithm with its hyperparameters from the options that `parse_training` returned."""
     return getattr(options, _field_of(options.algorithm))
 
 
 def _field_of(algorithm: str) -> str:
-    """Return the field of a command that has the hyperparameters of an algorithm, a name or `module:Class`."""
+    """Return the name of the field that holds the hyperparameters of `algorithm`, a name or `module:Class`."""
     return algorithm.rpartition(":")[2]
 
 
 def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
-    """Return `Train` or `Tune` with the hyperparameters of the chosen algorithm beside its own options."""
+    """Return a subclass of `Train` or `Tune` with a field for the chosen algorithm's hyperparameters."""
     from csac.algorithms import ALGORITHMS
 
     source, preset = _source(words), value_of(words, "--preset")
@@ -295,26 +295,26 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
         defaults |= {"seeds": len(source.seeds), "first_seed": source.seeds[0]}
         defaults["environment_arguments"] = source.config.environment_arguments
         if source.config.algorithm == name and not preset:
-            from csac.training.config import algorithm_of  # Gymnasium comes with it
+            from csac.training.config import algorithm_of  # imports Gymnasium
 
             learner = algorithm_of(source.config)
     hint = arg(help_behavior_hint=f"(default: {preset or 'none'})")
     hints: dict[str, Any] = get_type_hints(base, include_extras=True)
     names = tuple(dict.fromkeys([*ALGORITHMS, name]))
     hints |= {"algorithm": Literal[names], "preset": Annotated[Literal[PRESETS] | None, hint]}  # pyright: ignore[reportInvalidTypeForm]
-    fields = [(item, hints[item], _defaulting(value)) for item, value in defaults.items()]
+    fields = [(item, hints[item], _field_with_default(value)) for item, value in defaults.items()]
     fields.append((_field_of(name), OmitArgPrefixes[type(learner)], field(default=learner)))
     return dataclasses.make_dataclass(
         base.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace={"__doc__": base.__doc__}
     )
 
 
-def _defaulting(value: Any) -> Any:
+def _field_with_default(value: Any) -> Any:
     return field(default_factory=lambda: value) if isinstance(value, dict) else field(default=value)
 
 
 def _source(words: list[str]) -> RunSet | None:
-    """Return the runs that `--from` begins with, or those that it has begun. Raises InputError where there are none."""
+    """Return the runs given by `--from`, or to resume those in `--directory`. Raises InputError if there are none."""
     where, directory = value_of(words, "--from"), value_of(words, "--directory")
     if where is None:
         return None
@@ -326,8 +326,8 @@ def _source(words: list[str]) -> RunSet | None:
     return RunSet.open(name if at and not Path(where).exists() else where)
 
 
-def _elsewhere(option: str) -> str:
-    """Return which algorithms have an option that the chosen one does not have, or nothing."""
+def _other_algorithms_hint(option: str) -> str:
+    """Return a hint that names the algorithms with this option, or an empty string."""
     from csac.algorithms import ALGORITHMS
 
     names = [name for name, kind in ALGORITHMS.items() if option in options_of(kind)]

@@ -1,4 +1,4 @@
-"""From the words of a command to its dataclass: tyro, whose complaint becomes one line."""
+"""Parse command lines into dataclasses with tyro, and reduce its error messages to one line."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ Command = TypeVar("Command")
 
 
 class HelpShown(Exception):
-    """A command's help was asked for, and is printed."""
+    """Raised once the help of a command has been printed."""
 
 
 def parse(
-    command: type[Command], words: list[str], program: str, elsewhere: Callable[[str], str] = lambda option: ""
+    command: type[Command], words: list[str], program: str, hint_for: Callable[[str], str] = lambda option: ""
 ) -> Command:
-    """Return the parsed words; print the help and raise HelpShown where it is asked for.
+    """Parse `words` into a `command`; if they ask for help, print it and raise HelpShown.
 
-    `elsewhere(option)` says where an option belongs that this command does not have, or nothing.
+    `hint_for(option)` returns a hint for an option that the command lacks, or an empty string.
     """
     rules: Any = {"prog": program, "args": words, "registry": _numbers(), "config": (DisallowNone,)}
     if {"-h", "--help"} & {*words}:
@@ -44,15 +44,15 @@ def parse(
         raise HelpShown
     complaint = io.StringIO()
     try:
-        # A wide terminal, so that tyro does not break the words that it quotes.
+        # A wide terminal keeps tyro from wrapping the words that it quotes.
         with patch.dict(os.environ, COLUMNS="10000"), redirect_stderr(complaint), redirect_stdout(io.StringIO()):
             return tyro.cli(command, **rules)
     except SystemExit:
-        raise InputError(f"{_one_line(complaint.getvalue(), command, elsewhere)} ({program} --help)") from None
+        raise InputError(f"{_one_line(complaint.getvalue(), command, hint_for)} ({program} --help)") from None
 
 
 def value_of(words: list[str], option: str) -> Any:
-    """Return the value of an option that decides which other options there are."""
+    """Return the value of an option before parsing, since it decides which other options exist; None without it."""
     value = None
     for word, following in zip_longest(words, words[1:]):
         if word == option and following is not None:
@@ -63,9 +63,9 @@ def value_of(words: list[str], option: str) -> Any:
 
 
 def chosen_algorithm(words: list[str], begun_with: str | None) -> tuple[str, Any]:
-    """Return the name and the class of the algorithm: the words', else that of the runs to begin with, else CSAC.
+    """Return the name and the class of the algorithm: from the words, else from the runs of `--from`, else CSAC.
 
-    A class from elsewhere is imported where the words name it, never because a run's manifest does.
+    A `module:Class` is imported only if the words name it, never because a run's manifest does.
     """
     from csac.algorithms import ALGORITHMS
 
@@ -78,13 +78,13 @@ def chosen_algorithm(words: list[str], begun_with: str | None) -> tuple[str, Any
         raise InputError(f"no algorithm is called {name!r}: {hint}")
     if not typed:
         raise InputError(f"{value_of(words, '--from')} was trained by {name}: to run its code, add --algorithm {name}")
-    from csac.training.config import class_typed  # Gymnasium comes with it
+    from csac.training.config import class_typed  # imports Gymnasium
 
     return name, class_typed(name)
 
 
 def json_object(text: str) -> dict[str, Any]:
-    """Return the object in a text. Raises ValueError."""
+    """Parse a JSON object. Raises ValueError."""
     value = json.loads(text)
     if not isinstance(value, dict):
         raise ValueError(f"it takes a JSON object such as '{{\"name\": 1.5}}', not {text}")
@@ -101,7 +101,7 @@ JSON = PrimitiveConstructorSpec(
 
 
 def _numbers() -> ConstructorRegistry:
-    """Return how numbers are read: 1_000_000 and 1e6 are whole numbers too."""
+    """Return tyro's rule for numbers: 1_000_000 and 1e6 count as integers too."""
     registry = ConstructorRegistry()
 
     @registry.primitive_rule
@@ -129,7 +129,7 @@ def _whole(text: str) -> int:
 
 
 def options_of(kind: type[Any]) -> set[str]:
-    """Return the options that tyro makes of a dataclass; those of a dataclass within have no prefix."""
+    """Return the options that tyro derives from a dataclass; those of a nested dataclass have no prefix."""
     options = set()
     for item in dataclasses.fields(kind):
         within = dataclasses.is_dataclass(item.default)
@@ -137,8 +137,8 @@ def options_of(kind: type[Any]) -> set[str]:
     return options
 
 
-def _one_line(complaint: str, command: type[Any], elsewhere: Callable[[str], str]) -> str:
-    """Return what tyro complains of. It writes a title, what is wrong and what was perhaps meant, rules between."""
+def _one_line(complaint: str, command: type[Any], hint_for: Callable[[str], str]) -> str:
+    """Return tyro's error in one line. It writes a title, the error and suggestions, with rules between them."""
     _, what, more, *_ = [*re.split(r"^ *-{5,} *$", complaint, flags=re.MULTILINE), "", ""]
     what = " ".join(what.split())
     unknown = re.match(r"Unrecognized options: (.+?)(, |$)", what)
@@ -148,6 +148,6 @@ def _one_line(complaint: str, command: type[Any], elsewhere: Callable[[str], str
         return re.sub(r"^Missing from [^:]*: (\S+).*", r"\1 is missing", what)
     option = unknown[1].partition("=")[0].replace("_", "-") if unknown[1].startswith("-") else unknown[1]
     meant = re.findall(r"^ *(--[a-z-]+)", more, re.MULTILINE)[:2]
-    hint = called_here(option, options_of(command)) or elsewhere(option)
+    hint = called_here(option, options_of(command)) or hint_for(option)
     hint = hint or (f"did you mean {' or '.join(meant)}?" if meant else "")
     return f"there is no {option} here" + (f": {hint}" if hint else "")

@@ -1,1 +1,1 @@
-"""What is told: the live display, tables and text for people. Nothing here imports JAX."""
+"""Terminal output: the live display, tables and text. Nothing here imports JAX."""

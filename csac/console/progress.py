@@ -1,4 +1,4 @@
-"""What a set of runs shows while it trains and when it is over: a live display on a terminal, plain lines elsewhere."""
+"""Show a set of runs during and after training: a live display on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 CURVE_WIDTH = 24
-MOST_SEEDS_SHOWN = 12  # of more, only the mean and the range are shown
+MOST_SEEDS_SHOWN = 12  # with more, only the mean and the range are shown
 
 
 class _Seed:
-    """How far one run is: its step, and the mean return of each evaluation by its step."""
+    """The progress of one run: its step, and the mean return of each evaluation, keyed by step."""
 
     def __init__(self, run: RunDirectory) -> None:
         self.begin = self.step = run.manifest.steps_done
@@ -46,24 +46,24 @@ class _Seed:
 
 
 class Reporter:
-    """Shows the progress of a set of runs, by default on standard output; `clock` gives seconds."""
+    """Show the progress of a set of runs, by default on standard output; `clock` returns seconds."""
 
     def __init__(self, console: Console | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self.console = console or make_console()
         self._clock, self._speed = clock, Speed(clock)
         self._live: Live | None = None
         self._seeds: dict[int, _Seed] = {}
-        self._steps = self._shown = 0  # steps of a run; the newest evaluation that a line has told of
-        self._warmup = 0.0  # steps before the first update, which say nothing of how long the others take
-        self._began = self._spoke = clock()
+        self._steps = self._printed = 0  # steps per run; step of the newest evaluation printed as a line
+        self._warmup = 0.0  # steps before the first update, whose speed says nothing about later steps
+        self._started = self._last_output = clock()
 
     def start(self, runs: RunSet, notes: Sequence[str] = ()) -> None:
-        """Say what is trained and where it goes, and where each seed goes on."""
+        """Print what is trained, its directory and the notes, and start the live display on a terminal."""
         config = runs.config
         self._steps, self._seeds = config.steps, {run.seed: _Seed(run) for run in runs.runs}
         self._warmup = config.hyperparameters.get("warmup_steps", 0)
-        self._shown = self._passed()
-        self._began = self._spoke = self._clock()
+        self._printed = self._newest_common_step()
+        self._started = self._last_output = self._clock()
         title = Text.assemble((f"{config.algorithm} on {config.task}", "bold"))
         self._print(title.append(f", {seeds_told(runs.seeds)}, {config.steps:,} steps{' each' * (len(runs.runs) > 1)}"))
         for line in (str(runs.path), *notes):
@@ -74,23 +74,23 @@ class Reporter:
             self._live.start()
 
     def progress(self, steps: Mapping[int, int]) -> None:
-        """Note how far some seeds are."""
+        """Record the current steps of some seeds."""
         for seed, step in steps.items():
             self._seeds[seed].step = max(step, self._seeds[seed].step) if step > self._seeds[seed].begin else step
-        if self._is_warming():
+        if self._is_warming_up():
             self._speed = Speed(self._clock)
         self._speed.add(sum(one.step for one in self._seeds.values()))
-        if not self._live and self._clock() - self._spoke >= SECONDS_OF_SILENCE:
-            self._print(Text(f"step {self._range()} of {self._steps:,}{self._pace()}{self._news()}"))
+        if not self._live and self._clock() - self._last_output >= SECONDS_OF_SILENCE:
+            self._print(Text(f"step {self._range()} of {self._steps:,}{self._pace()}{self._newer_returns()}"))
 
     def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
-        """Take the mean returns of some seeds' evaluations at `step`; a line tells of it once no seed is behind."""
+        """Record the mean returns of some seeds' evaluations at `step`; print a line once no seed is behind."""
         for seed, value in returns.items():
             one = self._seeds[seed]
             one.returns[step], one.step = value, max(step, one.step)
-        passed = self._passed()
-        if not self._live and passed > self._shown:
-            self._shown = passed
+        passed = self._newest_common_step()
+        if not self._live and passed > self._printed:
+            self._printed = passed
             living = {seed: one.returns[passed] for seed, one in self._living().items() if passed in one.returns}
             mean = float(np.mean(list(living.values())))
             self._print(
@@ -98,7 +98,7 @@ class Reporter:
             )
 
     def failed(self, seed: int, step: int, reason: str) -> None:
-        """Show that a seed has stopped; the others go on."""
+        """Show that a seed has failed; the others continue."""
         self._seeds[seed].failure = f"seed {seed} failed at step {step:,}: {reason}"
         self._print(Text(self._seeds[seed].failure, "red"))
 
@@ -107,10 +107,10 @@ class Reporter:
         self._print(Text(text, "dim"))
 
     def finish(self, runs: RunSet) -> None:
-        """Replace the display by the results, and say where they are and what to type next."""
+        """Replace the display by the results, and print where they are and what to type next."""
         self.close()
         self._print(Text())
-        self._print(Text(_outcome(runs, duration(self._clock() - self._began)), "bold"))
+        self._print(Text(_outcome(runs, duration(self._clock() - self._started)), "bold"))
         has_curve = bool(len(runs.evaluations))
         for table in result_tables(runs) if has_curve else [Text("no evaluations yet")]:
             self._print(table)
@@ -121,55 +121,56 @@ class Reporter:
             self._print(Text.assemble((f"{label:<9}", "dim"), line))
 
     def close(self) -> None:
-        """Give the terminal back as it was. May be called at any time, and again."""
+        """Stop the live display and restore the terminal. May be called at any time, and more than once."""
         if self._live:
             self._live.stop()
             self._live = None
 
     def _print(self, renderable: RenderableType) -> None:
-        # A path or a command that is cut into lines could not be copied.
+        # A path or a command that is wrapped could not be copied.
         self.console.print(renderable, soft_wrap=isinstance(renderable, Text))
-        self._spoke = self._clock()
+        self._last_output = self._clock()
 
     def _living(self) -> dict[int, _Seed]:
         return {seed: one for seed, one in self._seeds.items() if not one.failure}
 
-    def _passed(self) -> int:
-        """Return the newest evaluation step that no living seed is behind, 0 before the first."""
+    def _newest_common_step(self) -> int:
+        """Return the newest step at which all seeds that have not failed are evaluated, 0 before the first."""
         newest = [max(one.returns, default=0) for one in self._living().values()]
         return min(newest, default=0)
 
-    def _is_warming(self) -> bool:
+    def _is_warming_up(self) -> bool:
         return any(one.step < min(self._warmup, self._steps) for one in self._living().values())
 
     def _range(self) -> str:
         steps = [one.step for one in (self._living() or self._seeds).values()]
         return f"{min(steps):,}" + (f" to {max(steps):,}" if max(steps) > min(steps) else "")
 
-    def _news(self) -> str:
-        """Return the last return of each seed that is ahead of the newest evaluation told of."""
-        ahead = {
-            seed: max(one.returns) for seed, one in self._living().items() if max(one.returns, default=0) > self._shown
-        }
-        told = [f"seed {seed} {number(self._seeds[seed].returns[step])} at {step:,}" for seed, step in ahead.items()]
-        return f"; last returns: {', '.join(told)}" if told and len(told) <= MOST_SEEDS_SHOWN else ""
+    def _newer_returns(self) -> str:
+        """Return the last return of each seed that has an evaluation newer than the last one printed."""
+        returns = [
+            f"seed {seed} {number(one.returns[max(one.returns)])} at {max(one.returns):,}"
+            for seed, one in self._living().items()
+            if max(one.returns, default=0) > self._printed
+        ]
+        return f"; last returns: {', '.join(returns)}" if returns and len(returns) <= MOST_SEEDS_SHOWN else ""
 
     def _pace(self) -> str:
-        """Return how fast it goes and how long it will take, or what goes on while no step is made."""
+        """Return the speed and the time left, or the phase: compiling, warm-up or finishing."""
         living = self._living().values()
         if living and all(one.step <= one.begin for one in living):
-            return f", compiling for {duration(self._clock() - self._began)}"
+            return f", compiling for {duration(self._clock() - self._started)}"
         left = sum(self._steps - one.step for one in living)
         if living and not left:
             return ", finishing"
-        if self._is_warming():
+        if self._is_warming_up():
             return f", {self._warmup:,} random steps before learning"
         speed = self._speed.per_second()
         unit = "steps/s" if len(self._seeds) == 1 else "seed-steps/s"
         return f", {speed:,.0f} {unit}, {duration(left / speed)} left" if speed else ""
 
     def _display(self) -> RenderableType:
-        """Show a bar over all, and a line for each seed: its step, its returns so far as a curve, and the last one."""
+        """Return a bar over all seeds, and a line for each: its step, its returns as a curve, and the last one."""
         living = (self._living() or self._seeds).values()
         done, total = sum(one.step for one in living), self._steps * len(living)
         step = short(min(one.step for one in living))
@@ -211,7 +212,7 @@ class Reporter:
 
 
 def sparkline(values: Sequence[float] | np.ndarray, low: float, high: float, width: int) -> str:
-    """Draw values between `low` and `high` in at most `width` characters, each the mean of its share; NaN is blank."""
+    """Draw values between `low` and `high` in at most `width` characters, each the mean of a chunk; NaN is blank."""
     array = np.asarray(values, dtype=np.float64)
     parts = np.array_split(array, min(width, len(array))) if len(array) else []
     span, drawn = high - low, ""
@@ -222,14 +223,14 @@ def sparkline(values: Sequence[float] | np.ndarray, low: float, high: float, wid
 
 
 def _next_lines(runs: RunSet, has_curve: bool) -> list[tuple[str, str]]:
-    """Return where to look and what to type next, each with its label."""
+    """Return (label, line) pairs that say where to look and what to type next."""
     directory, config = shlex.quote(str(runs.path)), runs.config
     logs = [run.path / "log.txt" for run in runs.runs if run.seed in runs.failures]
     lines = [("why", f"the traceback is in {log}") for log in logs if _has_traceback(log)]
     lines += [("curve", str(runs.curve))] if has_curve else []
     if not any(run.policy_file().exists() for run in runs.runs if run.seed not in runs.failures):
         return lines
-    if config.task_is_callable:  # which no command line can name
+    if config.task_is_callable:  # no command line can name it
         task = config.task if config.task.isidentifier() else "your_task"
         return [*lines, ("test it", f"in Python: evaluate(load({str(runs.path)!r}), {task})")]
     lines.append(("test it", f"{program()} evaluate {directory}"))
@@ -240,7 +241,7 @@ def _next_lines(runs: RunSet, has_curve: bool) -> list[tuple[str, str]]:
 
 
 def _has_traceback(log: Path) -> bool:
-    """Whether a log says more of a failure than its line: where a number is not finite, nothing was raised."""
+    """Return whether a log has a traceback; a run that failed because a number was not finite has none."""
     return log.exists() and "\nTraceback (most recent" in log.read_text("utf-8", "replace")
 
 

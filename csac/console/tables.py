@@ -1,4 +1,4 @@
-"""What a terminal is told: its console, lengths of time, and the tables that commands print."""
+"""The console, the format of durations, and the tables that commands print."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import io
 import shlex
 import shutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -34,11 +35,11 @@ if TYPE_CHECKING:
 
 STATE_STYLES = {"running": "cyan", "finished": "green", "failed": "red", "interrupted": "yellow", "killed": "red"}
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
-WIDTH_ELSEWHERE = 200  # characters where there is no terminal: lines stay whole for grep
+WIDTH_ELSEWHERE = 200  # characters without a terminal: lines stay whole for grep
 
 
 def make_console() -> Console:
-    """Return a console on standard output that takes text as it is, and that goes quiet when nobody reads any more."""
+    """Return a console on standard output that prints text verbatim and ignores a closed pipe or terminal."""
     output = sys.stdout
     if output is None or output.closed:
         output = io.StringIO()
@@ -49,20 +50,20 @@ def make_console() -> Console:
 
 
 def print_lines(console: Console, lines: Iterable[str | Text]) -> None:
-    """Print lines that stay whole at any width: a path or a command that is cut could not be copied."""
+    """Print lines without wrapping them: a wrapped path or command could not be copied."""
     for line in lines:
         console.print(line, soft_wrap=True)
 
 
 def program() -> str:
-    """Return what to type for csac: its name, or the path it was started by where a shell would not find the name."""
+    """Return what to type to run csac: its name, or the path that it was started by if it is not on the PATH."""
     started = sys.argv[0]
     is_ours = Path(started).name == "csac" and shutil.which("csac") is None
     return shlex.quote(started) if is_ours else "csac"
 
 
 def duration(seconds: float) -> str:
-    """Return a length of time with the two units that matter: 45 s, 3 min 20 s, 1 h 42 min, 2 d 3 h."""
+    """Format a duration with its two largest units: 45 s, 3 min 20 s, 1 h 42 min, 2 d 3 h."""
     whole = round(seconds)
     for size, unit, smaller_size, smaller in ((86400, "d", 3600, "h"), (3600, "h", 60, "min"), (60, "min", 1, "s")):
         if whole >= size:
@@ -72,7 +73,7 @@ def duration(seconds: float) -> str:
 
 
 class Fitted:
-    """A table on a terminal; where it is too narrow, cells are folded, so that no digit is lost."""
+    """A table on a terminal; if that is too narrow, cells are folded so that no digit is lost."""
 
     def __init__(self, table: Table) -> None:
         self.table = table
@@ -94,7 +95,7 @@ class Fitted:
 
 
 def result_tables(runs: RunSet) -> list[Fitted]:
-    """Return what training has reached: results by seed, cases in the last evaluations, and what perturbations cost."""
+    """Return tables of the results by seed, the cases in the last evaluations, and what perturbations cost."""
     rows, failed = runs.evaluations, runs.failures.keys()
     trained, episodes = np.unique(runs.rows("episodes")["seed"], return_counts=True)
     counts = dict(zip(trained.tolist(), episodes.tolist(), strict=True))
@@ -108,14 +109,14 @@ def result_tables(runs: RunSet) -> list[Fitted]:
 def evaluation_tables(
     results: Mapping[int, Sequence[EvaluationEpisode]], failed: Collection[int] = frozenset()
 ) -> list[Fitted]:
-    """Return the returns of fresh episodes by seed, and the cases of the seeds that did not fail in training."""
+    """Return tables of the returns by seed, and of the cases over the seeds that did not fail in training."""
     rows = _rows(results)
     cases = report_tables.case_table(rows[~np.isin(rows["seed"], list(failed))])
     return [Fitted(table) for table in (_evaluation_table(rows, failed), cases) if table]
 
 
 def _evaluation_table(rows: np.ndarray, failed: Collection[int]) -> Table:
-    """Return a row for each seed, and the mean of the seeds that did not fail in training with its interval."""
+    """Return a table with a row per seed, and the mean with its interval over seeds that did not fail in training."""
     largest, has_success = float(np.abs(rows["return"]).max(initial=0.0)), not np.isnan(rows["success"]).all()
     body, sound = [], []
     for seed in np.unique(rows["seed"]).tolist():
@@ -137,7 +138,7 @@ def _evaluation_table(rows: np.ndarray, failed: Collection[int]) -> Table:
 
 
 def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[str]:
-    """Return the events that no episode has held."""
+    """Return the names of the events that no episode recorded."""
     rows = _rows(results)
     return [name for name in (rows.dtype.names or ())[len(COLUMNS["evaluations"]) :] if np.isnan(rows[name]).all()]
 
@@ -145,7 +146,7 @@ def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[st
 def run_lines(sets: Sequence[RunSet]) -> list[Text]:
     """Return a line for each set of runs: task, algorithm, seeds, steps, state, last return, directory.
 
-    The last return is the mean over the seeds that have not failed.
+    The last return is a mean over the seeds that have not failed.
     """
     table = [("task", "algorithm", "seeds", "steps", "state", "last return", "directory")] if sets else []
     for runs in sets:
@@ -162,7 +163,7 @@ def run_lines(sets: Sequence[RunSet]) -> list[Text]:
 
 
 def export_lines(verification: Mapping[str, Any]) -> list[str]:
-    """Return the lines that say how an artefact compares with its policy."""
+    """Return lines that compare an artefact with the policy that it was exported from."""
     count, largest = verification["observations"], verification["largest_difference"]
     lines = [f"{count:,} observations: actions differ by at most {largest:.1e} of their range"]
     if returns := verification.get("returns"):
@@ -172,7 +173,7 @@ def export_lines(verification: Mapping[str, Any]) -> list[str]:
 
 
 def latency_table(measured: Mapping[str, Sequence[Latency]]) -> Fitted:
-    """Return the microseconds of single calls, a row for each artefact and way to call it."""
+    """Return a table of the microseconds per call, a row for each artefact and call rate."""
     headings = ("μs for one action", "calls", *PERCENTILES, "late: p99", "late: max")
     rows = []
     for name, several in measured.items():
@@ -185,7 +186,7 @@ def latency_table(measured: Mapping[str, Sequence[Latency]]) -> Fitted:
 
 
 def latency_cells(latency: Latency) -> list[str]:
-    """Return the percentiles of the durations, and the two of the lateness, in microseconds."""
+    """Return the percentiles of the durations, then p99 and maximum of the lateness, in microseconds."""
     late = ["", ""] if latency.lateness is None else _microseconds(latency.lateness, [99.0, 100.0])
     return _microseconds(latency.durations, [*PERCENTILES.values()]) + late
 
@@ -219,7 +220,7 @@ def _microseconds(nanoseconds: np.ndarray, percentiles: list[float]) -> list[str
 
 
 class _LenientFile:
-    """A text file that swallows what can no longer be written: a run goes on after its terminal or pipe is gone."""
+    """A text file that ignores write errors, so that a run continues after its terminal or pipe is closed."""
 
     def __init__(self, file: IO[str]) -> None:
         self._file = file
@@ -231,10 +232,8 @@ class _LenientFile:
             return len(text)
 
     def flush(self) -> None:
-        try:
+        with suppress(OSError, ValueError):
             self._file.flush()
-        except (OSError, ValueError):
-            return
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)

@@ -1,4 +1,4 @@
-"""How fast something goes, and what is shown while it takes its time."""
+"""Measure the speed of a long operation and show its progress."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-SECONDS_OF_SILENCE = 30.0  # between two lines where there is no terminal
-SPEED_WINDOW = 20.0  # seconds that the shown speed looks back
+SECONDS_OF_SILENCE = 30.0  # between two lines without a terminal
+SPEED_WINDOW = 20.0  # seconds over which the shown speed is averaged
 
 
 class Speed:
-    """Steps per second over the last `SPEED_WINDOW` seconds, or since the note before where that is longer ago."""
+    """Steps per second over the last `SPEED_WINDOW` seconds, or since the previous sample if that is older."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -27,18 +27,18 @@ class Speed:
         self._has_begun = False
 
     def add(self, total: int) -> None:
-        """Note the number of steps made so far."""
+        """Record the total number of steps so far."""
         now = self._clock()
         self._samples.append((now, total))
         while len(self._samples) > 2 and now - self._samples[1][0] > SPEED_WINDOW:
             self._samples.popleft()
         if len(self._samples) == 2 and not self._has_begun:
             self._has_begun = True
-            if now - self._samples[0][0] > SPEED_WINDOW:  # the first steps came after a compilation
+            if now - self._samples[0][0] > SPEED_WINDOW:  # compilation preceded the first steps
                 self._samples.popleft()
 
     def per_second(self) -> float | None:
-        """Return the speed, or None as long as there is too little to tell."""
+        """Return the speed, or None while there are too few samples."""
         if len(self._samples) < 2:
             return None
         (begin, first), (end, last) = self._samples[0], self._samples[-1]
@@ -49,25 +49,25 @@ class Speed:
 def progress_shown(
     console: Console, doing: str, unit: str, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[int, int], None]]:
-    """Show that something is being done; yield what is to be called with how much is done, and of how much.
+    """Show the progress of an operation; yield a function to call with the amount done and the total.
 
-    On a terminal it is one line that changes, with the time that the rest will take; elsewhere a line now and then.
+    On a terminal this is one updating line with the time left; elsewhere a line every `SECONDS_OF_SILENCE`.
     """
-    speed, spoke = Speed(clock), clock()
+    speed, last_output = Speed(clock), clock()
     speed.add(0)
     status = console.status(doing) if console.is_interactive else None
 
     def show(done: int, total: int) -> None:
-        nonlocal spoke
+        nonlocal last_output
         speed.add(done)
         pace = speed.per_second()
         left = f", {duration((total - done) / pace)} left" if pace and done < total else ""
         text = f"{doing}: {done:,} of {total:,} {unit}{left}"
         if status:
             status.update(text)
-        elif clock() - spoke >= SECONDS_OF_SILENCE:
+        elif clock() - last_output >= SECONDS_OF_SILENCE:
             console.print(text, soft_wrap=True)
-            spoke = clock()
+            last_output = clock()
 
     with status or nullcontext():
         yield show

@@ -1,1 +1,1 @@
-"""What is claimed: studies, their reports, and searches for hyperparameters."""
+"""Studies, their reports, and hyperparameter searches."""

@@ -1,4 +1,4 @@
-"""Runs side by side: the arms that they belong to, what each arm is called, and what its seeds have reached."""
+"""Group runs into the arms of a comparison, label the arms, and collect the results of their seeds."""
 
 from __future__ import annotations
 
@@ -32,39 +32,39 @@ if TYPE_CHECKING:
 
     from csac.studies.study import Study
 
-FITTED = ("warmup_steps", "replay_size")  # to the length of a run, whatever preset it follows
+FITTED = ("warmup_steps", "replay_size")  # to the length of a run, without leaving the preset
 NO_SETTING = ("task", "algorithm", "seed", "perturbations", "events", "device", "checkpoint_interval")
 NO_SETTING += ("keep_checkpoints", "task_is_callable", "hyperparameters", "environment_arguments")
 
 
 @dataclass
 class Arm:
-    """The runs of one method on one task under one condition, which differ by their seeds."""
+    """The runs of one method on one task under one condition, which differ only in their seeds."""
 
     label: str
     task: str
     condition: tuple[str, ...]
     runs: list[RunDirectory] = field(default_factory=list)
     missing: list[int] = field(default_factory=list)
-    """Seeds that a study wants and that have not begun."""
+    """Seeds of the study that have not started."""
     published: str | None = None
-    """The paper's column that stands beside it."""
+    """The column of the paper's tables to compare with."""
     until: int | None = None
-    """The last step that counts."""
+    """The last step whose evaluations count."""
 
     @property
     def config(self) -> RunConfig:
-        """What the first run computes."""
+        """The configuration of the first run."""
         return self.runs[0].config
 
     @property
     def failures(self) -> dict[int, str]:
-        """How each seed that failed did."""
+        """The failure reason of each failed seed."""
         return {run.seed: run.manifest.failure for run in self.runs if run.manifest.state == "failed"}
 
     @functools.cached_property
     def incomplete(self) -> dict[int, int]:
-        """The last evaluation of each seed that is behind the others or has not begun: it is in no number."""
+        """The last evaluated step of each seed that is behind or has not started; such a seed is in no statistic."""
         ends = {seed: int(rows["step"].max(initial=0)) for seed, rows in self._sound.items()}
         behind = {seed: step for seed, step in ends.items() if step < max(ends.values()) or not step}
         return behind | dict.fromkeys(self.missing, 0)
@@ -76,12 +76,12 @@ class Arm:
 
     @property
     def marks(self) -> list[tuple[int, str]]:
-        """Where something changes, and what."""
+        """The perturbations: the step of each, and its text."""
         return by_step(perturbations_of(self.condition))
 
     @property
     def place(self) -> str:
-        """The task, and what changes there."""
+        """The task and its perturbations."""
         return ", ".join([self.task, *(f"{text} after step {step:,}" if step else text for step, text in self.marks)])
 
     def best(self) -> tuple[np.ndarray, int]:
@@ -99,13 +99,13 @@ class Arm:
 
 
 def gather(study: Study, directory: Path) -> list[Arm]:
-    """Return every arm of a study, task by task, with its runs. Raises InputError for those of another study."""
+    """Return every arm of a study with its runs, task by task. Raises InputError for runs of another configuration."""
     arms: dict[tuple[str, tuple[str, ...], str], Arm] = {}
     for wanted in study.runs():
         method, config, _ = wanted
         key = config.task, config.perturbations, method.label
-        made = Arm(method.label, config.task, config.perturbations, published=method.published)
-        arm = arms.setdefault(key, made)
+        new_arm = Arm(method.label, config.task, config.perturbations, published=method.published)
+        arm = arms.setdefault(key, new_arm)
         if run := wanted.open(directory):
             arm.runs.append(run)
         else:
@@ -119,7 +119,7 @@ def read_arms(
     until: int | None = None,
     on_damaged: Callable[[InputError], None] | None = None,
 ) -> list[Arm]:
-    """Return the arms of the runs at and below these paths: those of a label, or those alike but for their seeds."""
+    """Group the runs at and below these paths into arms: by label, or by configuration apart from the seed."""
     groups: dict[tuple[Any, ...], Arm] = {}
     seen: set[Path] = set()
     plain = [("", path) for path in paths]
@@ -147,25 +147,25 @@ def _runs(path: Path, on_damaged: Callable[[InputError], None] | None) -> list[R
     if is_run(path):
         return [RunDirectory.open(path)]
     found = [run for runs in find_sets(path, on_damaged) for run in runs.runs]
-    return found or RunSet.open(path).runs  # which says what is there instead
+    return found or RunSet.open(path).runs  # raises an error that says what is there instead
 
 
 def labels(arms: Sequence[Arm]) -> list[str]:
-    """Return what each arm is called: its label, or its algorithm and preset, and how others of that name differ.
+    """Return a label for each arm: its own, or its algorithm and preset with the settings in which such arms differ.
 
-    What tells arms apart on one task is told on every task, so that a method has one label.
+    A setting that distinguishes arms on one task is named on every task, so that a method has one label.
     """
     names = [arm.label or name_of(arm.config) for arm in arms]
-    apart: dict[str, list[str]] = {}
+    distinguishing: dict[str, list[str]] = {}
     for name in names:
-        own = [arm for arm, its in zip(arms, names, strict=True) if its == name and not arm.label]
-        by_place = itertools.groupby(sorted(own, key=lambda arm: arm.place), key=lambda arm: arm.place)
-        told = [item for _, beside in by_place for item in differing([settings(arm.config) for arm in beside])]
-        if own and name == own[0].config.title:  # no preset, which may differ between tasks
-            told += differing([arm.config.hyperparameters for arm in own])
-        apart[name] = list(dict.fromkeys(told))
+        namesakes = [arm for arm, its in zip(arms, names, strict=True) if its == name and not arm.label]
+        groups = by_place(sorted(namesakes, key=lambda arm: arm.place)).values()
+        differences = [item for group in groups for item in differing([settings(arm.config) for arm in group])]
+        if namesakes and name == namesakes[0].config.title:  # no preset: its values may differ between tasks
+            differences += differing([arm.config.hyperparameters for arm in namesakes])
+        distinguishing[name] = list(dict.fromkeys(differences))
     full = [
-        ", ".join([name, *(f"{item} {plain(settings(arm.config).get(item))}" for item in apart[name])])
+        ", ".join([name, *(f"{item} {plain(settings(arm.config).get(item))}" for item in distinguishing[name])])
         for arm, name in zip(arms, names, strict=True)
     ]
     keys = [(label, arm.place) for arm, label in zip(arms, full, strict=True)]
@@ -176,33 +176,33 @@ def labels(arms: Sequence[Arm]) -> list[str]:
 
 
 def name_of(config: RunConfig) -> str:
-    """Return the algorithm, the preset that a run follows, if any, and what was fitted to its length beside that."""
-    name, own, make = config.title, config.hyperparameters, ALGORITHMS.get(config.algorithm)
+    """Return the algorithm, the preset that a run follows, if any, and the `FITTED` values that differ from it."""
+    name, actual, make = config.title, config.hyperparameters, ALGORITHMS.get(config.algorithm)
     for preset in PRESETS:
-        with suppress(InputError):  # of a preset that says nothing of the algorithm
+        with suppress(InputError):  # a preset may lack the algorithm
             given: Any = hyperparameters(preset, config.algorithm, config.task)
             values: Any = dataclasses.asdict(make(**given)) if make else {}
-            changed = differing([own, values])
+            changed = differing([actual, values])
             if values and set(changed) <= set(FITTED):
-                return ", ".join([f"{name} ({preset})", *(f"{item} {plain(own.get(item))}" for item in changed)])
+                return ", ".join([f"{name} ({preset})", *(f"{item} {plain(actual.get(item))}" for item in changed)])
     return name
 
 
 def settings(config: RunConfig) -> dict[str, Any]:
-    """Return what a run was given that its numbers depend on, beside task, algorithm and perturbations."""
-    own = {name: value for name, value in vars(config).items() if name not in NO_SETTING}
+    """Return the settings that a run's results depend on, apart from task, algorithm and perturbations."""
+    options = {name: value for name, value in vars(config).items() if name not in NO_SETTING}
     arguments = {f"environment: {name}": value for name, value in config.environment_arguments.items()}
-    return {**config.hyperparameters, **own, **arguments}
+    return {**config.hyperparameters, **options, **arguments}
 
 
 def differing(several: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the settings that are not the same in all of these, one that is missing among them."""
+    """Return the names of the settings that differ between these, or that some of them lack."""
     names = dict.fromkeys(name for own in several for name in own)
     return [name for name in names if len({plain(own.get(name)) for own in several}) > 1]
 
 
 def plain(value: Any) -> str:
-    """Return a setting as people write it."""
+    """Format the value of a setting for people."""
     if isinstance(value, tuple | list):
         return " ".join(map(str, value))
     if isinstance(value, float):
@@ -211,7 +211,7 @@ def plain(value: Any) -> str:
 
 
 def train_command(config: RunConfig, seeds: Sequence[int]) -> str:
-    """Return the `csac train` that trains these seeds of a configuration."""
+    """Return the `csac train` command that trains these seeds of a configuration."""
     words = ["csac", "train", config.task, "--algorithm", config.algorithm, "--steps", str(config.steps)]
     words += ["--seeds", str(seeds[-1] - seeds[0] + 1), *(["--first-seed", str(seeds[0])] if seeds[0] else [])]
     default = RunConfig(task=config.task)
@@ -226,7 +226,7 @@ def train_command(config: RunConfig, seeds: Sequence[int]) -> str:
 
 
 def _options(config: RunConfig) -> list[str]:
-    """Return the options of the hyperparameters: what is not as by default, or as in a preset if that is shorter."""
+    """Return the options of hyperparameters that differ from the defaults, or from a preset if that is shorter."""
     make: Any = ALGORITHMS.get(config.algorithm)
     choices = []
     for preset in (None, *PRESETS):
@@ -240,7 +240,7 @@ def _options(config: RunConfig) -> list[str]:
 
 
 def _option(name: str, value: Any) -> list[str]:
-    """Return one option; None cannot be typed: it is what leaving the option out means."""
+    """Return the words of one option; for None there are none, since leaving the option out means None."""
     flag = name.replace("_", "-")
     if value is None:
         return []
@@ -250,23 +250,23 @@ def _option(name: str, value: Any) -> list[str]:
 
 
 def seconds_per_step(run: RunDirectory) -> float | None:
-    """Return how long a step of a run took, by the times of its log's evaluations; its stops do not count."""
-    told = []
+    """Return the median seconds per step between evaluations in a run's log; interruptions do not count."""
+    evaluations = []
     with suppress(OSError, ValueError):
         for line in (run.path / "log.txt").read_text(encoding="utf-8").splitlines():
             moment, word, step, *_ = [*line.split(" "), "", ""]
             if word == "step" and step.endswith(":"):
-                told.append((datetime.fromisoformat(moment), int(step[:-1])))
+                evaluations.append((datetime.fromisoformat(moment), int(step[:-1])))
     paces = [
         (later - before).total_seconds() / (step - start)
-        for (before, start), (later, step) in itertools.pairwise(told)
+        for (before, start), (later, step) in itertools.pairwise(evaluations)
         if step > start
     ]
     return median(paces) if paces else None
 
 
 def by_place(arms: Iterable[Arm]) -> dict[str, list[Arm]]:
-    """Return the arms of each task and condition, under what these are called."""
+    """Group arms by their `place`, that is by task and perturbations."""
     groups: dict[str, list[Arm]] = {}
     for arm in arms:
         groups.setdefault(arm.place, []).append(arm)

@@ -1,4 +1,4 @@
-"""`csac study` and `csac report`: their options, and what each does."""
+"""The options and the implementation of `csac study` and `csac report`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from csac.studies.run import How
+    from csac.studies.run import Execution
     from csac.studies.study import Study
 
 HELP = """\
@@ -55,7 +55,7 @@ class List:
 
 @dataclass(frozen=True)
 class Show:
-    """Show the runs of a study, how far they are, and how long such runs took."""
+    """Show the runs of a study, their progress, and how long such runs take."""
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
     """One of csac study list, or a TOML file."""
@@ -66,12 +66,12 @@ class Show:
     algorithms: Annotated[tuple[str, ...], arg(metavar="NAME ...", help_behavior_hint="(default: all)")] = ()
     """Only these algorithms or methods."""
     seeds: Annotated[int | None, arg(help_behavior_hint="(default: as in the study)")] = None
-    """Number of seeds; asking for more later reuses what is there."""
+    """Number of seeds; asking for more later reuses the existing runs."""
     directory: Annotated[Path | None, arg(help_behavior_hint="(default: runs/studies/NAME)")] = None
     """Directory of the runs: METHOD/TASK[/CONDITION]/seed-K."""
 
     def study(self) -> Study:
-        """Return the study that is meant. Raises InputError for what there is not."""
+        """Return the chosen study. Raises InputError for an unknown study, task or method."""
         study = dataclasses.replace(find(self.name), scale=self.scale)
         return study.narrowed(self.tasks, self.algorithms, self.seeds)
 
@@ -81,7 +81,7 @@ class Show:
         return self.directory or Path("runs", "studies", Path(self.name).stem + scale)
 
     def words(self) -> list[str]:
-        """Return what to type for the same choice."""
+        """Return the command-line words that make the same choice."""
         words = [self.name, *(["--scale", f"{self.scale:g}"] if self.scale != 1 else [])]
         words += [*(["--tasks", *self.tasks] if self.tasks else [])]
         words += [*(["--algorithms", *self.algorithms] if self.algorithms else [])]
@@ -91,7 +91,7 @@ class Show:
 
 @dataclass(frozen=True)
 class Run(Show):
-    """Run what is not over: finished and failed runs are left alone, the others go on from their checkpoints.
+    """Train a study's unfinished runs, from their checkpoints if there are any; finished and failed runs are skipped.
 
     Exit codes: 0 done, 1 the directory can no longer be written, 2 wrong arguments, 3 a run failed, 130 or 143 stopped
     by a signal (every run is saved).
@@ -102,11 +102,11 @@ class Run(Show):
     )
     """local: one run at a time, on all cores. processes: several at once. ray: on a Ray cluster (docs/cluster.md)."""
     workers: Annotated[int | None, arg(help_behavior_hint="(default: one per core)")] = None
-    """Number of runs at once, each with its share of the cores."""
+    """Number of runs that train in parallel, each with its share of the cores."""
     cell: Annotated[int | None, arg(help_behavior_hint="(default: all)")] = None
-    """Only the run with this number in csac study show, for example as one job of an array."""
+    """Only the run with this number in csac study show, for example as one job of a job array."""
     address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: a new one, here)")] = None
-    """Address of the Ray cluster; auto is the one this machine belongs to."""
+    """Address of the Ray cluster; auto is the one that this machine belongs to."""
     cell_cores: int = 1
     """Cores that each run requests from Ray."""
     cell_gpus: float = 0.0
@@ -116,18 +116,18 @@ class Run(Show):
     device: Literal["cpu", "gpu"] = "cpu"
     """Device that the networks are trained on."""
     wandb: FlagCreatePairsOff[bool] = False
-    """Also log to Weights & Biases: one run for each, in the project WANDB_PROJECT or else csac."""
+    """Also log each run to Weights & Biases, in the project WANDB_PROJECT or else csac."""
     keep_checkpoints: FlagCreatePairsOff[bool] = False
-    """Keep the checkpoints of finished runs too; they contain the replay and take most of the space."""
+    """Keep the checkpoints of finished runs too; they contain the replay buffer and take most of the space."""
 
     def study(self) -> Study:
-        """Return the study that is meant, on its device."""
+        """Return the chosen study on the chosen device."""
         return dataclasses.replace(super().study(), device=self.device)
 
-    def how(self) -> How:
-        """Return where and how the runs train. Raises InputError for options that do not go together."""
+    def execution(self) -> Execution:
+        """Return the execution options. Raises InputError for options that conflict."""
         from csac.studies.ray import Cluster
-        from csac.studies.run import How
+        from csac.studies.run import Execution
 
         workers = cores_to_use() if self.workers is None else self.workers
         check_whole("--workers", workers, 1, 10_000)
@@ -140,7 +140,7 @@ class Run(Show):
         if self.wandb:
             import_wandb()
         one_at_a_time = self.engine == "local" or self.cell is not None or (self.device == "gpu" and not self.workers)
-        return How(
+        return Execution(
             1 if one_at_a_time else workers,
             cluster if self.engine == "ray" else None,
             self.wandb,
@@ -151,7 +151,7 @@ class Run(Show):
 
 @dataclass(frozen=True)
 class StudyReport(Show):
-    """Write a report of a study's runs, as far as they are: curves, tables, the paper's claims, commands."""
+    """Write a report of a study's runs so far: curves, tables, the paper's claims, commands."""
 
     out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: report.html beside the runs)")] = None
     """Where to write the report: an .html file, or an .md file with its pictures beside it."""
@@ -161,13 +161,13 @@ class StudyReport(Show):
 class Report:
     """Compare runs: curves, returns, intervals, what perturbations cost, hyperparameters, commands.
 
-    Runs that differ only in their seeds are one method, called by what differs.
+    Runs that differ only in their seeds are one method; methods are named by the settings in which they differ.
     """
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="(or --label)")] = ()
     """Runs, sets of runs, or directories that contain some."""
     label: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=DIR,...")] = ()
-    """More runs, as a method of this name on each task."""
+    """More runs to compare, as one method of this name."""
     until: Annotated[int | None, arg(help_behavior_hint="(default: the end)")] = None
     """Ignore evaluations after this step."""
     title: Annotated[str | None, arg(help_behavior_hint="(default: the tasks)")] = None
@@ -177,7 +177,7 @@ class Report:
 
 
 def list_studies(_: List) -> int:
-    """Print the studies that csac brings."""
+    """Print the studies that come with csac."""
     rows = []
     for name in named():
         study = find(name)
@@ -187,7 +187,7 @@ def list_studies(_: List) -> int:
 
 
 def show(options: Show) -> int:
-    """Print the runs of a study."""
+    """Print the runs of a study, their progress and the time that such runs take."""
     directory, rows, paces = options.home(), [], {}
     found = [(run, run.open(directory)) for run in options.study().runs()]
     for run, existing in found:
@@ -201,13 +201,13 @@ def show(options: Show) -> int:
         rows.append((str(index), run.name, f"{short(steps)} / {short(run.config.steps)}", state, time))
     _print_table(("run", "what", "steps", "state", "such runs take"), rows)
     counts = Counter(row[3] for row in rows)
-    told = ", ".join(f"{count} {state}" for state, count in counts.items())
-    make_console().print(f"runs in {directory}: {told}", soft_wrap=True)
+    summary = ", ".join(f"{count} {state}" for state, count in counts.items())
+    make_console().print(f"runs in {directory}: {summary}", soft_wrap=True)
     return 0
 
 
 def run(options: Run) -> int:
-    """Run what is not over and return the exit code."""
+    """Train the unfinished runs and return the exit code."""
     from csac.studies.run import run_study
 
     console, directory, runs = make_console(), options.home(), options.study().runs()
@@ -215,13 +215,13 @@ def run(options: Run) -> int:
         check_whole("--cell", options.cell, 0, len(runs) - 1)
         runs = [runs[options.cell]]
     try:
-        stopped = run_study(runs, directory, options.how(), console)
+        stopped = run_study(runs, directory, options.execution(), console)
     except StorageFailure as failure:
         print(f"csac: {failure}; the same line goes on once that is mended", file=sys.stderr)
         return 1
     states = Counter(existing.state if (existing := one.open(directory)) else "waiting" for one in runs)
-    told = ", ".join(f"{count} {state}" for state, count in states.items())
-    console.print(f"runs in {directory}: {told}", soft_wrap=True)
+    summary = ", ".join(f"{count} {state}" for state, count in states.items())
+    console.print(f"runs in {directory}: {summary}", soft_wrap=True)
     for one in runs:
         if (existing := one.open(directory)) and existing.state == "failed":
             console.print(f"{one.name} failed at {existing.manifest.failure} ({existing.path})", soft_wrap=True)
@@ -234,7 +234,7 @@ def run(options: Run) -> int:
 
 
 def report_study(options: StudyReport) -> int:
-    """Write the report of a study and print where it is."""
+    """Write the report of a study and print its path."""
     from csac.studies.report import report_of, write  # matplotlib is slow to import
 
     study, directory = options.study(), options.home()
@@ -250,7 +250,7 @@ def report_study(options: StudyReport) -> int:
 
 
 def report(options: Report, command: str) -> int:
-    """Write the report of any runs and print where it is; `command` is the line that asked for it."""
+    """Write a report of any runs and print its path; the report shows `command`, the line that made it."""
     from csac.studies.report import ANALYSES, report_of, write  # matplotlib is slow to import
 
     if not (options.runs or options.label):

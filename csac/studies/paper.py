@@ -1,4 +1,4 @@
-"""The paper as data, and one function for each of its claims. Its lengths and measures are inferred: docs/studies.md.
+"""The paper's numbers, and one function for each of its claims. docs/studies.md says which parts are inferred.
 
 Shang, Yuan, Huang, Cui, Chen, Zhu: Effective Reinforcement Learning Control using Conservative Soft Actor-Critic.
 """
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 COLUMNS = ("CSAC", "SAC", "PPO", "TD3", "SD3")
 CHEETAH, WALKER, ANT, HOPPER = "HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"
-QUADX, PANDA = "PyFlyt/QuadX-Waypoints-v1", "PandaReach-v3"  # the arm's task was v2, which ran on after a success
+QUADX, PANDA = "PyFlyt/QuadX-Waypoints-v1", "PandaReach-v3"  # the paper's v2 did not end at success
 
 STEPS: Mapping[str, int] = {**dict.fromkeys((CHEETAH, WALKER, ANT, QUADX, PANDA), 1_000_000), HOPPER: 2_000_000}
 
 
 class Published(NamedTuple):
-    """A mean over five trials and the standard deviation beside it."""
+    """A mean and a standard deviation over five trials."""
 
     mean: float
     std: float
@@ -79,7 +79,7 @@ NEARLY_ALL = 0.95  # of an evaluation's episodes: the paper's "nearly 100 %"
 
 
 class Claim(NamedTuple):
-    """That one arm is better than another, by a number for each seed of both: more is better."""
+    """A claim that `arm` is better than `other`: `ours` and `others` hold a score per seed, where higher is better."""
 
     text: str
     arm: Arm
@@ -87,25 +87,25 @@ class Claim(NamedTuple):
     ours: np.ndarray
     others: np.ndarray
     needs_whole_runs: bool = True
-    """Whether runs shorter than the paper's say nothing of it."""
+    """Whether only runs at least as long as the paper's can test the claim."""
 
     def verdict(self) -> tuple[str, str]:
-        """Return how the claim stands, and why: by the interval of the probability that a seed of ours is better."""
+        """Return the verdict and the reason, from the interval of the probability that a seed of ours is better."""
         probability = probability_of_improvement(self.ours, self.others)
         interval = improvement_interval(self.ours, self.others)
-        told = f"better in {probability:.0%} of the pairs of seeds"
+        reason = f"better in {probability:.0%} of the pairs of seeds"
         if interval is None:
-            return "not yet decidable", f"{told}; fewer than five seeds"
+            return "not yet decidable", f"{reason}; fewer than five seeds"
         low, high = interval
         verdict = "reproduced" if low > 0.5 else "not reproduced" if high < 0.5 else "not yet decidable"
-        told += f", 95 % interval {low:.0%} to {high:.0%}"
+        reason += f", 95 % interval {low:.0%} to {high:.0%}"
         if self.needs_whole_runs and not (_is_whole(self.arm) and _is_whole(self.other)):
-            return "not yet decidable", f"runs shorter than the paper's: {told}"
-        return verdict, told
+            return "not yet decidable", f"runs shorter than the paper's: {reason}"
+        return verdict, reason
 
 
 def claims(arms: Sequence[Arm]) -> list[Claim]:
-    """Return what the paper claims and both sides were measured of: each CSAC against each of the paper's methods."""
+    """Return the paper's claims that these arms can test: each CSAC against each other arm under the same condition."""
     found = []
     for arm in arms:
         beside = [
@@ -136,21 +136,21 @@ def _compared(arm: Arm, other: Arm, beside: Sequence[Arm]) -> Iterator[Claim]:
 
 
 def returns(arm: Arm, other: Arm) -> Iterator[Claim]:
-    """Higher maximum average returns, where the paper's are."""
-    told = RETURNS[arm.task]
-    if told["CSAC"].mean > told[other.published or ""].mean:
+    """Yield the claim of a higher maximum average return, where the paper reports one."""
+    published = RETURNS[arm.task]
+    if published["CSAC"].mean > published[other.published or ""].mean:
         yield Claim("a higher maximum average return", arm, other, arm.best()[0], other.best()[0])
 
 
 def stability(arm: Arm, other: Arm) -> Iterator[Claim]:
-    """What "more stable than SAC" is taken to be: a smaller largest fall of a learning curve."""
+    """Yield the claim "more stable than SAC", taken to mean a smaller largest fall of a learning curve."""
     if other.published == "SAC":
         ours, others = ([drawdown(line) for line in evaluation_matrix(one.rows)[2]] for one in (arm, other))
         yield Claim("a smaller drawdown", arm, other, -np.array(ours), -np.array(others))
 
 
 def weight(arm: Arm, other: Arm) -> Iterator[Claim]:
-    """A higher maximum average return with the weight that the paper finds best than with each other one."""
+    """Yield the claim that the paper's best weight gives a higher maximum average return than each other weight."""
     first, second = (one.config.hyperparameters for one in (arm, other))
     apart = [name for name in first if first[name] != second.get(name)]
     if apart == ["relative_entropy_weight"] and first[apart[0]] == BEST_TAU:
@@ -158,35 +158,35 @@ def weight(arm: Arm, other: Arm) -> Iterator[Claim]:
 
 
 def efficiency(arm: Arm, other: Arm, arms: Sequence[Arm]) -> Iterator[Claim]:
-    """Fewer interactions to the lower boundary of the maximum average returns, where the paper has so.
+    """Yield the claim of fewer steps to the lower boundary of the maximum average returns, where the paper reports so.
 
-    A seed that does not get there is censored: two of them are equal.
+    A seed that never reaches it is censored: two such seeds count as equal.
     """
-    told = INTERACTIONS.get(arm.task)
-    if told and told["CSAC"] < told[other.published or ""]:
+    published = INTERACTIONS.get(arm.task)
+    if published and published["CSAC"] < published[other.published or ""]:
         boundary, is_the_papers = lower_boundary(arms), not _has_ppo(arms)
         ours, others = -interactions(arm, boundary), -interactions(other, boundary)
         yield Claim("fewer steps to the lower boundary", arm, other, ours, others, not is_the_papers)
 
 
 def cases(arm: Arm, other: Arm) -> Iterator[Claim]:
-    """On the quadrotor, fewer crashes and more complete flights, where the paper has so."""
-    for name, told in CASES.items() if arm.task == QUADX else ():
+    """Yield the claims of fewer crashes and more complete flights on the quadrotor, where the paper reports so."""
+    for name, row in CASES.items() if arm.task == QUADX else ():
         sign = 1 if name == "env_complete" else -1
-        if sign * (told["CSAC"].mean - told[other.published or ""].mean) > 0 and name in (arm.rows.dtype.names or ()):
+        if sign * (row["CSAC"].mean - row[other.published or ""].mean) > 0 and name in (arm.rows.dtype.names or ()):
             text = f"{'more' if sign > 0 else 'fewer'} episodes with {name}"
             yield Claim(text, arm, other, sign * _shares(arm, name), sign * _shares(other, name))
 
 
 def success(arm: Arm, other: Arm) -> Iterator[Claim]:
-    """On the arm, success in nearly all episodes sooner than SAC."""
+    """Yield the claim of success in nearly all episodes sooner than SAC, on the robot arm."""
     if arm.task == PANDA and other.published in SUCCESS_STEPS:
         ours, others = (-interactions(one, NEARLY_ALL, "success") for one in (arm, other))
         yield Claim(f"success in {NEARLY_ALL:.0%} of the episodes sooner", arm, other, ours, others)
 
 
 def robustness(arm: Arm, other: Arm) -> Iterator[Claim]:
-    """On HalfCheetah, after more friction, a smaller loss, a sooner return and a higher end than SAC."""
+    """Yield the claims against SAC on HalfCheetah with increased friction: less loss, faster recovery, a higher end."""
     if arm.task != CHEETAH or other.published != "SAC":
         return
     ours, others = (list(recovery(one.rows, one.marks[0][0]).values()) for one in (arm, other))
@@ -200,9 +200,9 @@ def robustness(arm: Arm, other: Arm) -> Iterator[Claim]:
 
 
 def lower_boundary(arms: Sequence[Arm]) -> float:
-    """Return the lowest maximum average return of the paper's methods among these arms, or of all without any.
+    """Return the lowest maximum average return among arms of the paper's methods, or among all arms if there are none.
 
-    PPO has the lowest in the paper: arms of the paper's methods without it have the paper's own boundary.
+    PPO has the lowest in the paper: if the paper's methods are there but not PPO, the paper's own boundary is used.
     """
     arms = [arm for arm in arms if len(arm.rows)]
     known = RETURNS.get(arms[0].task)
@@ -216,7 +216,7 @@ def _has_ppo(arms: Sequence[Arm]) -> bool:
 
 
 def interactions(arm: Arm, threshold: float, column: str = "return") -> np.ndarray:
-    """Return the steps [seed] to the first evaluation at a threshold; infinite for a seed that does not get there."""
+    """Return the steps [seed] to the first evaluation that reaches `threshold`; infinity for a seed without one."""
     rows = arm.rows.copy()
     rows["return"] = np.nan_to_num(rows[column], nan=0.0)
     steps, _, values = evaluation_matrix(rows)

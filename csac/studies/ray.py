@@ -1,4 +1,4 @@
-"""The runs of a study on a Ray cluster: one task for each, tried again from its checkpoint where a node is lost."""
+"""Train the runs of a study on a Ray cluster: one task per run, retried from its checkpoint if a node is lost."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ SECONDS_TO_ANSWER = 10.0
 
 @dataclass(frozen=True)
 class Cluster:
-    """A Ray cluster, and what each run asks of a node. The runs' folder is at the same path on every node."""
+    """A Ray cluster, and what each run requests. The runs' folder must have the same path on every node."""
 
     address: str | None = None
-    """HOST:PORT, `auto`, or None for a cluster on this machine made for the purpose."""
+    """HOST:PORT, `auto`, or None to start a cluster on this machine."""
     cores: int = 1
     gpus: float = 0.0
     memory: float = 0.0
-    """GiB that a node must have to spare; 0 asks for none in particular."""
+    """GiB that each run requests; 0 requests none in particular."""
 
     def run(
         self, programs: Sequence[Program], watcher_of: Callable[[Program], Watcher], should_stop: Callable[[], bool]
     ) -> None:
-        """Run each program as a task. A task whose node is lost goes on elsewhere, from the newest checkpoint.
+        """Run each program as a task. A task whose node is lost continues on another, from the newest checkpoint.
 
-        Raises InputError where Ray is not installed, there is no cluster, or a run cannot begin, and StorageFailure
-        where a run directory can no longer be written.
+        Raises InputError if Ray is not installed, there is no cluster, or a run cannot start, and StorageFailure if a
+        run directory can no longer be written.
         """
         ray = self._connect()
         try:
@@ -58,7 +58,7 @@ class Cluster:
                 num_gpus=self.gpus or None,
                 memory=int(self.memory * 2**30) or None,
                 max_retries=RETRIES,
-                max_calls=1,  # XLA counts its cores once in a process
+                max_calls=1,  # XLA counts its cores only once per process
             )(_train)
             running = {task.remote(program, index, messages): program for index, program in enumerate(programs)}
             errors: list[Exception] = []
@@ -67,7 +67,7 @@ class Cluster:
                 if (should_stop() or errors) and not is_stopping:
                     is_stopping = True
                     for reference in running:
-                        ray.cancel(reference)  # raises SIGINT there, on which the run is saved
+                        ray.cancel(reference)  # sends SIGINT to the task, which saves the run
                 over, _ = ray.wait(list(running), num_returns=1, timeout=SECONDS_BETWEEN_LOOKS)
                 for index, name, arguments in messages.get_nowait_batch(messages.size()):
                     getattr(watcher_of(programs[index]), name)(*arguments)
@@ -77,7 +77,7 @@ class Cluster:
                         ray.get(reference)
                     except ray.exceptions.RayError as error:
                         cause = getattr(error, "cause", None)
-                        if isinstance(cause, InputError | StorageFailure):  # a mistake, which ends the study
+                        if isinstance(cause, InputError | StorageFailure):  # it ends the whole study
                             errors.append(cause)
                         elif not is_stopping:
                             record_failure(program, watcher_of(program), error)
@@ -94,7 +94,7 @@ class Cluster:
         except ImportError:
             raise InputError("Ray is not installed: pip install '.[cluster]' in a clone of csac") from None
         host, _, port = (self.address or "").rpartition(":")
-        if host and port.isdigit():  # Ray itself would try for minutes
+        if host and port.isdigit():  # Ray itself would retry for minutes
             try:
                 socket.create_connection((host, int(port)), SECONDS_TO_ANSWER).close()
             except OSError as error:
@@ -112,10 +112,10 @@ def _train(program: Program, index: int, messages: Any) -> None:
     import ray
 
     watcher = _QueueWatcher(index, messages)
-    from csac.training.running import begin_with, train_program  # JAX
+    from csac.training.running import begin_with, train_program  # imports JAX
 
     begin_with(program.threads)
-    for path in program.directories:  # of a run lost with its node the lock becomes free; another process may keep it
+    for path in program.directories:  # the lock of a lost node becomes free; another process may keep it
         lock, end = path / LOCK, time.monotonic() + SECONDS_FOR_LOCK
         while lock.exists() and is_locked(lock) and time.monotonic() < end:
             time.sleep(1.0)
@@ -131,11 +131,11 @@ def _train(program: Program, index: int, messages: Any) -> None:
 
 
 class _QueueWatcher(Watcher):
-    """Sends what happens to a run to the driver."""
+    """Send the events of a run to the driver."""
 
     def __init__(self, index: int, messages: Any) -> None:
         self.index, self.messages, self.sent = index, messages, list[Any]()
 
     def send(self, name: str, *arguments: Any) -> None:
-        # Nobody waits until it was heard: Ray would lend the core of who waits to another run.
+        # Do not wait until it is received: Ray would lend the core of a waiting task to another run.
         self.sent = [*self.sent[-100:], self.messages.actor.put.remote((self.index, name, arguments))]

@@ -1,4 +1,4 @@
-"""Reports: one self-contained HTML file, or Markdown with its pictures beside it, of runs side by side."""
+"""Write reports that compare runs: one self-contained HTML file, or Markdown with its pictures beside it."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ if TYPE_CHECKING:
 
     from csac.studies.arms import Arm
 
-MOST_CURVES = 7  # that are told apart in one picture
+MOST_CURVES = 7  # in one picture
 POINTS = 3  # evaluations at the end of a run that count as its score
 
 
 class Picture(NamedTuple):
-    """A figure and what it is called."""
+    """A figure and its title."""
 
     title: str
     figure: Figure
 
 
 class Commands(NamedTuple):
-    """Lines to type."""
+    """Command lines to show."""
 
     lines: tuple[str, ...]
 
 
 class Heading(NamedTuple):
-    """The title of what follows."""
+    """The heading of a section."""
 
     text: str
 
@@ -57,19 +57,19 @@ Part = str | Heading | Table | Picture | Commands
 
 
 def report_of(arms: Sequence[Arm], commands: Sequence[str], analyses: Sequence[str]) -> list[Part]:
-    """Return the report of these arms, with these sections among others."""
+    """Return the parts of a report on these arms; `analyses` names its optional sections."""
     shown = [arm for arm in arms if len(arm.rows)]
     parts = list(overview(arms))
     for name, section in SECTIONS.items():
         if shown and name in analyses:
             parts += section(shown)
     if shown:
-        parts += [*over_tasks(shown), *the_papers(shown)]
+        parts += [*over_tasks(shown), *paper_claims(shown)]
     return [*parts, *hyperparameters(arms), *provenance(arms, commands)]
 
 
 def write(path: Path, title: str, parts: Sequence[Part]) -> None:
-    """Write a report as `path`, an .html or an .md file. Raises InputError where it is another or cannot be written."""
+    """Write a report to `path`, an .html or .md file. Raises InputError for another kind, or if writing fails."""
     if path.suffix not in (".html", ".md"):
         raise InputError(f"a report is an .html or an .md file: name it {path.with_suffix('.html')}")
     with writing(path):
@@ -107,7 +107,7 @@ def _markdown(path: Path, title: str, parts: Sequence[Part]) -> str:
 
 
 def overview(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Which runs there are, which of them failed and which are incomplete."""
+    """Yield a table of the runs, and notes on those that failed or are incomplete."""
     yield Heading("Runs")
     rows = []
     for arm in arms:
@@ -121,42 +121,42 @@ def overview(arms: Sequence[Arm]) -> Iterator[Part]:
         for seed, reason in arm.failures.items():
             yield f"Failed: {arm.label} on {arm.place}, seed {seed}: {reason}. It is in no number below."
         if arm.incomplete:
-            told = ", ".join(f"seed {seed} at step {step:,}" for seed, step in arm.incomplete.items())
-            yield f"Incomplete, in no number below: {arm.label} on {arm.place}, {told}."
+            incomplete = ", ".join(f"seed {seed} at step {step:,}" for seed, step in arm.incomplete.items())
+            yield f"Incomplete, in no number below: {arm.label} on {arm.place}, {incomplete}."
 
 
 def curves(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Learning curves, task by task."""
+    """Yield the learning curves, task by task."""
     yield Heading("Learning curves")
     looks = looks_of(arm.label for arm in arms)
-    for place, own in by_place(arms).items():
-        for start in range(0, len(own), MOST_CURVES):
-            runs = [(arm.label, arm.rows) for arm in own[start : start + MOST_CURVES]]
-            yield Picture(place, figure_of(runs, place, own[0].marks, looks=looks))
+    for place, group in by_place(arms).items():
+        for start in range(0, len(group), MOST_CURVES):
+            runs = [(arm.label, arm.rows) for arm in group[start : start + MOST_CURVES]]
+            yield Picture(place, figure_of(runs, place, group[0].marks, looks=looks))
 
 
 def returns(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Scores with their intervals, maximum average returns and the paper's, worst seeds and drawdowns."""
+    """Yield tables of scores with intervals, maximum average returns and the paper's, worst seeds and drawdowns."""
     yield Heading("Returns")
-    for place, own in by_place(arms).items():
-        runs = [(arm.label, arm.rows) for arm in own]
-        yield report_tables.comparison_table(runs, [list(arm.failures) for arm in own], POINTS)._replace(title=place)
+    for place, group in by_place(arms).items():
+        runs = [(arm.label, arm.rows) for arm in group]
+        yield report_tables.comparison_table(runs, [list(arm.failures) for arm in group], POINTS)._replace(title=place)
         yield Table(
             ("method", "maximum average return", "the paper's", "worst seed", "largest drawdown"),
-            tuple(map(_extremes, own)),
+            tuple(map(_extremes, group)),
             note="mean ± standard deviation over seeds",
         )
 
 
 def _extremes(arm: Arm) -> Row:
-    told = paper.RETURNS.get(arm.task, {}).get(arm.published or "") if not arm.condition else None
+    published = paper.RETURNS.get(arm.task, {}).get(arm.published or "") if not arm.condition else None
     last = last_evaluations(arm.rows, POINTS)
     worst = min(last, key=lambda seed: last[seed])
     return Row(
         (
             Cell(arm.label),
             report_tables.plus_minus(over_seeds(arm.best()[0])),
-            Cell(f"{told.mean:,.2f} ± {told.std:,.2f}", told.mean) if told else EMPTY,
+            Cell(f"{published.mean:,.2f} ± {published.std:,.2f}", published.mean) if published else EMPTY,
             Cell(f"{number(last[worst])} (seed {worst})", last[worst]),
             report_tables.plus_minus(over_seeds(map(drawdown, evaluation_matrix(arm.rows)[2]))),
         )
@@ -164,39 +164,39 @@ def _extremes(arm: Arm) -> Row:
 
 
 def efficiency(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Steps to the lowest of the maximum average returns."""
+    """Yield tables of the steps to the lowest of the maximum average returns."""
     yield Heading("Steps to the lower boundary of the maximum average returns")
-    for place, own in by_place(arms).items():
-        if len(own) < 2:
+    for place, group in by_place(arms).items():
+        if len(group) < 2:
             continue
-        boundary, rows = paper.lower_boundary(own), []
-        for arm in own:
+        boundary, rows = paper.lower_boundary(group), []
+        for arm in group:
             steps = paper.interactions(arm, boundary)
             middle, reached = float(np.median(steps)), int(np.isfinite(steps).sum())
-            told = paper.INTERACTIONS.get(arm.task, {}).get(arm.published or "", math.nan)
+            published = paper.INTERACTIONS.get(arm.task, {}).get(arm.published or "", math.nan)
             cells = [Cell("not reached" if math.isinf(middle) else f"{middle:,.0f}", middle)]
-            cells += [Cell(f"{reached} of {len(steps)}", reached), numeric(told, f"{told:,.0f}")]
+            cells += [Cell(f"{reached} of {len(steps)}", reached), numeric(published, f"{published:,.0f}")]
             rows.append(Row((Cell(arm.label), *cells)))
         headings = ("method", "steps of the median seed", "seeds that get there", "the paper's")
         yield Table(headings, tuple(rows), f"{place}, return {number(boundary)}")
 
 
 def robustness(arms: Sequence[Arm]) -> Iterator[Part]:
-    """What each perturbation cost, as far as the next."""
+    """Yield tables of what each perturbation cost, measured up to the next one."""
     if any(arm.marks for arm in arms):
         yield Heading("Perturbations")
-    for own in by_place(arm for arm in arms if arm.marks).values():
-        steps = [-1, *(step for step, _ in own[0].marks), None]
-        for index, (step, text) in enumerate(own[0].marks):
-            found = [recoveries(arm.label, arm.rows, step, steps[index + 2], steps[index] or -1) for arm in own]
-            yield report_tables.recovery_table(found)._replace(title=f"{own[0].task}, {text} after step {step:,}")
+    for group in by_place(arm for arm in arms if arm.marks).values():
+        steps = [-1, *(step for step, _ in group[0].marks), None]
+        for index, (step, text) in enumerate(group[0].marks):
+            found = [recoveries(arm.label, arm.rows, step, steps[index + 2], steps[index] or -1) for arm in group]
+            yield report_tables.recovery_table(found)._replace(title=f"{group[0].task}, {text} after step {step:,}")
 
 
 def cases(arms: Sequence[Arm]) -> Iterator[Part]:
-    """How often success and events came in the last evaluations."""
+    """Yield tables of how often success and events occurred in the last evaluations."""
     tables = []
-    for place, own in by_place(arms).items():
-        if table := report_tables.case_comparison_table([(arm.label, last_rows(arm.rows, POINTS)) for arm in own]):
+    for place, group in by_place(arms).items():
+        if table := report_tables.case_comparison_table([(arm.label, last_rows(arm.rows, POINTS)) for arm in group]):
             tables.append(table._replace(title=place))
     if tables:
         yield Heading("How episodes end, in the last three evaluations")
@@ -204,18 +204,18 @@ def cases(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def success(arms: Sequence[Arm]) -> Iterator[Part]:
-    """Curves of the share of successful episodes."""
-    telling = [arm for arm in arms if is_case(arm.rows["success"])]
+    """Yield curves of the share of successful episodes."""
+    with_success = [arm for arm in arms if is_case(arm.rows["success"])]
     looks = looks_of(arm.label for arm in arms)
-    if telling:
+    if with_success:
         yield Heading("Success")
-    for place, own in by_place(telling).items():
+    for place, group in by_place(with_success).items():
         runs = []
-        for arm in own:
+        for arm in group:
             rows = arm.rows.copy()
             rows["return"] = np.nan_to_num(rows["success"], nan=0.0)
             runs.append((arm.label, rows))
-        figure = figure_of(runs, place, own[0].marks, "share of episodes with success", (-0.05, 1.05), looks)
+        figure = figure_of(runs, place, group[0].marks, "share of episodes with success", (-0.05, 1.05), looks)
         yield Picture(f"{place}, success", figure)
 
 
@@ -229,11 +229,11 @@ SECTIONS: Mapping[str, Callable[[Sequence[Arm]], Iterator[Part]]] = {
 }
 
 
-ANALYSES = ("curves", "returns", "robustness", "success", "cases")  # of runs that are no study's
+ANALYSES = ("curves", "returns", "robustness", "success", "cases")  # of runs outside a study
 
 
 def over_tasks(arms: Sequence[Arm]) -> Iterator[Part]:
-    """The methods over all tasks, where they have the same seeds on several: shares of one method's mean scores."""
+    """Yield a table of scores over all tasks, as shares of one method's means, if methods share tasks and seeds."""
     unchanged = [arm for arm in arms if not arm.condition]
     tasks = list(dict.fromkeys(arm.task for arm in unchanged))
     scores = {(arm.label, arm.task): last_evaluations(arm.rows, POINTS) for arm in unchanged}
@@ -254,13 +254,13 @@ def over_tasks(arms: Sequence[Arm]) -> Iterator[Part]:
         middle = report_tables.middle(own / reference, ".2f")
         rows.append(Row((Cell(label), middle, above, Cell(str(own.size), own.size))))
     yield Heading("Over all tasks")
-    told = f"{', '.join(tasks)}; seeds {', '.join(map(str, seeds))}; scores as shares of the mean of {first}"
+    note = f"{', '.join(tasks)}; seeds {', '.join(map(str, seeds))}; scores as shares of the mean of {first}"
     headings = ("method", "IQM (95 % bootstrap interval)", f"above {first}, probability (95 %)", "runs")
-    yield Table(headings, tuple(rows), told)
+    yield Table(headings, tuple(rows), note)
 
 
-def the_papers(arms: Sequence[Arm]) -> Iterator[Part]:
-    """How the paper's claims stand."""
+def paper_claims(arms: Sequence[Arm]) -> Iterator[Part]:
+    """Yield the verdicts on the paper's claims."""
     if not (found := paper.claims(arms)):
         return
     rows = []
@@ -270,18 +270,18 @@ def the_papers(arms: Sequence[Arm]) -> Iterator[Part]:
         rows.append(Row(tuple(map(Cell, texts))))
     yield Heading("The paper's claims")
     counts = Counter(row.cells[2].text for row in rows)
-    told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
-    yield f"Of {len(rows)}: {told}. Not corrected for their number."
+    summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
+    yield f"Of {len(rows)}: {summary}. Not corrected for their number."
     yield Table(("task", "claim", "verdict", "because"), tuple(rows))
 
 
 def hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
-    """What differs among the methods, and what is the same in all of them."""
+    """Yield the hyperparameters that differ between the methods, and those that are the same in all of them."""
     methods: dict[str, list[dict[str, str]]] = {}
     for arm in arms:
         if arm.runs:
-            told = {name: plain(value) for name, value in settings(arm.config).items()}
-            methods.setdefault(arm.label, []).append(told)
+            texts = {name: plain(value) for name, value in settings(arm.config).items()}
+            methods.setdefault(arm.label, []).append(texts)
     if not methods:
         return
     every = [own for several in methods.values() for own in several]
@@ -297,7 +297,7 @@ def hyperparameters(arms: Sequence[Arm]) -> Iterator[Part]:
 
 
 def provenance(arms: Sequence[Arm], commands: Sequence[str]) -> Iterator[Part]:
-    """Versions, machines and times of the runs, and the commands that make them again."""
+    """Yield the versions, machines and times of the runs, and the commands that reproduce them."""
     runs = [run for arm in arms for run in arm.runs]
     if runs:
         manifests = [run.manifest for run in runs]

@@ -1,4 +1,4 @@
-"""Running a study: what is not over yet, in processes of this machine or on a Ray cluster."""
+"""Train the unfinished runs of a study, in processes on this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -24,57 +24,58 @@ from csac.training.supervisor import supervise
 from csac.training.watch import Watcher
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from rich.console import Console
 
+    from csac.record.config import RunConfig
     from csac.studies.ray import Cluster
     from csac.studies.study import StudyRun
 
 
-class How(NamedTuple):
-    """Where and how the runs of a study train."""
+class Execution(NamedTuple):
+    """Options for executing the runs of a study."""
 
     workers: int = 1
-    """Runs that train at once on this machine."""
+    """Number of runs that train in parallel on this machine."""
     cluster: Cluster | None = None
-    """The Ray cluster that they train on instead."""
+    """The Ray cluster to train on instead."""
     wandb: bool = False
     keep_checkpoints: bool = False
     command: str | None = None
 
 
-def run_study(runs: Sequence[StudyRun], directory: Path, how: How, console: Console) -> int | None:
-    """Train what is not over yet; return the signal that stopped it, if one did. Every run is saved then."""
+def run_study(runs: Sequence[StudyRun], directory: Path, execution: Execution, console: Console) -> int | None:
+    """Train the unfinished runs. Return the signal that stopped them, if any; every run is then saved."""
     directory = directory.absolute()
     waiting = {directory / run.folder: run for run in runs if not run.is_over(directory)}
     for path in [path for path in waiting if is_run(path) and RunDirectory.open(path).state == "running"]:
         console.print(f"{waiting.pop(path).name}: another process trains it", soft_wrap=True)
-    if how.cluster is None:  # whose nodes may have what this machine has not
-        try_tasks(waiting.values())
-    programs = [_program(path, run, how) for path, run in waiting.items()]
+    if execution.cluster is None:  # the nodes of a cluster may have tasks that this machine lacks
+        try_tasks(run.config for run in waiting.values())
+    programs = [_program(path, run, execution) for path, run in waiting.items()]
     with (
         stop_requested(lambda text: console.print(text)) as request,
         progress_shown(console, "training", "steps") as show,
     ):
         progress = Progress(waiting, console, show)
-        if programs and how.cluster:
-            how.cluster.run(programs, progress.of, request.is_set)
+        if programs and execution.cluster:
+            execution.cluster.run(programs, progress.of, request.is_set)
         elif programs:
             turns = len(usable_cores()) // programs[0].threads
-            supervise(programs, progress.of, request.is_set, how.workers, turns)
-    if not how.keep_checkpoints:
+            supervise(programs, progress.of, request.is_set, execution.workers, turns)
+    if not execution.keep_checkpoints:
         for path in waiting:
-            if RunDirectory.open(path).manifest.state == "finished":  # the replay takes most of the room
+            if RunDirectory.open(path).manifest.state == "finished":  # the replay buffer takes most of the space
                 shutil.rmtree(path / "checkpoint", ignore_errors=True)
     return request.received[0] if request.received else None
 
 
-def try_tasks(runs: Any) -> None:
-    """Make each task once, and change it as it will be, so that a mistake is told before anything is written."""
+def try_tasks(configs: Iterable[RunConfig]) -> None:
+    """Make each task once and apply its perturbations, so that mistakes are reported before anything is written."""
     tried: list[tuple[str, dict[str, Any], tuple[str, ...]]] = []
-    for _, config, _ in runs:
+    for config in configs:
         one = config.task, config.environment_arguments, config.perturbations
         if one not in tried:
             tried.append(one)
@@ -84,25 +85,27 @@ def try_tasks(runs: Any) -> None:
                     environment.perturb({change.kind: change.value})
 
 
-def _program(path: Path, run: StudyRun, how: How) -> Program:
-    """Return what trains a run, after making its directory or giving it its larger number of steps."""
-    cores = how.cluster.cores if how.cluster else cores_to_use()
-    threads = cores if how.cluster else max(1, cores // how.workers)
+def _program(path: Path, run: StudyRun, execution: Execution) -> Program:
+    """Return the program that trains a run, after creating its directory or raising its number of steps."""
+    cores = execution.cluster.cores if execution.cluster else cores_to_use()
+    threads = cores if execution.cluster else max(1, cores // execution.workers)
     if is_run(path):
         existing = RunDirectory.open(path)
         if run.config.steps > existing.config.steps:
             with existing.locked():
                 refuse_lost(existing)
                 existing.update_manifest(config=run.config)
-        if existing.manifest.process is not None:  # its last bits depend on it
+        if existing.manifest.process is not None:  # the last bits of results depend on the threads
             threads = min(existing.manifest.machine.cores, cores) or threads
     else:
         RunDirectory.create(path, Manifest(config=run.config, program=(run.config.seed,)))
-    return Program((path,), algorithm_of(run.config), run.config.task, threads, wandb=how.wandb, command=how.command)
+    return Program(
+        (path,), algorithm_of(run.config), run.config.task, threads, wandb=execution.wandb, command=execution.command
+    )
 
 
 class Progress:
-    """Tells `show` how many steps the runs of a study have made, and of how many; prints a line for each that ends."""
+    """Pass the steps done by a study's runs, and their total, to `show`; print a line for each run that ends."""
 
     def __init__(self, runs: Mapping[Path, StudyRun], console: Console, show: Callable[[int, int], None]) -> None:
         self.runs, self.console, self._show = runs, console, show
@@ -112,44 +115,44 @@ class Progress:
         self._total = sum(run.config.steps for run in runs.values()) - self._before
 
     def of(self, program: Program) -> RunProgress:
-        """Return who is told about a program."""
+        """Return the watcher of a program."""
         return RunProgress(self, program.directories[0])
 
     def advanced(self, path: Path, step: int) -> None:
-        """Take how many steps a run has made."""
+        """Record how many steps a run has made."""
         self.done[path] = step
         self._show(sum(self.done.values()) - self._before, self._total)
         if step >= self.runs[path].config.steps and path not in self.over:
             self.ended(path, "finished")
 
     def ended(self, path: Path, outcome: str) -> None:
-        """Take that a run is over."""
+        """Record that a run is over, and print its outcome."""
         self.over.add(path)
         returns = last_evaluations(RunDirectory.open(path).evaluations, points=1)
         last = f", last return {number(next(iter(returns.values())))}" if returns else ""
         self.say(f"{len(self.over)} of {len(self.runs)}: {self.runs[path].name}: {outcome}{last}")
 
     def say(self, text: str) -> None:
-        """Show a line."""
+        """Print a line."""
         self.console.print(text, soft_wrap=True)
 
 
 @dataclass(frozen=True)
 class RunProgress(Watcher):
-    """Takes what happens to one run of a study."""
+    """Pass the events of one run to the `Progress` of its study."""
 
     study: Progress
     path: Path
 
     def progress(self, steps: Mapping[int, int]) -> None:
-        """Take how many steps the run has made."""
+        """Record how many steps the run has made."""
         for step in steps.values():
             self.study.advanced(self.path, step)
 
     def failed(self, seed: int, step: int, reason: str) -> None:
-        """Take that the run failed."""
+        """Record that the run failed."""
         self.study.ended(self.path, f"failed at step {step:,}: {reason}")
 
     def note(self, text: str) -> None:
-        """Show a line about the run."""
+        """Print a line about the run."""
         self.study.say(f"{self.study.runs[self.path].name}: {text}")

@@ -1,4 +1,4 @@
-"""What `csac tune` searches: of each algorithm some hyperparameters, how far, and when they do something."""
+"""The search spaces of `csac tune`: which hyperparameters, over which ranges, and when they have an effect."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
     from csac.types import Algorithm
 
-DIGITS = 3  # of a number that is tried
-REPORT_SEEDS = 5  # of the command that trains the best configuration
+DIGITS = 3  # significant digits of a number that is tried
+REPORT_SEEDS = 5  # in the command that trains the best configuration
 
-Dimension = tuple[Literal["log", "linear", "below 1", "one of"], *tuple[Any, ...]]  # a scale, and its ends or values
+Dimension = tuple[Literal["log", "linear", "below 1", "one of"], *tuple[Any, ...]]  # a scale, and its bounds or values
 Space = dict[str, Dimension]
 
 _RATE: Dimension = ("log", 3e-5, 3e-3)
@@ -43,7 +43,7 @@ _CLIPPED: Space = {
     "epochs": ("linear", 3, 20),
 }
 
-# Networks and updates per step are not searched: more of either costs time, which a search by steps does not see.
+# Networks and updates per step are not searched: more of either costs time, which a budget of steps does not count.
 SPACES: Mapping[str, Space] = {
     "csac": {**_ENTROPY, "relative_entropy_weight": ("log", 0.005, 50.0), **_REFERENCE, **_OFF_POLICY},
     "sac": {**_ENTROPY, **_OFF_POLICY},
@@ -60,7 +60,7 @@ SPACES: Mapping[str, Space] = {
 
 
 def draw(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
-    """Have a trial choose a value; "below 1", the distance to 1 is on a logarithmic scale."""
+    """Let a trial choose a value; for "below 1", the distance to 1 is drawn on a logarithmic scale."""
     scale, *ends = dimension
     if scale == "one of":
         return trial.suggest_categorical(name, ends)
@@ -72,13 +72,13 @@ def draw(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
 
 
 def _is_tau_idle(algorithm: Any) -> bool:
-    """Whether reference and actor are the same function, and the exact relative entropy zero."""
+    """Return whether the reference policy is the actor itself, so that the exact relative entropy is zero."""
     is_fresh = algorithm.reference_policy == "periodic" and algorithm.reference_period == 1
     return is_fresh and algorithm.relative_entropy_estimator == "closed_form"
 
 
-# When a hyperparameter does something; those that are not here always do.
-_WORKS: Mapping[str, Callable[[Any], bool]] = {
+# When a hyperparameter has an effect; those that are not listed always do.
+_HAS_EFFECT: Mapping[str, Callable[[Any], bool]] = {
     "relative_entropy_weight": lambda algorithm: not _is_tau_idle(algorithm),
     "reference_period": lambda algorithm: algorithm.reference_policy == "periodic" and algorithm.reference_period > 1,
     "reference_rate": lambda algorithm: algorithm.reference_policy == "average",
@@ -88,14 +88,14 @@ _WORKS: Mapping[str, Callable[[Any], bool]] = {
 
 
 def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: Sequence[str] = ()) -> Space:
-    """Return what is searched: what works and is not `given`, or what is `wanted` of it. `auto` is learnt."""
+    """Return the hyperparameters to search: those `wanted` that have an effect, are not `given` and not learnt."""
     values: dict[str, Any] = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
-    family = getattr(algorithm, "name", type(algorithm).__name__)  # one's own is searched as what it derives from
+    family = getattr(algorithm, "name", type(algorithm).__name__)  # a user's subclass is searched like its base class
     space = {name: one for name, one in SPACES.get(family, {}).items() if name in values}
     free = {
         name: dimension
         for name, dimension in space.items()
-        if name not in given and values[name] != "auto" and _WORKS.get(name, lambda _: True)(algorithm)
+        if name not in given and values[name] != "auto" and _HAS_EFFECT.get(name, lambda _: True)(algorithm)
     }
     for name in wanted or ():
         if name not in space:
@@ -111,13 +111,13 @@ def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: S
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """What is tuned, and how a trial is judged: what all processes that share a directory agree on."""
+    """The definition of a search, on which all processes that share a directory agree."""
 
     config: RunConfig
-    """What the first seed of a trial computes but for what is searched."""
+    """The configuration of a trial's first seed, apart from the searched hyperparameters."""
     seeds: int
     algorithm: Algorithm
-    """Where the search begins; what is not searched stays so."""
+    """The first trial's hyperparameters; those that are not searched keep these values."""
     space: Space
 
     def __post_init__(self) -> None:
@@ -127,14 +127,14 @@ class Search:
         if not self.config.evaluation_interval:
             raise InputError("a search goes by evaluations: evaluation_interval cannot be 0")
 
-    def told(self) -> dict[str, Any]:
-        """Return it as JSON has it."""
+    def definition(self) -> dict[str, Any]:
+        """Return the search as JSON-compatible values."""
         searched = {name: f"searched, {' '.join(map(str, dimension))}" for name, dimension in self.space.items()}
-        own = {name: value for name, value in vars(self.config).items() if name != "device"}
-        return as_json("the search", {**own, "seeds": self.seeds, **self._hyperparameters(searched)})
+        settings = {name: value for name, value in vars(self.config).items() if name != "device"}
+        return as_json("the search", {**settings, "seeds": self.seeds, **self._hyperparameters(searched)})
 
     def command(self, values: Mapping[str, Any]) -> str:
-        """Return the line that trains a configuration with seeds that the search has not used."""
+        """Return the command that trains a configuration with seeds that the search has not used."""
         first = 0 if self.config.seed >= REPORT_SEEDS else self.config.seed + self.seeds
         config = dataclasses.replace(self.config, device="cpu", **self._hyperparameters(values))
         return train_command(config, range(first, first + REPORT_SEEDS))

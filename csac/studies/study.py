@@ -1,4 +1,4 @@
-"""A study: tasks x methods x conditions x seeds, read from a TOML file, as a list of run configurations."""
+"""Read a study (tasks x methods x conditions x seeds) from a TOML file and expand it into run configurations."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     from csac.types import Algorithm
 
-FEWEST_POINTS = 20  # evaluations of a shortened run: it is evaluated more often once it would have fewer
-WARMUP_SHARE = 0.1  # of a shortened run that is warm-up at most
+FEWEST_POINTS = 20  # evaluations of a shortened run; its evaluation interval is shortened to keep as many
+WARMUP_SHARE = 0.1  # of a shortened run that may be warm-up
 NAMED = Path(__file__).parent / "named"
 
 Analysis = Literal["curves", "returns", "efficiency", "robustness", "cases", "success"]
@@ -44,7 +44,7 @@ class Method:
     preset: str | None = None
     hyperparameters: dict[str, Any] = field(default_factory=dict)
     sweep: dict[str, Any] = field(default_factory=dict)
-    """Lists of values: there is a method for each combination."""
+    """Lists of values: each combination is a method."""
     published: str | None = None
 
     def __post_init__(self) -> None:
@@ -53,7 +53,7 @@ class Method:
         object.__setattr__(self, "label", self.label or self.algorithm)
 
     def swept(self) -> list[Method]:
-        """Return the methods of its sweep, or itself."""
+        """Return a method for each combination of the sweep."""
         for name, values in self.sweep.items():
             if not isinstance(values, list) or not values:
                 raise InputError(f"sweep.{name} is a list of values, not {values!r:.40}")
@@ -66,14 +66,14 @@ class Method:
         return found
 
     def on(self, task: str, common: Mapping[str, Any]) -> Algorithm:
-        """Return the algorithm on a task; `common` counts where neither the method nor its preset says otherwise."""
+        """Return the algorithm on a task: the preset overrides `common`, and own hyperparameters override both."""
         preset = preset_of(self.preset, self.algorithm, task) if self.preset else {}
         make: Any = ALGORITHMS[self.algorithm]
         return make(**{**common, **preset, **self.hyperparameters})
 
 
 class StudyRun(NamedTuple):
-    """One run of a study, and where it lies below the study's directory."""
+    """One run of a study, and its folder below the study's directory."""
 
     method: Method
     config: RunConfig
@@ -81,13 +81,13 @@ class StudyRun(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What the run is called in messages."""
+        """The name of the run in messages."""
         one = self.config
         several = [f"{one.environments} environments"] * (one.environments > 1)
         return ", ".join([f"{self.method.label} on {one.task}", *one.perturbations, *several, f"seed {one.seed}"])
 
     def open(self, directory: Path) -> RunDirectory | None:
-        """Return the run if it has begun. Raises InputError where what is there has another configuration."""
+        """Return the run, or None if it has not started. Raises InputError if its configuration is another one."""
         if not is_run(directory / self.folder):
             return None
         run = RunDirectory.open(directory / self.folder)
@@ -95,7 +95,7 @@ class StudyRun(NamedTuple):
         return run
 
     def is_over(self, directory: Path) -> bool:
-        """Return whether the run is finished or has failed. Raises InputError as `open`."""
+        """Return whether the run is finished or has failed. Raises InputError like `open`."""
         run = self.open(directory)
         state = run.manifest.state if run else "waiting"
         return state == "failed" or bool(run and state == "finished" and run.config.steps >= self.config.steps)
@@ -103,29 +103,29 @@ class StudyRun(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """What is trained to answer a question. Steps are environment steps per seed; nothing here is shortened yet."""
+    """The runs that answer a question. Steps are environment steps per seed, before `scale` shortens them."""
 
     name: str
     title: str = ""
     tasks: tuple[str, ...]
     methods: tuple[Method, ...]
     common: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Hyperparameters of all methods of an algorithm."""
+    """Algorithm -> hyperparameters that all its methods share."""
     seeds: int = 5
     first_seed: int = 0
     steps: int = 1_000_000
     steps_on: dict[str, int] = field(default_factory=dict)
-    """Tasks on which it is another number of steps."""
+    """Tasks with another number of steps."""
     environments: int = 1
-    """Environments that each seed steps side by side."""
+    """Environments that each seed steps in parallel."""
     evaluation_interval: int = 5_000
     evaluation_episodes: int = 10
     conditions: tuple[tuple[str, ...], ...] = ((),)
-    """Each a set of perturbations; the empty one changes nothing."""
+    """Sets of perturbations; the empty set changes nothing."""
     environment_arguments: dict[str, Any] = field(default_factory=dict)
     events: tuple[str, ...] = ()
     analyses: tuple[Analysis, ...] = ("curves", "returns")
-    """What its report shows."""
+    """The sections of its report."""
     scale: float = 1.0
     device: Literal["cpu", "gpu"] = "cpu"
 
@@ -140,7 +140,7 @@ class Study:
         check_events(self.events)
 
     def narrowed(self, tasks: Sequence[str] = (), methods: Sequence[str] = (), seeds: int | None = None) -> Study:
-        """Return the study on some of its tasks, with some of its methods or algorithms, with other seeds."""
+        """Return the study with only these tasks and these methods or algorithms, and with this number of seeds."""
         names = dict.fromkeys(name for one in self.methods for name in (one.label, one.algorithm))
         _refuse_unknown(tasks, self.tasks, f"{self.name} has no task")
         _refuse_unknown(methods, names, f"{self.name} has no method")
@@ -153,7 +153,7 @@ class Study:
         )
 
     def steps_for(self, task: str) -> int:
-        """Return the steps of a run on this task, shortened."""
+        """Return the steps of a run on this task, shortened by `scale`."""
         steps = self.steps_on.get(task, self.steps)
         if self.scale == 1:
             return steps
@@ -212,12 +212,12 @@ def _folder(words: str) -> str:
 
 
 def named() -> list[str]:
-    """Return the names of the studies that csac brings."""
+    """Return the names of the studies that come with csac."""
     return sorted(path.stem for path in NAMED.glob("*.toml"))
 
 
 def find(name: str) -> Study:
-    """Return the study that a TOML file describes, or the one of csac's that has this name."""
+    """Return the study of this name that comes with csac, or the one in the TOML file of this name."""
     if name in named():
         return read_study(NAMED / f"{name}.toml")
     if not name.endswith(".toml") and not Path(name).is_file():
@@ -226,20 +226,20 @@ def find(name: str) -> Study:
 
 
 def read_study(path: Path) -> Study:
-    """Return the study in a TOML file; docs/studies.md says what it may hold. Raises InputError."""
+    """Read a study from a TOML file; docs/studies.md describes the format. Raises InputError."""
     try:
-        told = tomllib.loads(without_controls(path.read_bytes()).decode("utf-8-sig"))
-        _refuse_unknown(told, _names(Study), "a study has no")
-        for method in manifests.value(tuple[dict[str, Any], ...], told.get("methods", []), "methods"):
+        fields = tomllib.loads(without_controls(path.read_bytes()).decode("utf-8-sig"))
+        _refuse_unknown(fields, _names(Study), "a study has no")
+        for method in manifests.value(tuple[dict[str, Any], ...], fields.get("methods", []), "methods"):
             _refuse_unknown(method, _names(Method), "a method has no")
-        study = manifests.value(Study, {**told, "name": path.stem}, "")
+        study = manifests.value(Study, {**fields, "name": path.stem}, "")
         _refuse_unknown(study.common, [one.algorithm for one in study.methods], "common: no method has the algorithm")
         study.runs()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (ValueError, RecursionError) as error:  # of TOML and its numbers
+    except (ValueError, RecursionError) as error:  # from parsing TOML and its numbers
         raise InputError(f"{path} is not TOML: {error}") from None
     return study
 

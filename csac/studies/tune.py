@@ -1,6 +1,6 @@
-"""`csac tune`: Optuna chooses hyperparameters, csac trains a set of runs with them, and the worst end early.
+"""`csac tune`: Optuna chooses hyperparameters, csac trains a set of runs with them, and bad trials are pruned.
 
-Any number of processes may share a directory: the study is a journal in it, and each trial a folder, `trial-<n>`.
+Any number of processes may share a directory: Optuna's study is a journal in it, and each trial a folder, `trial-<n>`.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-STARTUP_TRIALS = 5  # that are never pruned, and that must be complete before any is
-SHARE_UNPRUNED = 0.25  # of a trial's steps, at its beginning
+STARTUP_TRIALS = 5  # that must be complete before any trial is pruned
+SHARE_UNPRUNED = 0.25  # of a trial's steps, from its beginning
 SHOWN = 10  # trials in the table at the end
 
 
 class Trial(NamedTuple):
-    """A trial that this process runs, for as long as it holds the lock."""
+    """A trial that this process runs while it holds the lock."""
 
     trial: optuna.Trial
     folder: Path
@@ -53,14 +53,14 @@ class Trial(NamedTuple):
 
 
 def tune(search: Search, directory: Path, trials: int, command: str | None, console: Console) -> int:
-    """Run trials until the directory has so many, show the best, and return the exit code.
+    """Run trials until the directory has `trials` of them, show the best, and return the exit code.
 
-    Raises InputError where Optuna is missing, the task cannot be made, or the directory holds another search, and
-    StorageFailure where it can no longer be written.
+    Raises InputError if Optuna is missing, the task cannot be made, or the directory holds another search, and
+    StorageFailure if it can no longer be written.
     """
     check_whole("trials", trials, 1, 100_000)
     directory = directory.absolute()
-    try_tasks([(None, search.config, None)])
+    try_tasks([search.config])
     study = _open(search, directory)
     with stop_requested(lambda text: console.print(text)) as request:
         while not request.is_set() and (trial := _next(study, search, directory, trials)):
@@ -74,7 +74,7 @@ def tune(search: Search, directory: Path, trials: int, command: str | None, cons
 
 
 def _open(search: Search, directory: Path) -> optuna.Study:
-    """Open the study, or begin it; its first trial is the configuration that the search begins with."""
+    """Open Optuna's study, or create it with the search's initial configuration as its first trial."""
     try:
         import optuna
         from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
@@ -88,7 +88,7 @@ def _open(search: Search, directory: Path) -> optuna.Study:
         directory.mkdir(parents=True, exist_ok=True)
     backend = JournalFileBackend(str(journal), JournalFileOpenLock(str(journal)))
     unpruned = max(search.algorithm.cadence.first_update, round(SHARE_UNPRUNED * search.config.steps))
-    with _alone(directory):
+    with _trial_choice_locked(directory):
         study = optuna.create_study(
             storage=optuna.storages.JournalStorage(backend),
             study_name="csac",
@@ -96,35 +96,35 @@ def _open(search: Search, directory: Path) -> optuna.Study:
             load_if_exists=True,
             pruner=optuna.pruners.MedianPruner(STARTUP_TRIALS, unpruned, n_min_trials=3),
         )
-        told = search.told()
-        if found := differences(study.user_attrs.get("search", told), told):
+        definition = search.definition()
+        if found := differences(study.user_attrs.get("search", definition), definition):
             raise InputError(f"{directory} holds another search: {'; '.join(found)}. Choose another --directory")
         if not study.get_trials(deepcopy=False):
-            study.set_user_attr("search", told)
-            own = {name: getattr(search.algorithm, name) for name in search.space}
+            study.set_user_attr("search", definition)
+            initial = {name: getattr(search.algorithm, name) for name in search.space}
             study.enqueue_trial(
-                {n: 1 - v if search.space[n][0] == "below 1" else v for n, v in own.items()}, {"trial": 0}
+                {n: 1 - v if search.space[n][0] == "below 1" else v for n, v in initial.items()}, {"trial": 0}
             )
     return study
 
 
 def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> Trial | None:
-    """Return the next trial to run, or None once there are so many.
+    """Return the next trial to run, or None once there are `trials` of them.
 
-    A trial that says that it is running, and whose lock nobody holds, goes back to the queue first.
+    Before that, a trial that is marked as running but whose lock nobody holds goes back to the queue.
     """
     import optuna
 
-    with _alone(directory):
+    with _trial_choice_locked(directory):
         known = study.get_trials(deepcopy=False)
         for lost in known:
-            is_begun = "trial" in lost.user_attrs and is_locked(_folder(directory, lost) / ".lock")
-            if lost.state.name == "RUNNING" and not is_begun:
+            is_held = "trial" in lost.user_attrs and is_locked(_folder(directory, lost) / ".lock")
+            if lost.state.name == "RUNNING" and not is_held:
                 _requeue(study, lost)
         known = study.get_trials(deepcopy=False)
         if sum(trial.state.name in ("COMPLETE", "PRUNED", "RUNNING") for trial in known) >= trials:
             return None
-        study.sampler = optuna.samplers.TPESampler(seed=len(known))  # the same for the same trials before it
+        study.sampler = optuna.samplers.TPESampler(seed=len(known))  # reproducible given the earlier trials
         trial = study.ask()
         latest = max((other.user_attrs.get("trial", -1) for other in known), default=-1)
         trial.set_user_attr("trial", trial.user_attrs.get("trial", latest + 1))
@@ -132,15 +132,15 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
         folder.mkdir(exist_ok=True)
         lock = kept_from_children(open(folder / ".lock", "a+"))  # noqa: SIM115  held for as long as the trial runs
         take(lock, folder)
-        with warnings.catch_warnings(action="ignore"):  # of a beginning outside the space
+        with warnings.catch_warnings(action="ignore"):  # the first trial may lie outside the space
             values = {name: draw(trial, name, dimension) for name, dimension in search.space.items()}
         trial.set_user_attr("values", values)
         return Trial(trial, folder, values, lock)
 
 
 @contextmanager
-def _alone(directory: Path) -> Iterator[None]:
-    """Keep other processes from choosing a trial meanwhile; what a dead one has left is removed after a while."""
+def _trial_choice_locked(directory: Path) -> Iterator[None]:
+    """Keep other processes from choosing a trial meanwhile; the lock of a dead process is removed after a while."""
     from optuna.storages.journal import JournalFileOpenLock
 
     mutex = JournalFileOpenLock(str(directory / "next"))
@@ -156,7 +156,7 @@ def _folder(directory: Path, trial: optuna.Trial | optuna.trial.FrozenTrial) -> 
 
 
 def _requeue(study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
-    """Put the configuration of a trial that was stopped back into the queue, to go on in its folder."""
+    """Put the configuration of a stopped trial back into the queue, to continue in its folder."""
     if "trial" in trial.user_attrs:
         params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
         study.enqueue_trial(params, user_attrs={"trial": trial.user_attrs["trial"]})
@@ -164,7 +164,7 @@ def _requeue(study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
 
 
 def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None, console: Console) -> None:
-    """Train a trial from where it is, and tell the study what came of it."""
+    """Train a trial from its newest checkpoint, and tell Optuna the result."""
     from optuna.trial import TrialState
 
     label = trial.folder.name
@@ -183,7 +183,7 @@ def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None,
         return is_pruned or bool(runs.failures)
 
     try:
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of seeds that fail: told below
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # failed seeds are reported below
             runs = train(
                 dataclasses.replace(search.algorithm, **trial.values),  # pyright: ignore[reportArgumentType]
                 search.config.task,
@@ -210,12 +210,12 @@ def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None,
         score = float(np.mean(list(last_evaluations(runs.evaluations).values())))
         study.tell(trial.trial, score)
         console.print(f"{label}: {number(score)}, best {number(study.best_value)}")
-    for run in runs.runs:  # nobody goes on with it any more, and the replay takes most of the room
+    for run in runs.runs:  # the trial is over, and the replay buffer takes most of the space
         shutil.rmtree(run.checkpoints, ignore_errors=True)
 
 
 def _scores(rows: np.ndarray, seeds: int, until: int) -> dict[int, float]:
-    """Return the score as it was at each step until this one at which every seed was evaluated."""
+    """Return the score at each step up to `until` at which every seed was evaluated."""
     steps = [step for step in np.unique(rows["step"]).tolist() if step <= until]
     steps = [step for step in steps if len(np.unique(rows["seed"][rows["step"] == step])) == seeds]
     return {step: float(np.mean([*last_evaluations(rows[rows["step"] <= step]).values()])) for step in steps}
@@ -226,7 +226,7 @@ def _complete(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
 
 
 def _conclude(study: optuna.Study, search: Search, directory: Path, console: Console) -> None:
-    """Show the best trials and the command to train the best, and draw Optuna's pictures."""
+    """Print the best trials and the command that trains the best one, and draw Optuna's pictures."""
     if not (complete := _complete(study)):
         console.print("no trial is complete")
         return
@@ -245,7 +245,7 @@ def _conclude(study: optuna.Study, search: Search, directory: Path, console: Con
 
 
 def _draw(study: optuna.Study, directory: Path) -> None:
-    """Draw what Optuna draws: the scores over the trials, and how much each hyperparameter matters."""
+    """Save Optuna's pictures: the scores over the trials, and how much each hyperparameter matters."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -256,6 +256,6 @@ def _draw(study: optuna.Study, directory: Path) -> None:
             ("history", pictures.plot_optimization_history),
             ("importances", pictures.plot_param_importances),
         ):
-            with suppress(ValueError, RuntimeError):  # of too few trials, or equal ones
+            with suppress(ValueError, RuntimeError):  # too few trials, or equal scores
                 axes: Any = draw(study)
                 axes.figure.savefig(directory / f"{name}.png", bbox_inches="tight", dpi=150)

@@ -9,14 +9,14 @@ from studying import tiny_study
 from csac.console.tables import make_console
 from csac.record.run import RunDirectory
 from csac.studies.ray import Cluster
-from csac.studies.run import How, Progress, run_study
+from csac.studies.run import Execution, Progress, run_study
 from csac.types import InputError
 
 
 def test_without_ray_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install '\.\[cluster\]'"):
-        run_study(tiny_study(tmp_path).runs(), tmp_path, How(cluster=Cluster()), make_console())
+        run_study(tiny_study(tmp_path).runs(), tmp_path, Execution(cluster=Cluster()), make_console())
 
 
 @pytest.mark.slow
@@ -40,10 +40,10 @@ def test_a_node_that_is_lost_in_mid_run_loses_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(Progress, "advanced", advance)
     monkeypatch.setattr("csac.training.loop.SECONDS_BETWEEN_CHECKPOINTS", 0.0)
     try:
-        run_study(runs, tmp_path / "ray", How(cluster=Cluster(cluster.address)), make_console())
+        run_study(runs, tmp_path / "ray", Execution(cluster=Cluster(cluster.address)), make_console())
     finally:
         cluster.shutdown()
-    run_study(runs, tmp_path / "alone", How(), make_console())
+    run_study(runs, tmp_path / "alone", Execution(), make_console())
     found = [RunDirectory.open(tmp_path / "ray" / run.folder) for run in runs]
     assert [run.state for run in found] == ["finished"] * 2
     assert sum(bool(run.manifest.history) for run in found) == 1
@@ -55,4 +55,4 @@ def test_a_node_that_is_lost_in_mid_run_loses_nothing(tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("ignore")
 def test_no_cluster_at_the_address(tmp_path):
     with pytest.raises(InputError, match=r"127\.0\.0\.1:1"):
-        run_study(tiny_study(tmp_path).runs(), tmp_path, How(cluster=Cluster("127.0.0.1:1")), make_console())
+        run_study(tiny_study(tmp_path).runs(), tmp_path, Execution(cluster=Cluster("127.0.0.1:1")), make_console())

@@ -11,7 +11,7 @@ from csac.console.tables import make_console
 from csac.record.run import RunDirectory
 from csac.record.sets import RunSet
 from csac.studies import run as module
-from csac.studies.run import How, run_study
+from csac.studies.run import Execution, run_study
 from csac.types import InputError
 
 
@@ -35,7 +35,7 @@ def test_each_run_is_a_program_of_its_own(tmp_path, supervised, monkeypatch, cap
     monkeypatch.setattr(module, "usable_cores", lambda: [0, 1, 2, 3])
     monkeypatch.setattr(module, "cores_to_use", lambda: 4)
     runs = tiny_study(tmp_path).runs()
-    assert run_study(runs, tmp_path / "runs", How(workers=2, command="csac study"), make_console()) is None
+    assert run_study(runs, tmp_path / "runs", Execution(workers=2, command="csac study"), make_console()) is None
     ((programs, workers, turns),) = supervised
     assert [program.directories for program in programs] == [(tmp_path / "runs" / run.folder,) for run in runs]
     assert {(program.threads, program.command) for program in programs} == {(2, "csac study")}
@@ -50,7 +50,7 @@ def test_what_is_over_is_left_alone_and_the_rest_goes_on(tmp_path, supervised):
     write_run(tmp_path / two.folder, two.config, state="failed")
     write_run(tmp_path / three.folder, three.config, state="interrupted", points=4)
     assert RunDirectory.open(tmp_path / three.folder).state == "interrupted"
-    run_study([one, two, three, four], tmp_path, How(), make_console())
+    run_study([one, two, three, four], tmp_path, Execution(), make_console())
     ((programs, _, _),) = supervised
     assert [program.directories[0] for program in programs] == [tmp_path / three.folder, tmp_path / four.folder]
     assert programs[0].threads == 1  # as it began
@@ -60,7 +60,7 @@ def test_what_another_process_trains_is_left_to_it(tmp_path, supervised, capsys)
     one, two, *_ = tiny_study(tmp_path).runs()
     write_run(tmp_path / one.folder, one.config, state="running", points=4)
     with RunDirectory.open(tmp_path / one.folder).locked():
-        run_study([one, two], tmp_path, How(), make_console())
+        run_study([one, two], tmp_path, Execution(), make_console())
     ((programs, _, _),) = supervised
     assert [program.directories[0] for program in programs] == [tmp_path / two.folder]
     assert "another process trains it" in capsys.readouterr().out
@@ -70,7 +70,7 @@ def test_more_steps_later_go_on(tmp_path, supervised):
     (run, *_) = tiny_study(tmp_path).runs()
     (longer, *_) = tiny_study(tmp_path, steps=2_000).runs()
     write_run(tmp_path / run.folder, run.config, points=0)
-    run_study([longer], tmp_path, How(), make_console())
+    run_study([longer], tmp_path, Execution(), make_console())
     assert RunDirectory.open(tmp_path / run.folder).config.steps == 2_000
 
 
@@ -91,14 +91,14 @@ def test_runs_of_another_study_are_refused(tmp_path, supervised, change):
     write_run(tmp_path / run.folder, run.config)
     (other, *_) = tiny_study(tmp_path, **change).runs()
     with pytest.raises(InputError, match=next(iter(change))):
-        run_study([other], tmp_path, How(), make_console())
+        run_study([other], tmp_path, Execution(), make_console())
     assert not supervised
 
 
 def test_a_task_that_cannot_be_made_is_told_before_anything_is_written(tmp_path, supervised):
     runs = tiny_study(tmp_path, tasks=["Pendulum-v1", "Pendlum-v1"]).runs()
     with pytest.raises(InputError, match="Pendlum-v1"):
-        run_study(runs, tmp_path / "runs", How(), make_console())
+        run_study(runs, tmp_path / "runs", Execution(), make_console())
     assert not (tmp_path / "runs").exists()
 
 
@@ -107,8 +107,8 @@ def test_checkpoints_of_finished_runs_are_removed(tmp_path, supervised):
     for run in (kept, removed):
         write_run(tmp_path / run.folder, run.config, state="interrupted", points=4)
         (tmp_path / run.folder / "checkpoint").mkdir()
-    run_study([kept], tmp_path, How(keep_checkpoints=True), make_console())
-    run_study([removed], tmp_path, How(), make_console())
+    run_study([kept], tmp_path, Execution(keep_checkpoints=True), make_console())
+    run_study([removed], tmp_path, Execution(), make_console())
     assert (tmp_path / kept.folder / "checkpoint").exists()
     assert not (tmp_path / removed.folder / "checkpoint").exists()
 
