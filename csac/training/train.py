@@ -1,4 +1,4 @@
-"""`train` and `resume`: one call to a set of trained runs; `csac train` and `csac resume` call nothing else."""
+"""`train` and `resume`, which train seeds and return their runs. `csac train` and `csac resume` only call these."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     OnEvaluation = Callable[[int, dict[int, float]], Any]
     StopWhen = Callable[[int, dict[int, float]], bool]
 
-PROCESSES_PER_CORE = 4  # more only cost memory: further seeds wait for their turn
+PROCESSES_PER_CORE = 4  # more would only cost memory: further seeds wait
 
 
 def train(
@@ -71,40 +71,40 @@ def train(
 ) -> TrainedRuns:
     """Train independent seeds of an algorithm on a task and return their runs.
 
-    Several seeds train in processes of their own, so a script needs the usual `if __name__ == "__main__":` guard.
+    Several seeds train in separate processes, so a script needs the usual `if __name__ == "__main__":` guard.
 
     Args:
         algorithm: a hyperparameter dataclass such as `CSAC()`.
         task: a Gymnasium id, `module:Id`, or a callable that makes an environment.
         seeds: number of independent seeds.
-        first_seed: the first of them; the others are numbered from it.
-        directory: the folder of the runs, `seed-<k>` each; by default `runs/<task>/<algorithm>/<date-time>`.
-        resume: resume the runs in `directory` that are there; start the others.
-        start_from: `DIRECTORY` or `DIRECTORY@STEP` of a set or a run: begin with copies of the seeds' checkpoints.
-        seeds_per_process: seeds that share one program; by default 1 on a CPU, and a few on a GPU. With all of them
-            training stays in this process.
-        evaluation_processes: processes in which a program evaluates while it trains on; 0 evaluates in between, and so
-            does None where no core is to spare, where a callback hears evaluations (`stop_when`), or in a
-            script without a guard. The numbers are the same.
-        environment_processes: processes of a program that share its environments, at most as many (`environments`); 0
-            steps them here, None chooses by what a step costs; without a guard it is 0. The numbers are the same.
+        first_seed: the first seed; the others are numbered consecutively from it.
+        directory: the folder of the runs, each in `seed-<k>`; by default `runs/<task>/<algorithm>/<date-time>`.
+        resume: resume the runs that exist in `directory`, and start the others.
+        start_from: `DIRECTORY` or `DIRECTORY@STEP` of a set or a run: start from copies of the seeds' checkpoints.
+        seeds_per_process: seeds that share one program; by default 1 on a CPU, and a few on a GPU. If all of them share
+            one, they train in this process.
+        evaluation_processes: processes in which a program evaluates while training goes on; 0 pauses training to
+            evaluate, and so does None if no core is free, if a callback receives evaluations (such as `stop_when`), or
+            in a script without a guard. The numbers are the same.
+        environment_processes: processes that step a program's environments, at most `environments`; 0 steps them in the
+            training process, None chooses by what a step costs, 0 without a guard. The numbers are the same.
         tensorboard: whether to write TensorBoard files.
-        wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to.
+        wandb: whether to also log to Weights & Biases (the extra `wandb`), or the project to log to.
         progress: whether to show progress, as the command line does.
         command: the command line, for the manifest.
-        callbacks: your own code, told how training goes (`csac.training.callbacks`), in this process.
+        callbacks: your own code (`csac.training.callbacks`), called in this process as training goes on.
         on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation of a program's seeds.
-        stop_when: called in the same way; those seeds end early, as finished, once it returns True.
-        **options: what a run computes, as `csac.record.config.RunConfig` explains it: `steps`, `device`,
-            `environments`, `evaluation_interval`, `evaluation_episodes`, `evaluation_environments`,
-            `evaluation_seed`, `checkpoint_interval`, `keep_checkpoints`, `environment_arguments`, `perturbations`,
-            `events`, `hindsight`; and `demonstrations`, what the replay begins with (`docs/learning-options.md`).
+        stop_when: called with the same arguments; those seeds end early, as finished, once it returns True.
+        **options: what a run computes, as documented in `csac.record.config.RunConfig`: `steps`, `device`,
+            `environments`, `evaluation_interval`, `evaluation_episodes`, `evaluation_environments`, `evaluation_seed`,
+            `checkpoint_interval`, `keep_checkpoints`, `environment_arguments`, `perturbations`, `events`, `hindsight`;
+            and `demonstrations`, with which the replay buffer starts (`docs/learning-options.md`).
 
     Raises:
-        InputError: a mistake in the arguments, or a run that cannot go on; new runs that have not begun are removed.
+        InputError: a mistake in the arguments, or a run that cannot resume; new runs that have not begun are removed.
         Interrupted: on SIGINT or SIGTERM, after everything was saved.
         StorageFailure: a run directory can no longer be written; it is as sound as if the run had been killed.
-        CallbackFailure: one of your own functions raised, after everything was saved.
+        CallbackFailure: one of your own functions raised; everything was saved.
     """
     end_if_unguarded()
     check_algorithm(algorithm)
@@ -154,14 +154,14 @@ def resume(
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
 ) -> TrainedRuns:
-    """Resume a run, or every run of a set, from its newest checkpoint; everything but `steps` comes from its manifest.
+    """Resume a run, or every run of a set, from its newest checkpoint, with the settings in its manifest.
 
-    `trust_task` lets the task, and an algorithm of one's own, import a module that nobody has named here
-    (`csac.tasks.trust`); the other arguments are those of `train`.
+    `steps` makes the runs longer. `trust_task` lets the task, or a custom algorithm, import a module that nobody has
+    named on this machine before (`csac.tasks.trust`); the other arguments are those of `train`.
 
     Raises:
-        InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
-            call `train` with it and `resume=True` then.
+        InputError: there is no such run, it cannot resume (the message says why), or its task is a Python function:
+            then call `train` with it and `resume=True`.
         Interrupted, StorageFailure, CallbackFailure: as `train`.
     """
     end_if_unguarded()
@@ -197,7 +197,7 @@ def _check_arguments(resume: bool, directory: str | Path | None, wandb: bool | s
 
 
 def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
-    """Remove those of these new runs that no process has begun, and their folder if nothing else is in it."""
+    """Remove the new runs that no process has begun, and their folder if nothing else is in it."""
     for run in runs:
         if RunDirectory.open(run.path).manifest.process is None:
             shutil.rmtree(run.path)
@@ -206,7 +206,7 @@ def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
 
 
 def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
-    """Give each run its configuration. Raises InputError, before any is changed, where one cannot go on."""
+    """Give each run its new configuration. Raises InputError, before any is changed, if one cannot resume."""
     with ExitStack() as locks:
         for run in runs:
             locks.enter_context(run.locked())
@@ -218,7 +218,7 @@ def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
 def _existing(
     place: Path, configs: Sequence[RunConfig], resume: bool, source: Source | None, has_schedule: bool
 ) -> dict[int, RunDirectory]:
-    """Return the runs that are there and to be resumed. Raises InputError where something is in the way."""
+    """Return the existing runs, to resume them. Raises InputError if they or the directory do not allow it."""
     existing = {}
     for config in configs:
         path = run_path(place, config.seed)
@@ -245,10 +245,10 @@ def _create(
     source: Source | None,
     demonstrations: Demonstrations | None,
 ) -> TrainedRuns:
-    """Create the run of each configuration; an existing one takes over what may differ where it goes on, such as steps.
+    """Create the run of each configuration; give existing ones the settings that a resume may change, such as steps.
 
-    New runs are made aside and named together: who is killed before leaves none of them, not some or a half of one.
-    Raises InputError where an existing run is in use, or a directory cannot be written.
+    New runs are created under temporary names and then renamed: a kill before that leaves none, rather than some or
+    half of one. Raises InputError if an existing run is in use, or a directory cannot be written.
     """
     changed = [config for config in configs if config.seed in existing and config != existing[config.seed].config]
     _change([existing[config.seed] for config in changed], changed)
@@ -272,7 +272,7 @@ def _create(
 
 
 def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[str]) -> TrainedRuns:
-    """Train every program that is not over, show it, and draw the curve. Raises as `train`."""
+    """Train every program that is not over, show progress, and draw the curve. Raises as `train`."""
     done = {run.path for run in runs.runs if watch.is_over(run)}
     programs = [program for program in programs if not done.issuperset(program.directories)]
     reporter = watch.reporter
