@@ -52,7 +52,7 @@ class Learner:
         # `keep_unused` keeps the parts of it that are not read: an offset by one would copy whole networks each time.
         self._explore, self._learn = (
             jax.jit(self._of_parcel(self._axis.map(program, (0, 0, 0, None))), donate_argnums=0, keep_unused=True)
-            for program in (self._one.remember_and_explore, self._one.remember_and_learn)
+            for program in (self._one.store_and_explore, self._one.store_and_update)
         )
         self._explore_alone, self._act_alone = (
             jax.jit(self._axis.map(program, (0, 0, None))) for program in (self._one.explore, self._one.act)
@@ -79,21 +79,21 @@ class Learner:
         if step >= self._cadence.warmup_steps:
             program = self._learn
             self._updates_summed += self._cadence.updates_per_interval
-        given = self._parcel.pack(step, self._axis.strip(self._waiting), self._axis.strip(outcome.observation))
-        self._carry, next_actions = program(self._carry, given)
+        parcel = self._parcel.pack(step, self._axis.strip(self._waiting), self._axis.strip(outcome.observation))
+        self._carry, next_actions = program(self._carry, parcel)
         self._waiting[...] = 0.0
         return self._axis.restore(np.asarray(next_actions))
 
     def extend(self, rows: Sequence[np.ndarray], step: int) -> None:
         """Add to each seed's memory its own packed transitions [n, width], n >= 0, after `step` environment steps."""
-        numbers = np.array([len(own) for own in rows], np.int32)
+        numbers = np.array([len(seed_rows) for seed_rows in rows], np.int32)
         padded = np.zeros((len(rows), 1 << (int(numbers.max()) - 1).bit_length(), row_width(self.spec)), np.float32)
-        for place, own in zip(padded, rows, strict=True):
-            place[: len(own)] = own
-        given = self._axis.strip(padded), self._axis.strip(numbers), np.int32(self._remembered(step))
-        self._carry = self._extend(self._carry, *given)
+        for target, seed_rows in zip(padded, rows, strict=True):
+            target[: len(seed_rows)] = seed_rows
+        arguments = self._axis.strip(padded), self._axis.strip(numbers), np.int32(self._stored(step))
+        self._carry = self._extend(self._carry, *arguments)
 
-    def _remembered(self, step: int) -> int:
+    def _stored(self, step: int) -> int:
         """Return how many of the transitions of `step` steps are in the memory: the rest wait for the next update."""
         return step // self._cadence.update_interval * self._cadence.update_interval
 
@@ -113,36 +113,36 @@ class Learner:
         return [self.network._replace(parameters=self._axis.of(parameters, i)) for i in range(self._axis.seeds)]
 
     def metrics(self) -> list[dict[str, float]]:
-        """Return each seed's metrics, averaged over the updates since `forget_metrics`; empty without any."""
+        """Return each seed's metrics, averaged over the updates since `reset_metrics`; empty without any."""
         if not self._updates_summed:
             return []
         means = np.asarray(self._carry.sums) / self._updates_summed
         of_seeds = [self._axis.of(means, i).tolist() for i in range(self._axis.seeds)]
         return [dict(zip(self._one.metrics, of_seed, strict=True)) for of_seed in of_seeds]
 
-    def forget_metrics(self) -> None:
+    def reset_metrics(self) -> None:
         """Restart the averages of the metrics."""
         self._carry = self._carry._replace(sums=jnp.zeros_like(self._carry.sums))
         self._updates_summed = 0
 
     def carry(self, index: int) -> Carry:
         """Return the carry of the seed at this index with its state unpacked, as read-only NumPy views."""
-        own = self._axis.of(jax.tree.map(np.asarray, self._carry), index)
-        return own._replace(state=self._one.packing.unpack(own.state))
+        carry = self._axis.of(jax.tree.map(np.asarray, self._carry), index)
+        return carry._replace(state=self._one.packing.unpack(carry.state))
 
     def save(self, index: int) -> Snapshot:
         """Return all that the seed at this index needs to resume, except its memory."""
-        lasting = _lasting(self._carry)  # without the memory's rows, which would be copied from a GPU to the host
-        own = self._axis.of(jax.tree.map(np.asarray, lasting), index)
-        own["state"] = self._one.packing.unpack(own["state"])
-        arrays = {name: np.array(leaf) for name, leaf in by_name(own).items()}
+        all_parts = _saved_parts(self._carry)  # without the memory's rows, which would be copied from a GPU to the host
+        parts = self._axis.of(jax.tree.map(np.asarray, all_parts), index)
+        parts["state"] = self._one.packing.unpack(parts["state"])
+        arrays = {name: np.array(leaf) for name, leaf in by_name(parts).items()}
         values = {"updates_summed": self._updates_summed, "metrics": list(self._one.metrics)}
         return Snapshot({**arrays, "waiting": self._waiting[index].copy()}, values)
 
     def memory(self, index: int, step: int) -> Ring:
         """Return a read-only view of the memory of the seed at this index, after `step` environment steps."""
         extra = 0 if self._carry.extra is None else int(self._axis.of(np.asarray(self._carry.extra), index))
-        return Ring(self._axis.of(np.asarray(self._carry.memory.rows), index), self._remembered(step) + extra)
+        return Ring(self._axis.of(np.asarray(self._carry.memory.rows), index), self._stored(step) + extra)
 
     def restore(self, saved: Sequence[Snapshot], memories: Sequence[Callable[[np.ndarray], None]]) -> None:
         """Resume from what `save` returned for each seed; each of `memories` fills one seed's rows [capacity, width].
@@ -152,23 +152,23 @@ class Learner:
         for seed in saved:
             if problem := incompatibility(self.algorithm, self.spec, self._steps, seed):
                 raise InputError(f"the checkpoint does not fit: {problem}: go on with the csac that wrote it")
-        memory, lasting = self._carry.memory, _lasting(self._carry._replace(state=self._one.state))
-        rows, kind = np.zeros(memory.rows.shape, memory.rows.dtype), jax.tree.structure(memory)
+        memory, parts = self._carry.memory, _saved_parts(self._carry._replace(state=self._one.state))
+        rows, structure = np.zeros(memory.rows.shape, memory.rows.dtype), jax.tree.structure(memory)
         memory = None  # a replay buffer may take half of the RAM: never hold three copies
         self._carry = self._carry._replace(memory=memory)
         for index, fill in enumerate(memories):
             fill(self._axis.of(rows, index))
-        leaves = [jnp.array(self._axis.stack([seed.arrays[name] for seed in saved])) for name in by_name(lasting)]
-        own = jax.tree.unflatten(jax.tree.structure(lasting), leaves)
+        leaves = [jnp.array(self._axis.stack([seed.arrays[name] for seed in saved])) for name in by_name(parts)]
+        restored = jax.tree.unflatten(jax.tree.structure(parts), leaves)
         device_rows = jax.device_put(rows, may_alias=False)  # an aliased buffer cannot be donated
-        memory = jax.tree.unflatten(kind, [device_rows, *jax.tree.leaves(own.pop("returns"))])
-        taken = Carry(memory=memory, **own)
+        memory = jax.tree.unflatten(structure, [device_rows, *jax.tree.leaves(restored.pop("returns"))])
+        carry = Carry(memory=memory, **restored)
         self._updates_summed = int(saved[0].values["updates_summed"])
         # With other options an algorithm may report other metrics: then the averages restart.
-        tells, sums = list(self._one.metrics), jnp.zeros_like(self._carry.sums)
-        if taken.sums.shape != sums.shape or any(seed.values.get("metrics", tells) != tells for seed in saved):
-            taken, self._updates_summed = taken._replace(sums=sums), 0
-        self._carry = taken._replace(state=jax.jit(self._axis.map(self._one.packing.pack))(taken.state))
+        names, sums = list(self._one.metrics), jnp.zeros_like(self._carry.sums)
+        if carry.sums.shape != sums.shape or any(seed.values.get("metrics", names) != names for seed in saved):
+            carry, self._updates_summed = carry._replace(sums=sums), 0
+        self._carry = carry._replace(state=jax.jit(self._axis.map(self._one.packing.pack))(carry.state))
         self._waiting = np.stack([seed.arrays["waiting"] for seed in saved])
 
     def truncate_last(self, indices: Sequence[int], step: int) -> None:
@@ -184,7 +184,7 @@ class Learner:
         begin = (step - self.spec.environments) % self._cadence.update_interval
         return slice(begin, begin + self.spec.environments)
 
-    def first_bad(self, index: int) -> str | None:
+    def first_non_finite(self, index: int) -> str | None:
         """Return the name of the first array in a seed's state that is not finite, or None."""
         for name, array in by_name(self._axis.of(self._states(), index)).items():
             if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
@@ -201,10 +201,10 @@ def incompatibility(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapsho
     state = jax.eval_shape(lambda key: algorithm.init(key, spec, steps), KEY_DATA)
     memory = jax.eval_shape(lambda: algorithm.memory(spec, steps))
     for name, leaf in by_name({"state": state, "returns": getattr(memory, "returns", None)}).items():
-        given = saved.arrays.get(name)
-        if given is None or given.shape != leaf.shape or given.dtype != leaf.dtype:
-            found = "no such array" if given is None else f"{given.dtype} {given.shape}"
-            return f"{name} is to be {leaf.dtype} {leaf.shape} and the checkpoint has {found}"
+        saved_array = saved.arrays.get(name)
+        if saved_array is None or saved_array.shape != leaf.shape or saved_array.dtype != leaf.dtype:
+            found = "no such array" if saved_array is None else f"{saved_array.dtype} {saved_array.shape}"
+            return f"{name} must be {leaf.dtype} {leaf.shape} and the checkpoint has {found}"
     cadence = algorithm.cadence.side_by_side(spec.environments)
     planned = saved.arrays.get("state.total_updates", cadence.updates(steps))
     if cadence.has_schedule and planned != cadence.updates(steps):
@@ -215,7 +215,7 @@ def incompatibility(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapsho
     return None
 
 
-def _lasting(carry: Carry) -> dict[str, Any]:
+def _saved_parts(carry: Carry) -> dict[str, Any]:
     """Return the parts of a carry that `save` keeps; the rows of the memory are saved separately."""
     returns = getattr(carry.memory, "returns", None)
     return {"state": carry.state, "sums": carry.sums, "key": carry.key, "extra": carry.extra, "returns": returns}

@@ -73,9 +73,9 @@ class Loop:
             self._changes = dict(by_step(self._perturbations))
             self._begin(points)
             self.recorders = [Recorder(run, self.step, program.tensorboard, program.wandb) for run in runs]
-            told = self.runs, self.recorders
-            self.notifier = Notifier(program.hears, watcher.call, *told, self.learner.metric_names, self._policy)
-            self.evaluations = Evaluations(program, *told, self.environments, watcher, self.notifier, stack)
+            recorded = self.runs, self.recorders
+            self.notifier = Notifier(program.hears, watcher.call, *recorded, self.learner.metric_names, self._policy)
+            self.evaluations = Evaluations(program, *recorded, self.environments, watcher, self.notifier, stack)
             self._saved_at, self._saved_time = self.step, time.monotonic()
             self.has_returned = False
             self._resources = stack.pop_all()
@@ -87,7 +87,7 @@ class Loop:
         """
         is_stopping, self.evaluations.should_stop = False, should_stop
         self.watcher.wait_for_turn(self.step)
-        if self._is_owed:
+        if self._evaluation_pending:
             self._evaluate(self.step)
             self._saved_at, is_stopping = -1, self.evaluations.wants_stop  # the rows are in no checkpoint yet
         while self.step < self.steps and self.environments.is_any_alive and not is_stopping:
@@ -135,26 +135,26 @@ class Loop:
     def _begin(self, points: Sequence[ResumePoint]) -> None:
         """Begin at step 0, or restore what `save` wrote."""
         keep = self.config.keep_checkpoints
-        given = files_of(self.config.demonstrations)
-        self._writers = [Writer(run.checkpoints, keep, given) for run in self.runs]
-        self._is_owed = False  # whether the evaluation of this step was broken off
+        demonstrations = files_of(self.config.demonstrations)
+        self._writers = [Writer(run.checkpoints, keep, demonstrations) for run in self.runs]
+        self._evaluation_pending = False  # whether the evaluation of this step was broken off
         self._perturb(max(self.step - self._stride, 0))  # as it was during the checkpoint's last step
         if not self.step:
-            if given:
+            if demonstrations:
                 self.learner.extend([rows_of(run) for run in self.runs], 0)
             self._observations = self.environments.reset()
             self._actions = self.learner.next_actions(self._observations, 0)
             return
         axes = self.environments.observations.shape[:-1]
         self._actions = np.zeros((*axes, self.environments.spec.action_size), np.float32)
-        learnt, restarted, fills = [], [], []
+        learner_snapshots, restarted, fills = [], [], []
         for index, (run, point) in enumerate(zip(self.runs, points, strict=True)):
             assert point.checkpoint
             saved, origin = point.checkpoint.state(), run.manifest.forked_from
             environment = saved.part("environment")
             self.environments.refuse_incompatible(environment, saved.arrays["actions"])
-            self._is_owed = self._is_owed or saved.values.get("evaluation_owed", False)
-            learnt.append(saved.part("learner"))
+            self._evaluation_pending = self._evaluation_pending or saved.values.get("evaluation_owed", False)
+            learner_snapshots.append(saved.part("learner"))
             self._actions[index] = saved.arrays["actions"]
             # Forked here from a run of another task: its saved episode does not fit (changes read "task is X, not Y").
             if origin and origin.step == self.step and origin.changed("task "):
@@ -164,7 +164,7 @@ class Loop:
             elif self.hindsight:
                 self.hindsight.restore(index, saved.part("hindsight"))
             fills.append(partial(self._fill, index, point.checkpoint))
-        self.learner.restore(learnt, fills)
+        self.learner.restore(learner_snapshots, fills)
         self._observations = self.environments.observations
         for index, reason in self.environments.refused.items():
             self._note_inexact(self.runs[index], f"seed {self.runs[index].seed}: {reason}: its episode restarts")
@@ -273,12 +273,12 @@ class Loop:
             if self.environments.alive[index]:
                 self.recorders[index].add("metrics", [{"seed": self.runs[index].seed, "step": self.step, **metrics}])
         if self._is_due(METRICS_INTERVAL):
-            self.learner.forget_metrics()
+            self.learner.reset_metrics()
 
     def _stop_diverged(self) -> None:
         """Stop each seed with parameters or actions that are not finite. Its last checkpoint stays sound."""
         for index in np.flatnonzero(self.environments.alive).tolist():
-            bad = self.learner.first_bad(index)
+            bad = self.learner.first_non_finite(index)
             if bad is None and not np.isfinite(self._actions[index]).all():
                 bad = "the policy's action"
             if bad is not None:

@@ -29,7 +29,7 @@ class Carry(NamedTuple):
 
     state: Any  # the algorithm's state; as `Packing` buffers while packed
     memory: Any  # a Replay or a Rollout
-    sums: jax.Array  # [metric] sums over the updates since `Learner.forget_metrics`
+    sums: jax.Array  # [metric] sums over the updates since `Learner.reset_metrics`
     key: jax.Array  # [2] key data of the run, from which each step's keys are folded
     extra: jax.Array | None = None  # [] number of transitions added by `extend`
 
@@ -43,14 +43,14 @@ class OneSeed:
     def __init__(self, algorithm: Algorithm, spec: Spec, steps: int, most_extra: int = 0) -> None:
         self.algorithm, self.spec = algorithm, spec
         self.cadence = algorithm.cadence.side_by_side(spec.environments)
-        self._no_extra = jnp.int32(0) if most_extra else None
+        self._initial_extra = jnp.int32(0) if most_extra else None
         self.noise: Noise = getattr(algorithm, "exploration_noise", "white")
         # Jitted so that `eval_shape` and the programs below share one trace.
-        self._first = jax.jit(
+        self._init = jax.jit(
             lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, steps + most_extra)), inline=True
         )
         self._update = jax.jit(lambda *arguments: algorithm.update(*arguments), inline=True)
-        self.state, memory = jax.eval_shape(lambda data: self._first(jax.random.wrap_key_data(data)), KEY_DATA)
+        self.state, memory = jax.eval_shape(lambda data: self._init(jax.random.wrap_key_data(data)), KEY_DATA)
         self.metrics = tuple(jax.eval_shape(self._first_metrics, self.state, memory, KEY_DATA))
         # An algorithm that acts more often than it updates packs nothing: each action would unpack the policy again.
         self.packing = Packing(self.state, SMALL if self.cadence.update_interval == spec.environments else 0)
@@ -58,9 +58,9 @@ class OneSeed:
     def begin(self, key_data: jax.Array) -> Carry:
         """Return the initial carry of a seed."""
         init_key, run_key = jax.random.split(jax.random.wrap_key_data(key_data))
-        state, memory = self._first(init_key)
+        state, memory = self._init(init_key)
         sums, key = jnp.zeros(len(self.metrics)), jax.random.key_data(run_key)
-        return Carry(self.packing.pack(state), memory, sums, key, self._no_extra)
+        return Carry(self.packing.pack(state), memory, sums, key, self._initial_extra)
 
     def explore(self, carry: Carry, observation: jax.Array, step: jax.Array) -> jax.Array:
         """Return a uniformly random action for each observation."""
@@ -74,34 +74,34 @@ class OneSeed:
         """Return the policy's exploratory action for each observation."""
         return self._act(self.packing.unpack(carry.state), carry.key, observation, step)
 
-    def remember_and_explore(
+    def store_and_explore(
         self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
     ) -> tuple[Carry, jax.Array]:
         """Store packed transitions [n, width]; return the new carry and a uniformly random action per observation."""
-        carry = self._remember(carry, rows, step)
+        carry = self._store(carry, rows, step)
         return carry, self.explore(carry, observation, step)
 
-    def remember_and_learn(
+    def store_and_update(
         self, carry: Carry, rows: jax.Array, observation: jax.Array, step: jax.Array
     ) -> tuple[Carry, jax.Array]:
         """Store packed transitions [n, width] and make all due updates; return the carry and its policy's action."""
-        memory = self._remember(carry, rows, step).memory
+        memory = self._store(carry, rows, step).memory
         count = step if carry.extra is None else step + carry.extra
         draw_key, update_key, _ = _keys(carry.key, step)
         rounds = (step - self.cadence.first_update) // self.cadence.update_interval  # before this one
         first = rounds * self.cadence.updates_per_interval
 
-        def update(i: jax.Array, learnt: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
-            state, sums = learnt
+        def update(i: jax.Array, state_and_sums: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
+            state, sums = state_and_sums
             batch = self._draw(memory, jax.random.fold_in(draw_key, i), count)
             state, metrics = self._update(state, batch, jax.random.fold_in(update_key, i), first + i)
             return state, sums + jnp.stack([metrics[name] for name in self.metrics])
 
-        learnt = self.packing.unpack(carry.state), carry.sums
+        state_and_sums = self.packing.unpack(carry.state), carry.sums
         if self.cadence.updates_per_interval == 1:
-            state, sums = update(jnp.int32(0), learnt)
+            state, sums = update(jnp.int32(0), state_and_sums)
         else:
-            state, sums = jax.lax.fori_loop(0, self.cadence.updates_per_interval, update, learnt)
+            state, sums = jax.lax.fori_loop(0, self.cadence.updates_per_interval, update, state_and_sums)
         action = self._act(state, carry.key, observation, step)
         return Carry(self.packing.pack(state), memory, sums, carry.key, carry.extra), action
 
@@ -111,7 +111,7 @@ class OneSeed:
         memory = carry.memory.extend(rows, number, step + carry.extra)
         return carry._replace(memory=memory, extra=carry.extra + number)
 
-    def _remember(self, carry: Carry, rows: jax.Array, step: jax.Array) -> Carry:
+    def _store(self, carry: Carry, rows: jax.Array, step: jax.Array) -> Carry:
         """Store the packed transitions [n, width] of the steps up to this one."""
         memory, count = carry.memory.measure(rows, self.spec), step - len(rows)
         if carry.extra is None:

@@ -38,15 +38,15 @@ class Program(NamedTuple):
     algorithm: Algorithm
     task: Task
     threads: int
-    """Cores that XLA divides its work for."""
+    """Cores among which XLA divides its work."""
     evaluation_processes: int | None = 0
-    """Of a template, None chooses."""
+    """How many processes evaluate; None, only in a template, has `programs_of` choose."""
     environment_processes: int | None = 0
-    """How many share the environments; None chooses by what a step costs."""
+    """How many processes share the environments; None chooses by what a step costs."""
     tensorboard: bool = True
     wandb: bool | str = False
     hears: Hears = Hears()
-    """What callbacks are told of, which training waits for."""
+    """The events that are sent to callbacks; training waits for each call."""
     command: str | None = None
 
 
@@ -89,9 +89,9 @@ def programs_of(
     spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
     processes = template.evaluation_processes
     if processes is None:
-        pays = spare > 0 and not template.hears.evaluations and 0 < config.evaluation_interval < config.steps
-        pays = pays and config.evaluation_environments > 0
-        processes = min(batches, max(1, spare // len(directories))) if pays and has_processes else 0
+        is_worthwhile = spare > 0 and not template.hears.evaluations and 0 < config.evaluation_interval < config.steps
+        is_worthwhile = is_worthwhile and config.evaluation_environments > 0
+        processes = min(batches, max(1, spare // len(directories))) if is_worthwhile and has_processes else 0
     check_whole("evaluation_processes", processes, 0, 1_000)
     if not config.evaluation_environments and max(config.environments, *map(len, directories)) > 1:
         raise InputError("evaluation_environments=0 is for one environment of one seed: have one seed per process")
@@ -104,8 +104,8 @@ def programs_of(
             f"the {name} cannot be sent to another process: define it in a module that can be imported, or train "
             "with seeds_per_process=seeds, evaluation_processes=0 and environment_processes=0"
         )
-    how = {"threads": threads, "evaluation_processes": processes, "environment_processes": stepping}
-    return [template._replace(directories=tuple(group), **how) for group in directories]
+    settings = {"threads": threads, "evaluation_processes": processes, "environment_processes": stepping}
+    return [template._replace(directories=tuple(group), **settings) for group in directories]
 
 
 def can_be_sent(task: Task | Algorithm) -> bool:
@@ -117,10 +117,10 @@ def can_be_sent(task: Task | Algorithm) -> bool:
             return True
         maker = known.entry_point
     try:
-        sent = pickle.dumps(maker)
+        pickled = pickle.dumps(maker)
     except Exception:
         return False
-    return has_script or b"__main__" not in sent
+    return has_script or b"__main__" not in pickled
 
 
 def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at_once: int) -> str:
@@ -128,9 +128,9 @@ def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at
     programs = programs[:at_once]
     per_seed = _bytes_per_seed(programs[0].algorithm, config, spec)
     seeds = sum(len(program.directories) for program in programs)
-    evaluating = sum((program.evaluation_processes or 0) + (program.environment_processes or 0) for program in programs)
+    helpers = sum((program.evaluation_processes or 0) + (program.environment_processes or 0) for program in programs)
     per_process = BYTES_PER_GPU_PROCESS if config.device == "gpu" else BYTES_PER_PROCESS
-    needed = seeds * per_seed + len(programs) * per_process + evaluating * BYTES_PER_EVALUATION_PROCESS
+    needed = seeds * per_seed + len(programs) * per_process + helpers * BYTES_PER_EVALUATION_PROCESS
     available, limit = psutil.virtual_memory().available, memory_left()
     available = available if limit is None else min(available, limit)
     if needed > available:
@@ -138,7 +138,7 @@ def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at
             f"this needs about {needed / 2**30:,.1f} GiB of memory and {available / 2**30:.1f} GiB are available: "
             f"use fewer seeds, a smaller replay or batch (one seed takes {per_seed / 2**30:,.2f} GiB)"
         )
-    processes = len(programs) + evaluating
+    processes = len(programs) + helpers
     return (
         f"memory: about {needed / 2**30:.1f} GiB of the {available / 2**30:.1f} GiB available "
         f"({seeds} x {per_seed / 2**20:.0f} MiB, {processes} process{'es' if processes > 1 else ''})"

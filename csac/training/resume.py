@@ -63,10 +63,10 @@ class ResumePoint(NamedTuple):
 def refuse_differences(run: RunDirectory, wanted: RunConfig, has_schedule: bool) -> None:
     """Raise InputError, with what differs, if `wanted` is not a continuation of `run`."""
     before = run.config
-    made, asked = _fixed(before), _fixed(wanted)
+    old, new = _fixed(before), _fixed(wanted)
     if before.algorithm != wanted.algorithm:  # their hyperparameters are not comparable
-        made, asked = {"algorithm": before.algorithm}, {"algorithm": wanted.algorithm}
-    if found := differences(made, asked):
+        old, new = {"algorithm": before.algorithm}, {"algorithm": wanted.algorithm}
+    if found := differences(old, new):
         advice = f"choose another directory, or resume it as it was: csac resume {run.path}"
         raise InputError(f"config differs from the saved run {run.path}: {'; '.join(found)}; {advice}")
     if wanted.steps < before.steps:
@@ -104,8 +104,8 @@ def _find(run: RunDirectory, until: int | None) -> ResumePoint:
         raise InputError(f"no checkpoint of {run.path} is sound ({'; '.join(complaints)}): restore one, or train anew")
     if checkpoint is None and run.manifest.forked_from:
         raise InputError(f"{run.path} was stopped before its first checkpoint: repeat its command in a new directory")
-    is_all_there_is = run.manifest.state == "finished" or not run.config.checkpoint_interval
-    if checkpoint is None and is_all_there_is and any(len(run.rows(table)) for table in TABLES):
+    results_are_final = run.manifest.state == "finished" or not run.config.checkpoint_interval
+    if checkpoint is None and results_are_final and any(len(run.rows(table)) for table in TABLES):
         raise InputError(f"{run.path} has results and no checkpoint to go on from: train in another directory")
     return ResumePoint(checkpoint, [f"warning: {text}; an earlier checkpoint is used" for text in complaints])
 
@@ -148,9 +148,9 @@ def _remove_unfinished(run: RunDirectory) -> None:
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
-def continuation(manifest: Manifest, now_: Manifest, point: ResumePoint) -> tuple[Continuation, list[str]]:
+def continuation(manifest: Manifest, current: Manifest, point: ResumePoint) -> tuple[Continuation, list[str]]:
     """Return the entry of a resume in the manifest's history, and the lines for the user."""
-    changes = machine_changes(manifest, now_)
+    changes = machine_changes(manifest, current)
     lines = [*point.notes, f"resuming at step {point.step:,}" if point.step else "no checkpoint yet: starting anew"]
     if changes:
         lines.append(f"note: not bit for bit the same from here on: {' and '.join(changes)}")
@@ -164,7 +164,7 @@ def continuation(manifest: Manifest, now_: Manifest, point: ResumePoint) -> tupl
         "versions": manifest.versions,
         "commit": manifest.commit,
     }
-    return Continuation(now(), point.step, exact, tuple(point.notes), now_.command, previous), lines
+    return Continuation(now(), point.step, exact, tuple(point.notes), current.command, previous), lines
 
 
 def record_inexact(run: RunDirectory, note: str) -> None:
@@ -191,7 +191,7 @@ def machine_changes(before: Manifest, current: Manifest) -> list[str]:
     return [f"the {name} was {old} and is {new}" for name, (old, new) in pairs.items() if old != new]
 
 
-def as_begun(run: RunDirectory, options: TrainOptions) -> TrainOptions:
+def fork_options(run: RunDirectory, options: TrainOptions) -> TrainOptions:
     """Return the options to resume existing forks with, without their sources: these may be gone or have trained on."""
     config, origin, given = run.config, run.manifest.forked_from, options.get("perturbations")
     planned: Any = config.perturbations
@@ -260,7 +260,7 @@ class Source(NamedTuple):
             found = [*differences(_fixed(self.runs[wanted.seed].config), _fixed(wanted)), problem]
             raise InputError(f"{self.path} does not fit: {'; '.join(found)}")
 
-    def begun(self, manifest: Manifest) -> Manifest:
+    def forked_manifest(self, manifest: Manifest) -> Manifest:
         """Return the manifest of a new run, with its origin."""
         before = self.runs[manifest.config.seed]
         changes = tuple(differences(_fixed(before.config), _fixed(manifest.config)))
@@ -272,7 +272,7 @@ class Source(NamedTuple):
         """Copy the tables and the checkpoint to a new run; transitions are hard-linked if the file system can."""
         checkpoint = self.checkpoints[run.seed]
         (run.checkpoints / REPLAY).mkdir(parents=True, exist_ok=True)
-        own: dict[str, bytes] = {}
+        contents: dict[str, bytes] = {}
         for name in checkpoint.files:
             if name.startswith(f"{REPLAY}/"):
                 target = run.checkpoints / name
@@ -282,12 +282,12 @@ class Source(NamedTuple):
                 except OSError:  # the file system has no hard links
                     write_atomically(target, checkpoint.read(name))
                 continue
-            own[name] = checkpoint.read(name)
+            contents[name] = checkpoint.read(name)
             if name.endswith(".csv"):
-                write_atomically(run.path / name, own[name])
+                write_atomically(run.path / name, contents[name])
         folder = checkpoint.folder / f"step_{checkpoint.step}"
-        own["checkpoint.json"] = (folder / "checkpoint.json").read_bytes()
-        write_folder(run.checkpoints / folder.name, own)
+        contents["checkpoint.json"] = (folder / "checkpoint.json").read_bytes()
+        write_folder(run.checkpoints / folder.name, contents)
 
 
 def _fixed(config: RunConfig) -> dict[str, Any]:

@@ -48,8 +48,8 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
         try:
             loop.run(should_stop)
         finally:
-            is_short = loop.step < loop.steps or loop.evaluations.broken_off is not None
-            stopped = not loop.has_returned or (is_short and should_stop())
+            is_incomplete = loop.step < loop.steps or loop.evaluations.broken_off is not None
+            stopped = not loop.has_returned or (is_incomplete and should_stop())
             for run in runs:
                 if run.manifest.state == "running":
                     run.update_manifest(state="interrupted" if stopped else "finished")
@@ -65,8 +65,8 @@ def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], 
         for line in lines:
             run.log(line)
             watcher.note(f"seed {run.seed}: {line}")
-    is_resting = before.state == "failed" and point.checkpoint and not point.checkpoint.values["environment"]["alive"]
-    state = {} if is_resting else {"state": "running", "failure": ""}
+    stays_failed = before.state == "failed" and point.checkpoint and not point.checkpoint.values["environment"]["alive"]
+    state = {} if stays_failed else {"state": "running", "failure": ""}
     run.update_manifest(**current, **state, history=history, steps_done=point.step)
 
 

@@ -191,9 +191,9 @@ class _RemoteWatcher(Watcher):
             self._turns.get()
 
     def call(self, event: Event) -> Answer:
-        is_heard = not self.stopped.is_set()
+        expects_answer = not self.stopped.is_set()
         self.send("call", event)
-        answer = self._answers.get() if is_heard else STOPPED
+        answer = self._answers.get() if expects_answer else STOPPED
         if answer.failed:
             self.stopped.set()
         return answer

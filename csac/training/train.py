@@ -23,7 +23,7 @@ from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs
 from csac.training.devices import choose_device
 from csac.training.program import Program, choose_groups, memory_needed, programs_of
-from csac.training.resume import Source, as_begun, refuse_differences, refuse_lost
+from csac.training.resume import Source, fork_options, refuse_differences, refuse_lost
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.supervisor import supervise
@@ -116,19 +116,19 @@ def train(
 
     source = None
     if start_from is not None and resume and place and all(is_run(run_path(place, seed)) for seed in wanted):
-        options = as_begun(RunDirectory.open(run_path(place, wanted[0])), options)
+        options = fork_options(RunDirectory.open(run_path(place, wanted[0])), options)
     elif start_from is not None:
         source = Source.find(start_from, wanted)
     configs, demonstrations, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
     choose_device(configs[0].device)  # the task's module may have changed JAX's settings
     place = place or new_set_directory(configs[0].task, configs[0].algorithm)
-    existing = _existing(place, configs, resume, source, algorithm.cadence.has_schedule)
+    existing = _existing_runs(place, configs, resume, source, algorithm.cadence.has_schedule)
     if source:
         source.refuse_misfit(algorithm, spec, configs[0])
 
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task, algorithm)
-    how = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
-    template = Program((), algorithm, task, 1, *how)
+    settings = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
+    template = Program((), algorithm, task, 1, *settings)
     directories = [[run_path(place, seed) for seed in group] for group in groups]
     programs = programs_of(template, directories, existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
@@ -172,16 +172,16 @@ def resume(
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
     if steps is not None:
-        longer = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
-        for run, config in zip(runs.runs, longer, strict=True):
+        configs = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
+        for run, config in zip(runs.runs, configs, strict=True):
             refuse_differences(run, config, algorithm.cadence.has_schedule)
-        _change(runs.runs, longer)
+        _set_configs(runs.runs, configs)
     existing = {run.seed: run for run in runs.runs}
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
     tensorboard = any(run.tensorboard.exists() for run in runs.runs)
     wandb = any((run.path / "wandb").exists() for run in runs.runs)
-    how = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
-    template = Program((), algorithm, config.task, 1, *how)
+    settings = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
+    template = Program((), algorithm, config.task, 1, *settings)
     programs = programs_of(template, [[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
 
@@ -205,7 +205,7 @@ def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
         place.rmdir()
 
 
-def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
+def _set_configs(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
     """Give each run its new configuration. Raises InputError, before any is changed, if one cannot resume."""
     with ExitStack() as locks:
         for run in runs:
@@ -215,7 +215,7 @@ def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
             run.update_manifest(config=config)
 
 
-def _existing(
+def _existing_runs(
     place: Path, configs: Sequence[RunConfig], resume: bool, source: Source | None, has_schedule: bool
 ) -> dict[int, RunDirectory]:
     """Return the existing runs, to resume them. Raises InputError if they or the directory do not allow it."""
@@ -228,8 +228,8 @@ def _existing(
             existing[config.seed] = run = RunDirectory.open(path)
             refuse_differences(run, config, has_schedule)
     known = (".", "seed-", "curve.png")
-    strangers = [] if existing or not place.is_dir() else [p for p in place.iterdir() if not p.name.startswith(known)]
-    if strangers or (place.exists() and not place.is_dir()):
+    unknown = [] if existing or not place.is_dir() else [p for p in place.iterdir() if not p.name.startswith(known)]
+    if unknown or (place.exists() and not place.is_dir()):
         raise InputError(f"{place} is not empty and holds no set of runs: choose a new or an empty directory")
     if source:
         for config in configs:
@@ -251,22 +251,22 @@ def _create(
     half of one. Raises InputError if an existing run is in use, or a directory cannot be written.
     """
     changed = [config for config in configs if config.seed in existing and config != existing[config.seed].config]
-    _change([existing[config.seed] for config in changed], changed)
+    _set_configs([existing[config.seed] for config in changed], changed)
     new = [config for config in configs if config.seed not in existing]
-    aside = {config.seed: name_aside(run_path(place, config.seed)) for config in new}
+    temporary = {config.seed: name_aside(run_path(place, config.seed)) for config in new}
     try:
         for config in new:
             program = next(group for group in groups if config.seed in group)
             manifest = Manifest(config=config, program=tuple(program))
-            run = RunDirectory.create(aside[config.seed], source.begun(manifest) if source else manifest)
+            run = RunDirectory.create(temporary[config.seed], source.forked_manifest(manifest) if source else manifest)
             if source:
                 source.copy_to(run)
             if demonstrations:
                 demonstrations.write(run)
-        for seed, path in aside.items():
+        for seed, path in temporary.items():
             RunDirectory.open(path).rename(run_path(place, seed))
     finally:
-        for path in aside.values():
+        for path in temporary.values():
             shutil.rmtree(path, ignore_errors=True)
     return TrainedRuns(place, [RunDirectory.open(run_path(place, config.seed)) for config in configs])
 
