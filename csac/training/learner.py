@@ -1,4 +1,4 @@
-"""The compiled programs of one group: remember, learn, act, for all its seeds in one dispatch."""
+"""The compiled programs of a group of seeds: one dispatch stores transitions, updates and acts for all of them."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 
 class Learner:
-    """The compiled programs of one group. Seeds are the leading axis of everything that enters and leaves.
+    """The compiled programs of a group of seeds, which are the leading axis of all arrays passed in or returned.
 
-    What is learnt is kept packed into few buffers, donated at every update: with one for each of CSAC's 74 arrays an
-    update takes 2-6 % longer.
+    The algorithm's state is kept packed in few buffers, donated at every update: with a buffer for each of CSAC's 74
+    arrays an update takes 2-6 % longer.
 
-    `most_extra` is how many transitions a seed may be given by `extend`.
+    `most_extra` is the maximum number of transitions per seed that `extend` may add.
     """
 
     def __init__(self, algorithm: Algorithm, spec: Spec, seeds: Sequence[int], steps: int, most_extra: int = 0) -> None:
@@ -40,19 +40,19 @@ class Learner:
         keep_programs()
         self._one = OneSeed(algorithm, spec, steps, most_extra)
         self.metric_names = self._one.metrics
-        self.network = algorithm.policy(self._one.state)  # for all but its parameters
-        # It runs once, and less optimised it is compiled in three quarters of the time.
+        self.network = algorithm.policy(self._one.state)  # whose parameters are shapes: `networks` fills them in
+        # It runs only once, and at this optimisation level compiles in three quarters of the time.
         begin = jax.jit(self._axis.map(self._one.begin), compiler_options={"xla_backend_optimization_level": 1})
         keys = [np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds]
         self._carry: Carry = begin(self._axis.stack(keys))
         axis = (spec.environments,) if spec.environments > 1 else ()
         observations = np.zeros((len(seeds), *axis, spec.observation_size), np.float32)
         self._parcel = Parcel(self._axis.strip(self._waiting).shape, self._axis.strip(observations).shape)
-        # JAX pairs what is donated with what comes out by order and shape. So the carry comes out first, and is kept
-        # whole where an algorithm does not read all of it: a shift by one would copy whole networks to and fro.
+        # JAX matches donated buffers with outputs by order and shape. So the carry is the first output, and
+        # `keep_unused` keeps the parts of it that are not read: an offset by one would copy whole networks each time.
         self._explore, self._learn = (
             jax.jit(self._of_parcel(self._axis.map(program, (0, 0, 0, None))), donate_argnums=0, keep_unused=True)
-            for program in (self._one.remember_and_explore, self._one.remember_and_learn)
+            for program in (self._one.store_and_explore, self._one.store_and_update)
         )
         self._explore_alone, self._act_alone = (
             jax.jit(self._axis.map(program, (0, 0, None))) for program in (self._one.explore, self._one.act)
@@ -60,15 +60,15 @@ class Learner:
         self._extend = jax.jit(self._axis.map(self._one.extend, (0, 0, 0, None)), donate_argnums=0)
 
     def next_actions(self, observations: np.ndarray, step: int) -> np.ndarray:
-        """Return the actions [seed, (environment,) action] for observations of such axes, after `step` steps."""
+        """Return actions [seed, (environment,) action] for observations with the same axes, after `step` steps."""
         program = self._explore_alone if step < self._cadence.warmup_steps else self._act_alone
         return self._axis.restore(np.array(program(self._carry, self._axis.strip(observations), np.int32(step))))
 
     def step(self, observations: np.ndarray, actions: np.ndarray, outcome: Steps, step: int) -> np.ndarray:
-        """Remember a step of each environment, learn where it is time to, and return the next actions.
+        """Store one transition of each environment, update if it is time to, and return the next actions.
 
-        `step` is the number of the last of these steps. One dispatch, whatever the algorithm does. Between updates
-        transitions wait on the host, so that an algorithm that learns from rollouts is only asked to act.
+        `step` counts environment steps, these included. A call is a single dispatch for every algorithm. Transitions
+        wait on the host until the next update, so between updates an algorithm that uses rollouts only acts.
         """
         ends = outcome.terminated, outcome.truncated
         rows = pack(Transition(observations, actions, outcome.reward, outcome.next_observation, *ends))
@@ -79,26 +79,26 @@ class Learner:
         if step >= self._cadence.warmup_steps:
             program = self._learn
             self._updates_summed += self._cadence.updates_per_interval
-        given = self._parcel.pack(step, self._axis.strip(self._waiting), self._axis.strip(outcome.observation))
-        self._carry, next_actions = program(self._carry, given)
+        parcel = self._parcel.pack(step, self._axis.strip(self._waiting), self._axis.strip(outcome.observation))
+        self._carry, next_actions = program(self._carry, parcel)
         self._waiting[...] = 0.0
         return self._axis.restore(np.asarray(next_actions))
 
     def extend(self, rows: Sequence[np.ndarray], step: int) -> None:
-        """Give each seed packed transitions [n, width] of its own, n from 0 on; `step` environment steps were made."""
-        numbers = np.array([len(own) for own in rows], np.int32)
+        """Add to each seed's memory its own packed transitions [n, width], n >= 0, after `step` environment steps."""
+        numbers = np.array([len(seed_rows) for seed_rows in rows], np.int32)
         padded = np.zeros((len(rows), 1 << (int(numbers.max()) - 1).bit_length(), row_width(self.spec)), np.float32)
-        for place, own in zip(padded, rows, strict=True):
-            place[: len(own)] = own
-        given = self._axis.strip(padded), self._axis.strip(numbers), np.int32(self._remembered(step))
-        self._carry = self._extend(self._carry, *given)
+        for target, seed_rows in zip(padded, rows, strict=True):
+            target[: len(seed_rows)] = seed_rows
+        arguments = self._axis.strip(padded), self._axis.strip(numbers), np.int32(self._stored(step))
+        self._carry = self._extend(self._carry, *arguments)
 
-    def _remembered(self, step: int) -> int:
-        """Return how many of so many steps are in the memory: the others wait for an update."""
+    def _stored(self, step: int) -> int:
+        """Return how many of the transitions of `step` steps are in the memory: the rest wait for the next update."""
         return step // self._cadence.update_interval * self._cadence.update_interval
 
     def _of_parcel(self, program: Callable) -> Callable:
-        """Return the program of a carry, packed transitions, observations and a step as one of a carry and a parcel."""
+        """Wrap a program of a carry, packed transitions, observations and a step to take a carry and a parcel."""
 
         @functools.wraps(program)
         def of_parcel(carry: Carry, row: jax.Array) -> Any:
@@ -107,104 +107,104 @@ class Learner:
         return of_parcel
 
     def networks(self) -> list[PolicyNetwork]:
-        """Return each seed's policy as NumPy layers."""
+        """Return each seed's policy network, with NumPy parameters."""
         parameters_of = self._axis.map(lambda state: self.algorithm.policy(state).parameters)
         parameters = jax.tree.map(np.array, parameters_of(self._states()))
         return [self.network._replace(parameters=self._axis.of(parameters, i)) for i in range(self._axis.seeds)]
 
     def metrics(self) -> list[dict[str, float]]:
-        """Return each seed's metrics, averaged over the updates since `forget_metrics`; none if there were none."""
+        """Return each seed's metrics, averaged over the updates since `reset_metrics`; empty without any."""
         if not self._updates_summed:
             return []
         means = np.asarray(self._carry.sums) / self._updates_summed
         of_seeds = [self._axis.of(means, i).tolist() for i in range(self._axis.seeds)]
         return [dict(zip(self._one.metrics, of_seed, strict=True)) for of_seed in of_seeds]
 
-    def forget_metrics(self) -> None:
-        """Begin to average anew."""
+    def reset_metrics(self) -> None:
+        """Restart the averages of the metrics."""
         self._carry = self._carry._replace(sums=jnp.zeros_like(self._carry.sums))
         self._updates_summed = 0
 
     def carry(self, index: int) -> Carry:
-        """Return what the seed at this place carries, its state unpacked; views of NumPy, to read only."""
-        own = self._axis.of(jax.tree.map(np.asarray, self._carry), index)
-        return own._replace(state=self._one.packing.unpack(own.state))
+        """Return the carry of the seed at this index with its state unpacked, as read-only NumPy views."""
+        carry = self._axis.of(jax.tree.map(np.asarray, self._carry), index)
+        return carry._replace(state=self._one.packing.unpack(carry.state))
 
     def save(self, index: int) -> Snapshot:
-        """Return what the seed at this place needs to go on, but for its memory."""
-        lasting = _lasting(self._carry)  # without the rows: a GPU's would be copied to the host
-        own = self._axis.of(jax.tree.map(np.asarray, lasting), index)
-        own["state"] = self._one.packing.unpack(own["state"])
-        arrays = {name: np.array(leaf) for name, leaf in by_name(own).items()}
+        """Return all that the seed at this index needs to resume, except its memory."""
+        all_parts = _saved_parts(self._carry)  # without the memory's rows, which would be copied from a GPU to the host
+        parts = self._axis.of(jax.tree.map(np.asarray, all_parts), index)
+        parts["state"] = self._one.packing.unpack(parts["state"])
+        arrays = {name: np.array(leaf) for name, leaf in by_name(parts).items()}
         values = {"updates_summed": self._updates_summed, "metrics": list(self._one.metrics)}
         return Snapshot({**arrays, "waiting": self._waiting[index].copy()}, values)
 
     def memory(self, index: int, step: int) -> Ring:
-        """Return the memory of the seed at this place, to read only; `step` environment steps were made."""
+        """Return a read-only view of the memory of the seed at this index, after `step` environment steps."""
         extra = 0 if self._carry.extra is None else int(self._axis.of(np.asarray(self._carry.extra), index))
-        return Ring(self._axis.of(np.asarray(self._carry.memory.rows), index), self._remembered(step) + extra)
+        return Ring(self._axis.of(np.asarray(self._carry.memory.rows), index), self._stored(step) + extra)
 
     def restore(self, saved: Sequence[Snapshot], memories: Sequence[Callable[[np.ndarray], None]]) -> None:
-        """Go on from what `save` returned for each seed; `memories` fill each seed's rows [capacity, width].
+        """Resume from what `save` returned for each seed; each of `memories` fills one seed's rows [capacity, width].
 
-        Raises InputError where it is of another algorithm, or of networks of another size.
+        Raises InputError if it is from another algorithm or from networks of another size.
         """
         for seed in saved:
             if problem := incompatibility(self.algorithm, self.spec, self._steps, seed):
                 raise InputError(f"the checkpoint does not fit: {problem}: go on with the csac that wrote it")
-        memory, lasting = self._carry.memory, _lasting(self._carry._replace(state=self._one.state))
-        rows, kind = np.zeros(memory.rows.shape, memory.rows.dtype), jax.tree.structure(memory)
-        memory = None  # a replay may fill half of what memory there is: never three at a time
+        memory, parts = self._carry.memory, _saved_parts(self._carry._replace(state=self._one.state))
+        rows, structure = np.zeros(memory.rows.shape, memory.rows.dtype), jax.tree.structure(memory)
+        memory = None  # a replay buffer may take half of the RAM: never hold three copies
         self._carry = self._carry._replace(memory=memory)
         for index, fill in enumerate(memories):
             fill(self._axis.of(rows, index))
-        leaves = [jnp.array(self._axis.stack([seed.arrays[name] for seed in saved])) for name in by_name(lasting)]
-        own = jax.tree.unflatten(jax.tree.structure(lasting), leaves)
-        device_rows = jax.device_put(rows, may_alias=False)  # what is aliased cannot be donated
-        memory = jax.tree.unflatten(kind, [device_rows, *jax.tree.leaves(own.pop("returns"))])
-        taken = Carry(memory=memory, **own)
+        leaves = [jnp.array(self._axis.stack([seed.arrays[name] for seed in saved])) for name in by_name(parts)]
+        restored = jax.tree.unflatten(jax.tree.structure(parts), leaves)
+        device_rows = jax.device_put(rows, may_alias=False)  # an aliased buffer cannot be donated
+        memory = jax.tree.unflatten(structure, [device_rows, *jax.tree.leaves(restored.pop("returns"))])
+        carry = Carry(memory=memory, **restored)
         self._updates_summed = int(saved[0].values["updates_summed"])
-        # With other options an algorithm may tell of other metrics: then their means begin anew.
-        tells, sums = list(self._one.metrics), jnp.zeros_like(self._carry.sums)
-        if taken.sums.shape != sums.shape or any(seed.values.get("metrics", tells) != tells for seed in saved):
-            taken, self._updates_summed = taken._replace(sums=sums), 0
-        self._carry = taken._replace(state=jax.jit(self._axis.map(self._one.packing.pack))(taken.state))
+        # With other options an algorithm may report other metrics: then the averages restart.
+        names, sums = list(self._one.metrics), jnp.zeros_like(self._carry.sums)
+        if carry.sums.shape != sums.shape or any(seed.values.get("metrics", names) != names for seed in saved):
+            carry, self._updates_summed = carry._replace(sums=sums), 0
+        self._carry = carry._replace(state=jax.jit(self._axis.map(self._one.packing.pack))(carry.state))
         self._waiting = np.stack([seed.arrays["waiting"] for seed in saved])
 
     def truncate_last(self, indices: Sequence[int], step: int) -> None:
-        """Mark the last transition of these seeds, after `step` steps, as truncated: what follows is another episode.
+        """Mark these seeds' last transition, after `step` steps, as truncated: the next one starts a new episode.
 
-        One that an update has learnt from already stays as it was: a replay sees by itself what follows what.
+        One already moved to the memory stays unmarked: the replay detects from observations where a sequence breaks.
         """
         if step % self._cadence.update_interval:
-            self._waiting[indices, self._rows_of(step), -1] = 1.0  # `pack` ends with it
+            self._waiting[indices, self._rows_of(step), -1] = 1.0  # `truncated` is the last column
 
     def _rows_of(self, step: int) -> slice:
-        """Return where the transitions of the step of each environment that ends with `step` wait."""
+        """Return where in `_waiting` each environment's transition goes, for the iteration that ends at `step`."""
         begin = (step - self.spec.environments) % self._cadence.update_interval
         return slice(begin, begin + self.spec.environments)
 
-    def first_bad(self, index: int) -> str | None:
-        """Return the name of the first of a seed's arrays that is not finite, or None."""
+    def first_non_finite(self, index: int) -> str | None:
+        """Return the name of the first array in a seed's state that is not finite, or None."""
         for name, array in by_name(self._axis.of(self._states(), index)).items():
             if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
                 return name
         return None
 
     def _states(self) -> Any:
-        """Return what the seeds have learnt as views of NumPy, to read only."""
+        """Return the state of all seeds, unpacked, as read-only NumPy views."""
         return self._one.packing.unpack([np.asarray(buffer) for buffer in self._carry.state])
 
 
 def incompatibility(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapshot) -> str | None:
-    """Say what keeps an algorithm from going on from what `Learner.save` returned, or return None."""
+    """Return why an algorithm cannot resume from what `Learner.save` returned, or None if it can."""
     state = jax.eval_shape(lambda key: algorithm.init(key, spec, steps), KEY_DATA)
     memory = jax.eval_shape(lambda: algorithm.memory(spec, steps))
     for name, leaf in by_name({"state": state, "returns": getattr(memory, "returns", None)}).items():
-        given = saved.arrays.get(name)
-        if given is None or given.shape != leaf.shape or given.dtype != leaf.dtype:
-            found = "no such array" if given is None else f"{given.dtype} {given.shape}"
-            return f"{name} is to be {leaf.dtype} {leaf.shape} and the checkpoint has {found}"
+        saved_array = saved.arrays.get(name)
+        if saved_array is None or saved_array.shape != leaf.shape or saved_array.dtype != leaf.dtype:
+            found = "no such array" if saved_array is None else f"{saved_array.dtype} {saved_array.shape}"
+            return f"{name} must be {leaf.dtype} {leaf.shape} and the checkpoint has {found}"
     cadence = algorithm.cadence.side_by_side(spec.environments)
     planned = saved.arrays.get("state.total_updates", cadence.updates(steps))
     if cadence.has_schedule and planned != cadence.updates(steps):
@@ -215,7 +215,7 @@ def incompatibility(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapsho
     return None
 
 
-def _lasting(carry: Carry) -> dict[str, Any]:
-    """Return what a checkpoint has of a carry; the rows of memories are saved apart."""
+def _saved_parts(carry: Carry) -> dict[str, Any]:
+    """Return the parts of a carry that `save` keeps; the rows of the memory are saved separately."""
     returns = getattr(carry.memory, "returns", None)
     return {"state": carry.state, "sums": carry.sums, "key": carry.key, "extra": carry.extra, "returns": returns}

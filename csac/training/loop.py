@@ -1,4 +1,4 @@
-"""One loop for every algorithm: step the environments, remember, learn, act; now and then evaluate, write and save."""
+"""The training loop of every algorithm: step environments, store, update, act; evaluate, write and save when due."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
 class Loop:
-    """Trains runs side by side that differ by their seeds alone.
+    """Trains runs side by side that differ only in their seeds.
 
-    Strict order: all updates due after a step finish before the next action is chosen. Evaluations may run in
-    processes beside this one while training goes on; their numbers are the same.
+    Strict order: all updates due after a step finish before the next action is chosen. Evaluations may run in other
+    processes while training goes on; their numbers are the same.
 
-    This process has locked the runs, and all go on at one step. Raises InputError where a checkpoint does not fit, or
-    the task cannot be made.
+    This process must hold the runs' locks, and all runs must be at the same step. Raises InputError if a checkpoint
+    does not fit, or the task cannot be made.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Loop:
     ) -> None:
         self.runs, self.watcher, self.config = list(runs), watcher, runs[0].config
         self.step, self.steps = points[0].step, self.config.steps
-        self._stride = self.config.environments  # environment steps per iteration: one of each environment
+        self._stride = self.config.environments  # environment steps per iteration: one per environment
         seeds = [run.seed for run in runs]
         arguments = self.config.environment_arguments
         with ExitStack() as stack:
@@ -73,23 +73,23 @@ class Loop:
             self._changes = dict(by_step(self._perturbations))
             self._begin(points)
             self.recorders = [Recorder(run, self.step, program.tensorboard, program.wandb) for run in runs]
-            told = self.runs, self.recorders
-            self.notifier = Notifier(program.hears, watcher.call, *told, self.learner.metric_names, self._policy)
-            self.evaluations = Evaluations(program, *told, self.environments, watcher, self.notifier, stack)
+            recorded = self.runs, self.recorders
+            self.notifier = Notifier(program.hears, watcher.call, *recorded, self.learner.metric_names, self._policy)
+            self.evaluations = Evaluations(program, *recorded, self.environments, watcher, self.notifier, stack)
             self._saved_at, self._saved_time = self.step, time.monotonic()
             self.has_returned = False
             self._resources = stack.pop_all()
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Train to the last step, until no seed is left, or until a signal or a callback asks for a stop.
+        """Train to the last step, until no seed is alive, or until a signal or a callback asks for a stop.
 
-        Raises OSError where a run directory can no longer be written.
+        Raises OSError if a run directory can no longer be written.
         """
         is_stopping, self.evaluations.should_stop = False, should_stop
         self.watcher.wait_for_turn(self.step)
-        if self._is_owed:
+        if self._evaluation_pending:
             self._evaluate(self.step)
-            self._saved_at, is_stopping = -1, self.evaluations.wants_stop  # its rows are in no checkpoint yet
+            self._saved_at, is_stopping = -1, self.evaluations.wants_stop  # the rows are in no checkpoint yet
         while self.step < self.steps and self.environments.is_any_alive and not is_stopping:
             is_stopping = self._advance()
             is_last = self.step == self.steps
@@ -110,7 +110,7 @@ class Loop:
         self.has_returned = True
 
     def save(self) -> None:
-        """Write a checkpoint of every run, failed seeds included, unless this step has one. Raises OSError."""
+        """Write a checkpoint of every run, failed seeds included, unless this step already has one. Raises OSError."""
         self.evaluations.finish()
         self._stop_diverged()
         if self.step == self._saved_at or not self.environments.alive.any():
@@ -127,36 +127,36 @@ class Loop:
         self._saved_at, self._saved_time = self.step, time.monotonic()
 
     def close(self) -> None:
-        """Close every environment, and end the processes that evaluate."""
+        """Close the recorders and environments, and end the evaluation processes."""
         for recorder in self.recorders:
             recorder.close()
         self._resources.close()
 
     def _begin(self, points: Sequence[ResumePoint]) -> None:
-        """Reset the environments, or restore what `save` wrote."""
+        """Begin at step 0, or restore what `save` wrote."""
         keep = self.config.keep_checkpoints
-        given = files_of(self.config.demonstrations)
-        self._writers = [Writer(run.checkpoints, keep, given) for run in self.runs]
-        self._is_owed = False  # an evaluation of this step, which was broken off
-        self._perturb(max(self.step - self._stride, 0))  # as before the last step of the checkpoint
+        demonstrations = files_of(self.config.demonstrations)
+        self._writers = [Writer(run.checkpoints, keep, demonstrations) for run in self.runs]
+        self._evaluation_pending = False  # whether the evaluation of this step was broken off
+        self._perturb(max(self.step - self._stride, 0))  # as it was during the checkpoint's last step
         if not self.step:
-            if given:
+            if demonstrations:
                 self.learner.extend([rows_of(run) for run in self.runs], 0)
             self._observations = self.environments.reset()
             self._actions = self.learner.next_actions(self._observations, 0)
             return
         axes = self.environments.observations.shape[:-1]
         self._actions = np.zeros((*axes, self.environments.spec.action_size), np.float32)
-        learnt, restarted, fills = [], [], []
+        learner_snapshots, restarted, fills = [], [], []
         for index, (run, point) in enumerate(zip(self.runs, points, strict=True)):
             assert point.checkpoint
             saved, origin = point.checkpoint.state(), run.manifest.forked_from
             environment = saved.part("environment")
             self.environments.refuse_incompatible(environment, saved.arrays["actions"])
-            self._is_owed = self._is_owed or saved.values.get("evaluation_owed", False)
-            learnt.append(saved.part("learner"))
+            self._evaluation_pending = self._evaluation_pending or saved.values.get("evaluation_owed", False)
+            learner_snapshots.append(saved.part("learner"))
             self._actions[index] = saved.arrays["actions"]
-            # Begun by a run of another task, whose saved episode does not fit here (changes read "task is X, not Y").
+            # Forked here from a run of another task: its saved episode does not fit (changes read "task is X, not Y").
             if origin and origin.step == self.step and origin.changed("task "):
                 environment.values["exact"] = False
             if not self.environments.restore(index, environment):
@@ -164,7 +164,7 @@ class Loop:
             elif self.hindsight:
                 self.hindsight.restore(index, saved.part("hindsight"))
             fills.append(partial(self._fill, index, point.checkpoint))
-        self.learner.restore(learnt, fills)
+        self.learner.restore(learner_snapshots, fills)
         self._observations = self.environments.observations
         for index, reason in self.environments.refused.items():
             self._note_inexact(self.runs[index], f"seed {self.runs[index].seed}: {reason}: its episode restarts")
@@ -173,14 +173,14 @@ class Loop:
             self._actions[restarted] = self.learner.next_actions(self._observations, self.step)[restarted]
 
     def _fill(self, index: int, checkpoint: Checkpoint, rows: np.ndarray) -> None:
-        """Fill rows [capacity, width] with a run's transitions, and go on with the checkpoint's files."""
+        """Fill rows [capacity, width] with a run's transitions, and have its writer continue the checkpoint's files."""
         run, lost = self.runs[index], checkpoint.fill(rows)
         for text in lost:
             self._note_inexact(run, f"warning: {text}")
         self._writers[index] = Writer(run.checkpoints, self.config.keep_checkpoints, {} if lost else checkpoint.files)
 
     def _advance(self) -> bool:
-        """Make one step of each environment, and learn from them; return whether a callback ends the runs."""
+        """Step each environment once and learn from it; return whether a callback ends the runs."""
         for change in [self._changes[step] for step in self._changes if 0 <= self.step - step < self._stride]:
             self._perturb(self.step)
             text = f"perturbed from step {self.step + 1:,} on: {change}"
@@ -201,34 +201,34 @@ class Loop:
         self._actions = self.learner.step(self._observations, self._actions, outcome, self.step)
         self._observations = outcome.observation
         flat = self._actions.ravel()
-        # One product finds a nan or an inf in a third of the time of np.isfinite().all().
+        # A dot product finds a nan or an inf in a third of the time of np.isfinite().all().
         if not flat.dot(flat) < np.inf and not np.isfinite(self._actions[self.environments.alive]).all():
             self._stop_diverged()
         return self.notifier.after_step(self.step, self._stride, self.environments.alive, outcome.episodes)
 
     def _due_evaluation(self) -> int | None:
-        """Return the step of an evaluation that is to be made now, or None."""
+        """Return the step of the evaluation that is due now, or None."""
         interval = self.config.evaluation_interval
         if not interval or self.step == self.steps:
             return self.step if interval else None
         if self.config.evaluation_environments:
             return self.step if self._is_due(interval) else None
-        due = self.step - self.step % interval  # waits for the end of the episode in progress
+        due = self.step - self.step % interval  # made once the episode in progress has ended
         return due if due > self.evaluations.step and self.environments.is_at_start else None
 
     def _evaluate(self, step: int) -> None:
-        """Evaluate the current policies, on the task as it was in the last step, as the evaluation of `step`.
+        """Evaluate the current policies on the task as it was in the last step, recorded under `step`.
 
-        In the training environment that is the multiple of the interval that was passed, up to an episode ago.
+        In the training environment, `step` is the last multiple of the interval, passed up to an episode ago.
         """
         self.evaluations.begin(step, self.learner.networks(), self.step - self._stride)
-        if not self.config.evaluation_environments:  # the training environment has played them
+        if not self.config.evaluation_environments:  # the episodes ran in the training environment
             self.learner.truncate_last([0], self.step)
             self._observations = self.environments.begin_again()
             self._actions = self.learner.next_actions(self._observations, self.step)
 
     def _write_and_report(self) -> None:
-        """Write waiting rows, report progress, save by the clock, wait for the next turn on the cores."""
+        """Write waiting rows, report progress, save if the last save is old, wait for the next turn on the cores."""
         if self.evaluations.is_ready:
             self.evaluations.finish()
         for recorder in self.recorders:
@@ -241,7 +241,7 @@ class Loop:
             self.watcher.wait_for_turn(self.step)
 
     def _finish(self) -> None:
-        """Save at the end, or where a stop was asked for; leave the newest policies."""
+        """Write the newest policies, and save, at the end or after a stop."""
         self.evaluations.finish()
         self._stop_diverged()
         for index, alive in enumerate(self.environments.alive.tolist()):
@@ -273,12 +273,12 @@ class Loop:
             if self.environments.alive[index]:
                 self.recorders[index].add("metrics", [{"seed": self.runs[index].seed, "step": self.step, **metrics}])
         if self._is_due(METRICS_INTERVAL):
-            self.learner.forget_metrics()
+            self.learner.reset_metrics()
 
     def _stop_diverged(self) -> None:
-        """Stop each seed whose parameters, or what they led to, are not finite. Its last checkpoint stays sound."""
+        """Stop each seed with parameters or actions that are not finite. Its last checkpoint stays sound."""
         for index in np.flatnonzero(self.environments.alive).tolist():
-            bad = self.learner.first_bad(index)
+            bad = self.learner.first_non_finite(index)
             if bad is None and not np.isfinite(self._actions[index]).all():
                 bad = "the policy's action"
             if bad is not None:
@@ -301,12 +301,12 @@ class Loop:
             self.environments.perturb(values_at(self._perturbations, step))
 
     def _is_due(self, interval: int) -> bool:
-        """Return whether the last step of each environment passed a multiple of `interval`."""
+        """Return whether this iteration reached or passed a multiple of `interval`."""
         return bool(interval) and self.step % interval < self._stride
 
 
 def _tables_and_policy(run: RunDirectory) -> dict[str, bytes]:
-    """Return what a checkpoint has beside the state: the tables, the best policy and the manifest."""
+    """Return what a checkpoint holds besides the state: the tables, the best policy and the manifest."""
     paths = [*map(run.table, TABLES), run.policy_file("best")]
     contents = {path.name: path.read_bytes() for path in paths if path.exists()}
     return {**contents, MANIFEST: written(run.manifest)}

@@ -1,4 +1,4 @@
-"""How trees of arrays are laid out: packed into few buffers, with or without an axis of seeds, and by name in files."""
+"""Layouts of trees of arrays: packed into few buffers, with or without an axis of seeds, and by name in files."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 class Packing:
-    """How the leaves of a tree become buffers: the small floats in one row, then the other leaves in their order.
+    """Converts a tree to buffers and back: one row of all small float leaves, then the other leaves in their order.
 
-    Each buffer that enters and leaves a program costs, however little is in it. A leaf of fewer than `below` elements
-    is small; `tree` may hold shapes instead of arrays.
+    Each buffer passed to or from a program costs time, however small it is. A leaf of fewer than `below` elements is
+    small; `tree` may hold shapes instead of arrays.
     """
 
     def __init__(self, tree: Any, below: int) -> None:
@@ -26,14 +26,14 @@ class Packing:
         self._is_small = [leaf.dtype == jnp.float32 and leaf.size < below for leaf in leaves]
 
     def pack(self, tree: Any) -> list[jax.Array]:
-        """Return the buffers: a row of all small floats, [their number], then the other leaves as they are."""
+        """Return the buffers: a row of all small floats, then the other leaves as they are."""
         leaves = jax.tree.leaves(tree)
         small = [leaf.ravel() for leaf, is_small in zip(leaves, self._is_small, strict=True) if is_small]
         others = [leaf for leaf, is_small in zip(leaves, self._is_small, strict=True) if not is_small]
         return [jnp.concatenate([jnp.zeros(0), *small]), *others]
 
     def unpack(self, buffers: Sequence[Any]) -> Any:
-        """Return the tree; leading axes of the buffers are those of its leaves. NumPy arrays give views."""
+        """Return the tree; its leaves have the leading axes of the buffers. NumPy buffers give views."""
         row, others = buffers[0], iter(buffers[1:])
         leaves, end = [], 0
         for shape, is_small in zip(self._shapes, self._is_small, strict=True):
@@ -46,10 +46,10 @@ class Packing:
 
 
 class Parcel:
-    """Float32 arrays and a whole number as one row on their way from the host to a program, and what they are there.
+    """Packs float32 arrays and an integer into one row on the host, and unpacks them in a program.
 
-    A GPU is sent each array for itself, and each takes time however small it is. The row is of integers: they reach
-    the program as they are, where a float that is the image of a small integer might be taken for zero.
+    Each array is a separate transfer to a GPU, which takes time however small it is. The row is int32, since integers
+    arrive unchanged, while a float with the bits of a small integer might be flushed to zero.
     """
 
     def __init__(self, *shapes: tuple[int, ...]) -> None:
@@ -66,52 +66,52 @@ class Parcel:
         return row
 
     def unpack(self, row: jax.Array) -> list[jax.Array]:
-        """Return the arrays, and last the number."""
+        """Return the arrays, then the number."""
         floats = jax.lax.bitcast_convert_type(row[:-1], jnp.float32)
         return [*(floats[place].reshape(shape) for shape, place in self._parts), row[-1]]
 
 
 class SeedAxis:
-    """The axis of seeds: the leading one of all arrays, and left out where a seed is alone.
+    """The axis of seeds: the leading one of all arrays, left out if there is only one seed.
 
-    For an axis of size one XLA transposes the weight gradients, which costs 4-8 % of an update.
+    With an axis of size one XLA transposes the weight gradients, which costs 4-8 % of an update.
     """
 
     def __init__(self, seeds: int) -> None:
         self.seeds, self._is_alone = seeds, seeds == 1
 
     def map(self, program: Callable, in_axes: Any = 0) -> Callable:
-        """Return a program of one seed as one of all; `in_axes`, as for `jax.vmap`, says what they share."""
+        """Return a program of one seed mapped over all seeds; `in_axes` as for `jax.vmap`."""
         return program if self._is_alone else jax.vmap(program, in_axes)
 
     def stack(self, arrays: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the arrays of the seeds, one each, as one."""
+        """Stack one array per seed into one array."""
         return arrays[0] if self._is_alone else np.stack(arrays)
 
     def of(self, tree: Any, index: int) -> Any:
-        """Return what the seed at this place has of a tree; NumPy arrays give views."""
+        """Return the part of a tree that belongs to the seed at this index; NumPy arrays give views."""
         return tree if self._is_alone else jax.tree.map(lambda leaf: leaf[index], tree)
 
     def strip(self, array: np.ndarray) -> np.ndarray:
-        """Return an array [seed, ...] as `map`'s programs take it."""
+        """Return an array [seed, ...] in the form that the programs of `map` take."""
         return array[0] if self._is_alone else array
 
     def restore(self, array: np.ndarray) -> np.ndarray:
-        """Return what `map`'s programs give as an array [seed, ...]."""
+        """Return an array that the programs of `map` returned as [seed, ...]."""
         return array[None] if self._is_alone else array
 
 
 def by_name(tree: Any) -> dict[str, Any]:
-    """Return the leaves of a tree by where they are in it, such as `actor.layers.0.weight`.
+    """Return the leaves of a tree by their path, such as `actor.layers.0.weight`.
 
-    These names stand in checkpoints: they hang on the tree alone, and not on how JAX prints a path.
+    Checkpoints contain these names, so they depend only on the tree, not on how JAX prints a path.
     """
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {".".join(_part(step) for step in path): leaf for path, leaf in leaves}
 
 
 def _part(step: Any) -> str:
-    """Return one step of a path: a field's name, a dictionary's key, or a place in a sequence."""
+    """Return one step of a path: a field's name, a dictionary's key, or an index in a sequence."""
     if isinstance(step, jax.tree_util.GetAttrKey):
         return step.name
     if isinstance(step, jax.tree_util.SequenceKey):

@@ -1,4 +1,4 @@
-"""What one process trains: the runs of a program, how they are chosen, and how much memory they take."""
+"""The runs that one process trains as a program: how they are grouped, and how much memory they take."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ if TYPE_CHECKING:
     from csac.tasks.registry import Task
     from csac.types import Algorithm, Spec
 
-PROCESSES_PER_GPU = 4  # eight were in each other's way
-SEEDS_PER_GPU_PROCESS = 5  # with fewer, one more process gains little
-# Measured resident size of a process with JAX, MuJoCo and the compiled programs, before its replay; CUDA adds.
+PROCESSES_PER_GPU = 4  # eight slowed each other down
+SEEDS_PER_GPU_PROCESS = 5  # with fewer, another process gains little
+# Measured resident size of a process with JAX, MuJoCo and the compiled programs, without its replay; more with CUDA.
 BYTES_PER_PROCESS, BYTES_PER_GPU_PROCESS = 600 * 2**20, 1_300 * 2**20
 BYTES_PER_EVALUATION_PROCESS = 80 * 2**20  # on MuJoCo, without JAX; PyBullet takes several times that
 
 
 class Program(NamedTuple):
-    """The runs that one process trains together, and how. Nothing here changes what they compute but `threads`."""
+    """The runs that one process trains together, and how. Of the settings, only `threads` changes the numbers."""
 
     directories: tuple[Path, ...]
     algorithm: Algorithm
     task: Task
     threads: int
-    """Cores that XLA divides its work for."""
+    """Cores among which XLA divides its work."""
     evaluation_processes: int | None = 0
-    """Of a template, None chooses."""
+    """How many processes evaluate; None, only in a template, has `programs_of` choose."""
     environment_processes: int | None = 0
-    """How many share the environments; None chooses by what a step costs."""
+    """How many processes share the environments; None chooses by what a step costs."""
     tensorboard: bool = True
     wandb: bool | str = False
     hears: Hears = Hears()
-    """What callbacks are told of, which training waits for."""
+    """The events that are sent to callbacks; training waits for each call."""
     command: str | None = None
 
 
@@ -57,9 +57,9 @@ def choose_groups(
     device: str,
     *sent: Any,
 ) -> list[list[int]]:
-    """Return the seeds of each program: as they were, as asked for, or as pays here.
+    """Return the seeds of each program: as recorded in existing runs, as requested, or as is fastest here.
 
-    A program's process is `sent` its task and its algorithm: where that cannot be, all seeds train together, in ours.
+    By default all seeds train together if one of `sent`, the task and the algorithm, cannot be sent to a process.
     """
     known = {existing[seed].manifest.program for seed in seeds if seed in existing}
     together = [[seed for seed in group if seed in seeds] for group in sorted(known) if len(group) > 1]
@@ -77,9 +77,9 @@ def choose_groups(
 def programs_of(
     template: Program, directories: Sequence[Sequence[Path]], existing: Mapping[int, RunDirectory], config: RunConfig
 ) -> list[Program]:
-    """Return a program like `template` for each group of directories, which share the cores and processes.
+    """Return a program like `template` for each group of directories, with its share of the cores and processes.
 
-    Raises InputError for what cannot be sent to a process.
+    Raises InputError for numbers out of range, and for a task or an algorithm that cannot be sent to another process.
     """
     cores = cores_to_use()
     threads = max(1, cores // len(directories))
@@ -89,9 +89,9 @@ def programs_of(
     spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
     processes = template.evaluation_processes
     if processes is None:
-        pays = spare > 0 and not template.hears.evaluations and 0 < config.evaluation_interval < config.steps
-        pays = pays and config.evaluation_environments > 0
-        processes = min(batches, max(1, spare // len(directories))) if pays and has_processes else 0
+        is_worthwhile = spare > 0 and not template.hears.evaluations and 0 < config.evaluation_interval < config.steps
+        is_worthwhile = is_worthwhile and config.evaluation_environments > 0
+        processes = min(batches, max(1, spare // len(directories))) if is_worthwhile and has_processes else 0
     check_whole("evaluation_processes", processes, 0, 1_000)
     if not config.evaluation_environments and max(config.environments, *map(len, directories)) > 1:
         raise InputError("evaluation_environments=0 is for one environment of one seed: have one seed per process")
@@ -104,12 +104,12 @@ def programs_of(
             f"the {name} cannot be sent to another process: define it in a module that can be imported, or train "
             "with seeds_per_process=seeds, evaluation_processes=0 and environment_processes=0"
         )
-    how = {"threads": threads, "evaluation_processes": processes, "environment_processes": stepping}
-    return [template._replace(directories=tuple(group), **how) for group in directories]
+    settings = {"threads": threads, "evaluation_processes": processes, "environment_processes": stepping}
+    return [template._replace(directories=tuple(group), **settings) for group in directories]
 
 
 def can_be_sent(task: Task | Algorithm) -> bool:
-    """Return whether another process can be sent a task or an algorithm: it cannot import what a notebook defined."""
+    """Return whether a task or an algorithm can be sent to another process, which cannot import from a notebook."""
     has_script, maker = script() is not None, task
     if isinstance(task, str):
         known = gymnasium.registry.get(task)
@@ -117,20 +117,20 @@ def can_be_sent(task: Task | Algorithm) -> bool:
             return True
         maker = known.entry_point
     try:
-        sent = pickle.dumps(maker)
+        pickled = pickle.dumps(maker)
     except Exception:
         return False
-    return has_script or b"__main__" not in sent
+    return has_script or b"__main__" not in pickled
 
 
 def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at_once: int) -> str:
-    """Return the line that predicts the memory of programs, `at_once` at a time. Raises InputError for too much."""
+    """Return a line that predicts the memory of programs, `at_once` at a time. Raises InputError if it is too much."""
     programs = programs[:at_once]
     per_seed = _bytes_per_seed(programs[0].algorithm, config, spec)
     seeds = sum(len(program.directories) for program in programs)
-    evaluating = sum((program.evaluation_processes or 0) + (program.environment_processes or 0) for program in programs)
+    helpers = sum((program.evaluation_processes or 0) + (program.environment_processes or 0) for program in programs)
     per_process = BYTES_PER_GPU_PROCESS if config.device == "gpu" else BYTES_PER_PROCESS
-    needed = seeds * per_seed + len(programs) * per_process + evaluating * BYTES_PER_EVALUATION_PROCESS
+    needed = seeds * per_seed + len(programs) * per_process + helpers * BYTES_PER_EVALUATION_PROCESS
     available, limit = psutil.virtual_memory().available, memory_left()
     available = available if limit is None else min(available, limit)
     if needed > available:
@@ -138,7 +138,7 @@ def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at
             f"this needs about {needed / 2**30:,.1f} GiB of memory and {available / 2**30:.1f} GiB are available: "
             f"use fewer seeds, a smaller replay or batch (one seed takes {per_seed / 2**30:,.2f} GiB)"
         )
-    processes = len(programs) + evaluating
+    processes = len(programs) + helpers
     return (
         f"memory: about {needed / 2**30:.1f} GiB of the {available / 2**30:.1f} GiB available "
         f"({seeds} x {per_seed / 2**20:.0f} MiB, {processes} process{'es' if processes > 1 else ''})"
@@ -146,17 +146,17 @@ def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at
 
 
 def _bytes_per_seed(algorithm: Algorithm, config: RunConfig, spec: Spec) -> int:
-    """Return the size of what a seed learns and remembers, and of what one update needs beside it.
+    """Return the size of a seed's state and memory, and of the temporary arrays of one update.
 
-    The latter is the batch, and for each of its transitions a number for every unit of the networks, of which a matrix
-    of weights has as many as columns.
+    The latter are the batch, and for each of its transitions one number per unit of the networks; a weight matrix has
+    as many units as columns.
     """
     steps, transitions = config.steps, config.steps + config.extra_transitions
     key = jax.ShapeDtypeStruct((2,), "uint32")
     state, memory = jax.eval_shape(
         lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, transitions)), key
     )
-    jax.eval_shape(lambda state: algorithm.policy(state).parameters, state)  # refuses networks that cannot leave
+    jax.eval_shape(lambda state: algorithm.policy(state).parameters, state)  # refuses networks that cannot be exported
     units = sum(leaf.shape[-1] for leaf in jax.tree.leaves(state) if len(leaf.shape) == 2)
     kept = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((state, memory)))
     return kept + 4 * algorithm.cadence.transitions_per_update * (memory.rows.shape[1] + units)

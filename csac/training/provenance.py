@@ -1,4 +1,4 @@
-"""Where a run is made: the machine, the versions, csac's own commit. What the manifest remembers of it."""
+"""Where a run is made, for its manifest: the machine, the package versions and csac's own commit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def provenance(task: Task, command: str | None, threads: int) -> dict[str, Any]:
-    """Return these fields of a manifest, of a process whose device has been chosen."""
+    """Return these fields of a manifest for this process, whose device must have been chosen."""
     machine = Machine(_processor(), threads, platform.node(), **in_use())
     return {
         "machine": machine,
@@ -31,7 +31,7 @@ def provenance(task: Task, command: str | None, threads: int) -> dict[str, Any]:
 
 
 def _versions(task: Task, on_gpu: bool) -> dict[str, str]:
-    """Return the versions of what decides the numbers; on a GPU also those of its libraries, whatever they are."""
+    """Return the versions of the packages that affect the numbers; on a GPU also those of all its libraries."""
     robots = ("pybullet", "PyFlyt", "panda-gym") if adapter_of(task) else ()
     versions = {"csac": __version__, "python": platform.python_version()}
     for package in ("jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco", *robots):
@@ -46,7 +46,7 @@ def _versions(task: Task, on_gpu: bool) -> dict[str, str]:
 
 
 def _processor() -> str:
-    """Return the processor's model, as far as the system tells."""
+    """Return the processor's model, as far as the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -58,7 +58,7 @@ def _processor() -> str:
 def _commit() -> str | None:
     """Return the commit of csac's own checkout, if it runs from one."""
     try:
-        # Installed into an environment inside of somebody's repository, its files are none of that repository's.
+        # csac may be installed inside somebody else's repository, which does not track its files.
         _git("ls-files", "--error-unmatch", Path(__file__).name)
         return _git("rev-parse", "HEAD").strip() or None
     except (OSError, subprocess.SubprocessError):
@@ -66,6 +66,6 @@ def _commit() -> str | None:
 
 
 def _git(*arguments: str) -> str:
-    """Return what git says in the folder of this file. Raises OSError or SubprocessError."""
+    """Return the output of git in the folder of this file. Raises OSError or SubprocessError."""
     command = ["git", "-C", Path(__file__).parent, *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout

@@ -1,4 +1,4 @@
-"""Resuming a run or starting one from another's checkpoint: what is refused, what may change, what is rolled back."""
+"""Resuming and forking runs: which changes are refused, which are allowed, and what is rolled back."""
 
 from __future__ import annotations
 
@@ -37,36 +37,36 @@ if TYPE_CHECKING:
     from csac.training.config import TrainOptions
     from csac.types import Algorithm, Spec
 
-# What a checkpoint's networks and optimisers are made for.
+# Hyperparameters that a checkpoint's networks and optimisers depend on.
 _KINDS = ("activation", "layer_norm")
 _LEARNT_WITH = (
     *("normalise_observations", "normalise_rewards", "learning_rate_schedule"),
     *(f"{network}{kind}" for network in ("", "actor_", "critic_") for kind in _KINDS),
 )
 
-# What may differ when a run goes on; with any other value it would be another run.
+# The only fields of the configuration that may change when a run is resumed.
 _MAY_DIFFER = ("steps", "device", "checkpoint_interval", "keep_checkpoints")
 
 
 class ResumePoint(NamedTuple):
-    """Where a run goes on: its checkpoint, None for its beginning, and what the user should know of it."""
+    """Where a run resumes: its checkpoint, or None for its beginning, and notes for the user."""
 
     checkpoint: Checkpoint | None
     notes: list[str]
 
     @property
     def step(self) -> int:
-        """The step of the checkpoint; 0 is the beginning."""
+        """The step of the checkpoint, or 0 for the beginning."""
         return self.checkpoint.step if self.checkpoint else 0
 
 
 def refuse_differences(run: RunDirectory, wanted: RunConfig, has_schedule: bool) -> None:
-    """Raise InputError, with what differs, where `wanted` is not a continuation of `run`."""
+    """Raise InputError, with what differs, if `wanted` is not a continuation of `run`."""
     before = run.config
-    made, asked = _fixed(before), _fixed(wanted)
-    if before.algorithm != wanted.algorithm:  # whose hyperparameters are others
-        made, asked = {"algorithm": before.algorithm}, {"algorithm": wanted.algorithm}
-    if found := differences(made, asked):
+    old, new = _fixed(before), _fixed(wanted)
+    if before.algorithm != wanted.algorithm:  # their hyperparameters are not comparable
+        old, new = {"algorithm": before.algorithm}, {"algorithm": wanted.algorithm}
+    if found := differences(old, new):
         advice = f"choose another directory, or resume it as it was: csac resume {run.path}"
         raise InputError(f"config differs from the saved run {run.path}: {'; '.join(found)}; {advice}")
     if wanted.steps < before.steps:
@@ -77,9 +77,9 @@ def refuse_differences(run: RunDirectory, wanted: RunConfig, has_schedule: bool)
 
 
 def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
-    """Bring runs that share a program back to their newest common sound checkpoint, or to their beginning.
+    """Roll the runs of a program back to their newest common sound checkpoint, or to their beginning.
 
-    Raises InputError where no checkpoint is sound, or there are results and no checkpoint to go on from.
+    Raises InputError if no checkpoint is sound, or if there are results but no checkpoint to resume from.
     """
     for run in runs:
         _remove_unfinished(run)
@@ -94,7 +94,7 @@ def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
 
 
 def refuse_lost(run: RunDirectory) -> None:
-    """Raise InputError where a run has no sound checkpoint to go on from, and cannot begin anew."""
+    """Raise InputError if a run has no sound checkpoint to resume from, and cannot restart from the beginning."""
     _find(run, None)
 
 
@@ -104,14 +104,14 @@ def _find(run: RunDirectory, until: int | None) -> ResumePoint:
         raise InputError(f"no checkpoint of {run.path} is sound ({'; '.join(complaints)}): restore one, or train anew")
     if checkpoint is None and run.manifest.forked_from:
         raise InputError(f"{run.path} was stopped before its first checkpoint: repeat its command in a new directory")
-    is_all_there_is = run.manifest.state == "finished" or not run.config.checkpoint_interval
-    if checkpoint is None and is_all_there_is and any(len(run.rows(table)) for table in TABLES):
+    results_are_final = run.manifest.state == "finished" or not run.config.checkpoint_interval
+    if checkpoint is None and results_are_final and any(len(run.rows(table)) for table in TABLES):
         raise InputError(f"{run.path} has results and no checkpoint to go on from: train in another directory")
     return ResumePoint(checkpoint, [f"warning: {text}; an earlier checkpoint is used" for text in complaints])
 
 
 def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
-    """Bring tables and the best policy back to a checkpoint; return a line for each that was damaged."""
+    """Restore the tables and the best policy from a checkpoint; return a warning for each that was damaged."""
     checkpoint, notes = point.checkpoint, []
     if checkpoint:
         prune(run.checkpoints, 0, newest=checkpoint.step)
@@ -138,7 +138,7 @@ def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
 
 
 def _remove_unfinished(run: RunDirectory) -> None:
-    """Remove what a process was writing when it was killed."""
+    """Remove the files that a process was writing when it was killed."""
     for path in [
         *run.path.glob(".*.*"),
         *run.policies.glob(".*"),
@@ -148,9 +148,9 @@ def _remove_unfinished(run: RunDirectory) -> None:
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
-def continuation(manifest: Manifest, now_: Manifest, point: ResumePoint) -> tuple[Continuation, list[str]]:
-    """Return what the manifest remembers of a resume, and the lines for the user."""
-    changes = machine_changes(manifest, now_)
+def continuation(manifest: Manifest, current: Manifest, point: ResumePoint) -> tuple[Continuation, list[str]]:
+    """Return the entry of a resume in the manifest's history, and the lines for the user."""
+    changes = machine_changes(manifest, current)
     lines = [*point.notes, f"resuming at step {point.step:,}" if point.step else "no checkpoint yet: starting anew"]
     if changes:
         lines.append(f"note: not bit for bit the same from here on: {' and '.join(changes)}")
@@ -164,11 +164,11 @@ def continuation(manifest: Manifest, now_: Manifest, point: ResumePoint) -> tupl
         "versions": manifest.versions,
         "commit": manifest.commit,
     }
-    return Continuation(now(), point.step, exact, tuple(point.notes), now_.command, previous), lines
+    return Continuation(now(), point.step, exact, tuple(point.notes), current.command, previous), lines
 
 
 def record_inexact(run: RunDirectory, note: str) -> None:
-    """Record in the manifest why the resume in progress is not exact; a fork's beginning is no resume."""
+    """Record in the manifest why the resume in progress is not exact; the start of a fork is not a resume."""
     if run.manifest.history:
         *before, entry = run.manifest.history
         entry = replace(entry, exact=False, notes=(*entry.notes, note))
@@ -176,7 +176,7 @@ def record_inexact(run: RunDirectory, note: str) -> None:
 
 
 def machine_changes(before: Manifest, current: Manifest) -> list[str]:
-    """Return what decides the last bits of a run and is not what it was."""
+    """Return which of the things that affect the last bits of a run's numbers have changed."""
     pairs: dict[str, tuple[Any, Any]] = {
         "processor": (before.machine.processor, current.machine.processor),
         "number of cores": (before.machine.cores, current.machine.cores),
@@ -191,8 +191,8 @@ def machine_changes(before: Manifest, current: Manifest) -> list[str]:
     return [f"the {name} was {old} and is {new}" for name, (old, new) in pairs.items() if old != new]
 
 
-def as_begun(run: RunDirectory, options: TrainOptions) -> TrainOptions:
-    """Return the options of runs that have begun with others' checkpoints, which may be gone or have trained on."""
+def fork_options(run: RunDirectory, options: TrainOptions) -> TrainOptions:
+    """Return the options to resume existing forks with, without their sources: these may be gone or have trained on."""
     config, origin, given = run.config, run.manifest.forked_from, options.get("perturbations")
     planned: Any = config.perturbations
     if given is not None and origin:
@@ -202,7 +202,7 @@ def as_begun(run: RunDirectory, options: TrainOptions) -> TrainOptions:
 
 
 class Source(NamedTuple):
-    """Checkpoints, all of one step, that new runs begin with: one for each seed."""
+    """Checkpoints of one step, one for each seed, from which new runs are forked."""
 
     path: Path
     runs: dict[int, RunDirectory]
@@ -213,7 +213,7 @@ class Source(NamedTuple):
     def find(cls, where: str | Path, seeds: Sequence[int]) -> Source:
         """Return the checkpoints at `DIRECTORY` (the newest) or `DIRECTORY@STEP`, of a set or of one run.
 
-        Raises InputError where there is no such run, seed or checkpoint, or a damaged one.
+        Raises InputError if there is no such run, seed or checkpoint, or if it is damaged.
         """
         name, at, text = str(where).rpartition("@")
         has_step = bool(at) and not os.path.exists(where)
@@ -226,12 +226,12 @@ class Source(NamedTuple):
         return cls(found.path, runs, checkpoints, step)
 
     def perturbations(self, seed: int, given: Any) -> tuple[str, ...]:
-        """Return those of the run before the checkpoint and those `given`; with None those that it had planned."""
+        """Return the source's perturbations before the checkpoint and those `given`, or with None all the source's."""
         planned = perturbations_of(self.runs[seed].config.perturbations)
         return tuple(map(str, planned if given is None else continued(planned, perturbations_of(given), self.step)))
 
     def refuse_incompatible(self, wanted: RunConfig, has_schedule: bool) -> None:
-        """Raise InputError where a new run of this configuration cannot begin with its checkpoint."""
+        """Raise InputError if a new run of this configuration cannot start from its checkpoint."""
         before = self.runs[wanted.seed].config
         if before.algorithm != wanted.algorithm:
             raise InputError(f"{self.path} does not fit: its algorithm is {before.algorithm}, not {wanted.algorithm}")
@@ -254,14 +254,14 @@ class Source(NamedTuple):
             raise InputError(f"steps counts from the beginning: give more than the {self.step:,} made already")
 
     def refuse_misfit(self, algorithm: Algorithm, spec: Spec, wanted: RunConfig) -> None:
-        """Raise InputError where what was learnt is of another form than what the new run would learn."""
+        """Raise InputError if the checkpoint's learned state does not fit the new run's algorithm and task."""
         learnt = self.checkpoints[wanted.seed].state().part("learner")
         if problem := incompatibility(algorithm, spec, wanted.steps, learnt):
             found = [*differences(_fixed(self.runs[wanted.seed].config), _fixed(wanted)), problem]
             raise InputError(f"{self.path} does not fit: {'; '.join(found)}")
 
-    def begun(self, manifest: Manifest) -> Manifest:
-        """Return the manifest with which a new run begins."""
+    def forked_manifest(self, manifest: Manifest) -> Manifest:
+        """Return the manifest of a new run, with its origin."""
         before = self.runs[manifest.config.seed]
         changes = tuple(differences(_fixed(before.config), _fixed(manifest.config)))
         origin = Origin(str(before.path), self.step, changes)
@@ -269,29 +269,29 @@ class Source(NamedTuple):
         return replace(manifest, forked_from=origin, restarts_episode=restarts)
 
     def copy_to(self, run: RunDirectory) -> None:
-        """Give a new run the tables and the checkpoint; transitions get a second name where the disk can."""
+        """Copy the tables and the checkpoint to a new run; transitions are hard-linked if the file system can."""
         checkpoint = self.checkpoints[run.seed]
         (run.checkpoints / REPLAY).mkdir(parents=True, exist_ok=True)
-        own: dict[str, bytes] = {}
+        contents: dict[str, bytes] = {}
         for name in checkpoint.files:
             if name.startswith(f"{REPLAY}/"):
                 target = run.checkpoints / name
                 target.unlink(missing_ok=True)
                 try:
                     os.link(checkpoint.folder / name, target)
-                except OSError:  # the file system has no links
+                except OSError:  # the file system has no hard links
                     write_atomically(target, checkpoint.read(name))
                 continue
-            own[name] = checkpoint.read(name)
+            contents[name] = checkpoint.read(name)
             if name.endswith(".csv"):
-                write_atomically(run.path / name, own[name])
+                write_atomically(run.path / name, contents[name])
         folder = checkpoint.folder / f"step_{checkpoint.step}"
-        own["checkpoint.json"] = (folder / "checkpoint.json").read_bytes()
-        write_folder(run.checkpoints / folder.name, own)
+        contents["checkpoint.json"] = (folder / "checkpoint.json").read_bytes()
+        write_folder(run.checkpoints / folder.name, contents)
 
 
 def _fixed(config: RunConfig) -> dict[str, Any]:
-    """Return what may not differ; a hyperparameter that is newer than the run has its default."""
+    """Return the fields that must not differ; a hyperparameter newer than the run has its default."""
     fixed = {name: value for name, value in asdict(config).items() if name not in _MAY_DIFFER}
     if config.algorithm in ALGORITHMS:
         fixed["hyperparameters"] = asdict(ALGORITHMS[config.algorithm]()) | config.hyperparameters

@@ -1,4 +1,4 @@
-"""Trains the runs of one program in this process, from their newest checkpoint or their beginning."""
+"""Train the runs of one program in this process: lock them, roll them back, and run the training loop."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], bool]) -> None:
     """Train the runs of a program in this process, from their newest checkpoint or their beginning.
 
-    Raises InputError where a run is in use or cannot go on, StorageFailure as `train`.
+    Raises InputError if a run is in use or cannot resume, and StorageFailure as `train`.
     """
     runs = [RunDirectory.open(path) for path in program.directories]
     with ExitStack() as stack, storage_failures(runs[0].path.parent):
         for run in runs:
             stack.enter_context(run.locked())
-            run.manifest = RunDirectory.open(run.path).manifest  # as another process left it before we had the lock
+            run.manifest = RunDirectory.open(run.path).manifest  # may have changed before we got the lock
         choose_device(runs[0].config.device)
         seed_globals(runs[0].seed)
         points = roll_back(runs)
@@ -48,15 +48,15 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
         try:
             loop.run(should_stop)
         finally:
-            is_short = loop.step < loop.steps or loop.evaluations.broken_off is not None
-            stopped = not loop.has_returned or (is_short and should_stop())
+            is_incomplete = loop.step < loop.steps or loop.evaluations.broken_off is not None
+            stopped = not loop.has_returned or (is_incomplete and should_stop())
             for run in runs:
                 if run.manifest.state == "running":
                     run.update_manifest(state="interrupted" if stopped else "finished")
 
 
 def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], watcher: Watcher) -> None:
-    """Record in a run's manifest where and how it begins or goes on."""
+    """Record in a run's manifest where and how it begins or resumes."""
     before, history = run.manifest, run.manifest.history
     after = dataclasses.replace(before, **current)
     if before.process is not None:
@@ -65,15 +65,15 @@ def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], 
         for line in lines:
             run.log(line)
             watcher.note(f"seed {run.seed}: {line}")
-    is_resting = before.state == "failed" and point.checkpoint and not point.checkpoint.values["environment"]["alive"]
-    state = {} if is_resting else {"state": "running", "failure": ""}
+    stays_failed = before.state == "failed" and point.checkpoint and not point.checkpoint.values["environment"]["alive"]
+    state = {} if stays_failed else {"state": "running", "failure": ""}
     run.update_manifest(**current, **state, history=history, steps_done=point.step)
 
 
 def begin_with(threads: int) -> None:
-    """Have XLA divide its work for so many cores, and let this process run on every one.
+    """Have XLA divide its work for this many cores, while this process may run on every core.
 
-    XLA sizes its threads by the cores that it sees when JAX first looks for devices; later this does nothing.
+    XLA sizes its thread pool by the cores that it sees when JAX first looks for devices; later this has no effect.
     """
     import jax
 

@@ -1,4 +1,4 @@
-"""One supervisor for whatever trains in processes: starts them, passes messages and signals on, restarts the dead."""
+"""Supervise training processes: start them, pass on their messages and signals, restart those that die."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from csac.training.callbacks import Answer, Event
     from csac.training.program import Program
 
-SECONDS_TO_CLOSE = 5.0  # that a process has to close its environments
+SECONDS_TO_CLOSE = 5.0  # for a process to close its environments
 
 
 def supervise(
@@ -35,13 +35,13 @@ def supervise(
     workers: int,
     turns: int | None = None,
 ) -> None:
-    """Run each program in a process of its own, `workers` at a time, until all are over or stopped.
+    """Run each program in its own process, `workers` at a time, until all have ended or been stopped.
 
-    `watcher_of` returns who is told about a program. A process that dies is replaced once: its runs resume from their
-    newest checkpoint. If it dies again, they fail. With `turns`, so many processes train at a time, a few hundred steps
-    each, and the one furthest behind comes next: five that share two cores at will make four fifths of the steps.
-    Raises InputError where a program's arguments are wrong, such as a checkpoint that does not fit, and StorageFailure
-    where a run directory can no longer be written; the other programs are stopped and saved.
+    `watcher_of` returns the watcher of a program. A process that dies is replaced once: its runs resume from their
+    newest checkpoint. If it dies again, they fail. With `turns`, only this many processes train at a time, a few
+    hundred steps each, and the one furthest behind is next: five that share two cores freely make four fifths of the
+    steps. Raises InputError if a program's arguments are wrong, such as a checkpoint that does not fit, and
+    StorageFailure if a run directory can no longer be written; the other programs are stopped and saved.
     """
     waiting, running, over = deque(programs), {}, []
     restarted: set[tuple[Path, ...]] = set()
@@ -57,7 +57,7 @@ def supervise(
             _give_turns(running.values(), turns)
             ready = set(wait(list(running), timeout=0.1))
             for worker in list(running.values()):
-                is_dead = worker.process.exitcode is not None  # a helper of its task may keep its pipe open
+                is_dead = worker.process.exitcode is not None  # a subprocess of its task may keep the pipe open
                 if worker.connection not in ready and not is_dead:
                     continue
                 message = worker.receive()
@@ -83,7 +83,7 @@ def supervise(
 
 
 def _give_turns(workers: Iterable[_Worker], turns: int | None) -> None:
-    """Give free turns to the workers that wait for one and are furthest behind."""
+    """Give free turns to those of the waiting workers that are furthest behind."""
     workers = list(workers)
     waiting = sorted((worker for worker in workers if worker.has_turn is False), key=lambda worker: worker.step)
     free = len(workers) if turns is None else turns - sum(worker.has_turn is True for worker in workers)
@@ -95,13 +95,13 @@ def _give_turns(workers: Iterable[_Worker], turns: int | None) -> None:
 def _replace(
     worker: _Worker, watcher: Watcher, restarted: set[tuple[Path, ...]], errors: list[Exception]
 ) -> list[Program]:
-    """Return the program to start again, or note how its runs failed."""
+    """Return the program if it is to restart, or record how its runs failed."""
     try:
         reason = worker.cause_of_death()
     except InputError as error:
         errors.append(error)
         return []
-    if worker.is_stopping:  # its runs go on from their newest checkpoint when they are resumed
+    if worker.is_stopping:  # `resume` continues its runs from their newest checkpoint
         return []
     runs = [RunDirectory.open(path) for path in worker.program.directories]
     if worker.program.directories not in restarted:
@@ -125,11 +125,11 @@ class _Worker(Child):
     def __init__(self, program: Program) -> None:
         super().__init__(_work, program)
         self.program, self.is_stopping = program, False
-        self.has_turn: bool | None = None  # False while it waits for one, None before it has asked
+        self.has_turn: bool | None = None  # False while it waits for one, None before it first asks
         self.step = 0
 
     def receive(self) -> tuple[Any, ...] | None:
-        """Return the next message, or None where the process is gone."""
+        """Return the next message, or None if the process is gone."""
         with suppress(EOFError, OSError):
             if self.connection.poll(0.0) or self.process.exitcode is None:
                 return self.connection.recv()
@@ -143,7 +143,7 @@ class _Worker(Child):
 
 
 def _work(connection: Connection, program: Program) -> None:
-    """Train a program in a process of its own."""
+    """Train a program; runs in the child process."""
     from csac.training.running import begin_with, train_program  # JAX
 
     begin_with(program.threads)
@@ -163,7 +163,7 @@ def _work(connection: Connection, program: Program) -> None:
 
 
 def record_failure(program: Program, watcher: Watcher, error: Exception) -> None:
-    """Write down that the runs of a program failed by an error that nobody foresaw, and tell it."""
+    """Record and report that the runs of a program failed with an unexpected error."""
     reason = one_line(error)
     for path in program.directories:
         run = RunDirectory.open(path)
@@ -173,7 +173,7 @@ def record_failure(program: Program, watcher: Watcher, error: Exception) -> None
 
 
 class _RemoteWatcher(Watcher):
-    """Hands what happens to the parent, and hears from it in a thread of its own."""
+    """Sends events to the parent process, and receives its messages in a separate thread."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -191,9 +191,9 @@ class _RemoteWatcher(Watcher):
             self._turns.get()
 
     def call(self, event: Event) -> Answer:
-        is_heard = not self.stopped.is_set()
+        expects_answer = not self.stopped.is_set()
         self.send("call", event)
-        answer = self._answers.get() if is_heard else STOPPED
+        answer = self._answers.get() if expects_answer else STOPPED
         if answer.failed:
             self.stopped.set()
         return answer

@@ -1,4 +1,4 @@
-"""`train` and `resume`: one call to a set of trained runs; `csac train` and `csac resume` call nothing else."""
+"""`train` and `resume`, which train seeds and return their runs. `csac train` and `csac resume` only call these."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, labels, make_configs
 from csac.training.devices import choose_device
 from csac.training.program import Program, choose_groups, memory_needed, programs_of
-from csac.training.resume import Source, as_begun, refuse_differences, refuse_lost
+from csac.training.resume import Source, fork_options, refuse_differences, refuse_lost
 from csac.training.running import begin_with, train_program
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.supervisor import supervise
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     OnEvaluation = Callable[[int, dict[int, float]], Any]
     StopWhen = Callable[[int, dict[int, float]], bool]
 
-PROCESSES_PER_CORE = 4  # more only cost memory: further seeds wait for their turn
+PROCESSES_PER_CORE = 4  # more would only cost memory: further seeds wait
 
 
 def train(
@@ -71,40 +71,40 @@ def train(
 ) -> TrainedRuns:
     """Train independent seeds of an algorithm on a task and return their runs.
 
-    Several seeds train in processes of their own, so a script needs the usual `if __name__ == "__main__":` guard.
+    Several seeds train in separate processes, so a script needs the usual `if __name__ == "__main__":` guard.
 
     Args:
         algorithm: a hyperparameter dataclass such as `CSAC()`.
         task: a Gymnasium id, `module:Id`, or a callable that makes an environment.
         seeds: number of independent seeds.
-        first_seed: the first of them; the others are numbered from it.
-        directory: the folder of the runs, `seed-<k>` each; by default `runs/<task>/<algorithm>/<date-time>`.
-        resume: resume the runs in `directory` that are there; start the others.
-        start_from: `DIRECTORY` or `DIRECTORY@STEP` of a set or a run: begin with copies of the seeds' checkpoints.
-        seeds_per_process: seeds that share one program; by default 1 on a CPU, and a few on a GPU. With all of them
-            training stays in this process.
-        evaluation_processes: processes in which a program evaluates while it trains on; 0 evaluates in between, and so
-            does None where no core is to spare, where a callback hears evaluations (`stop_when`), or in a
-            script without a guard. The numbers are the same.
-        environment_processes: processes of a program that share its environments, at most as many (`environments`); 0
-            steps them here, None chooses by what a step costs; without a guard it is 0. The numbers are the same.
+        first_seed: the first seed; the others are numbered consecutively from it.
+        directory: the folder of the runs, each in `seed-<k>`; by default `runs/<task>/<algorithm>/<date-time>`.
+        resume: resume the runs that exist in `directory`, and start the others.
+        start_from: `DIRECTORY` or `DIRECTORY@STEP` of a set or a run: start from copies of the seeds' checkpoints.
+        seeds_per_process: seeds that share one program; by default 1 on a CPU, and a few on a GPU. If all of them share
+            one, they train in this process.
+        evaluation_processes: processes in which a program evaluates while training goes on; 0 pauses training to
+            evaluate, and so does None if no core is free, if a callback receives evaluations (such as `stop_when`), or
+            in a script without a guard. The numbers are the same.
+        environment_processes: processes that step a program's environments, at most `environments`; 0 steps them in the
+            training process, None chooses by what a step costs, 0 without a guard. The numbers are the same.
         tensorboard: whether to write TensorBoard files.
-        wandb: whether to log to Weights & Biases too (the extra `wandb`), or the project to log to.
+        wandb: whether to also log to Weights & Biases (the extra `wandb`), or the project to log to.
         progress: whether to show progress, as the command line does.
         command: the command line, for the manifest.
-        callbacks: your own code, told how training goes (`csac.training.callbacks`), in this process.
+        callbacks: your own code (`csac.training.callbacks`), called in this process as training goes on.
         on_evaluation: called as `on_evaluation(step, {seed: mean return})` after each evaluation of a program's seeds.
-        stop_when: called in the same way; those seeds end early, as finished, once it returns True.
-        **options: what a run computes, as `csac.record.config.RunConfig` explains it: `steps`, `device`,
-            `environments`, `evaluation_interval`, `evaluation_episodes`, `evaluation_environments`,
-            `evaluation_seed`, `checkpoint_interval`, `keep_checkpoints`, `environment_arguments`, `perturbations`,
-            `events`, `hindsight`; and `demonstrations`, what the replay begins with (`docs/learning-options.md`).
+        stop_when: called with the same arguments; those seeds end early, as finished, once it returns True.
+        **options: what a run computes, as documented in `csac.record.config.RunConfig`: `steps`, `device`,
+            `environments`, `evaluation_interval`, `evaluation_episodes`, `evaluation_environments`, `evaluation_seed`,
+            `checkpoint_interval`, `keep_checkpoints`, `environment_arguments`, `perturbations`, `events`, `hindsight`;
+            and `demonstrations`, with which the replay buffer starts (`docs/learning-options.md`).
 
     Raises:
-        InputError: a mistake in the arguments, or a run that cannot go on; new runs that have not begun are removed.
+        InputError: a mistake in the arguments, or a run that cannot resume; new runs that have not begun are removed.
         Interrupted: on SIGINT or SIGTERM, after everything was saved.
         StorageFailure: a run directory can no longer be written; it is as sound as if the run had been killed.
-        CallbackFailure: one of your own functions raised, after everything was saved.
+        CallbackFailure: one of your own functions raised; everything was saved.
     """
     end_if_unguarded()
     check_algorithm(algorithm)
@@ -116,19 +116,19 @@ def train(
 
     source = None
     if start_from is not None and resume and place and all(is_run(run_path(place, seed)) for seed in wanted):
-        options = as_begun(RunDirectory.open(run_path(place, wanted[0])), options)
+        options = fork_options(RunDirectory.open(run_path(place, wanted[0])), options)
     elif start_from is not None:
         source = Source.find(start_from, wanted)
     configs, demonstrations, spec, task_notes = make_configs(algorithm, task, wanted, options, source)
     choose_device(configs[0].device)  # the task's module may have changed JAX's settings
     place = place or new_set_directory(configs[0].task, configs[0].algorithm)
-    existing = _existing(place, configs, resume, source, algorithm.cadence.has_schedule)
+    existing = _existing_runs(place, configs, resume, source, algorithm.cadence.has_schedule)
     if source:
         source.refuse_misfit(algorithm, spec, configs[0])
 
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task, algorithm)
-    how = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
-    template = Program((), algorithm, task, 1, *how)
+    settings = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
+    template = Program((), algorithm, task, 1, *settings)
     directories = [[run_path(place, seed) for seed in group] for group in groups]
     programs = programs_of(template, directories, existing, configs[0])
     notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
@@ -154,14 +154,14 @@ def resume(
     on_evaluation: OnEvaluation | None = None,
     stop_when: StopWhen | None = None,
 ) -> TrainedRuns:
-    """Resume a run, or every run of a set, from its newest checkpoint; everything but `steps` comes from its manifest.
+    """Resume a run, or every run of a set, from its newest checkpoint, with the settings in its manifest.
 
-    `trust_task` lets the task, and an algorithm of one's own, import a module that nobody has named here
-    (`csac.tasks.trust`); the other arguments are those of `train`.
+    `steps` makes the runs longer. `trust_task` lets the task, or a custom algorithm, import a module that nobody has
+    named on this machine before (`csac.tasks.trust`); the other arguments are those of `train`.
 
     Raises:
-        InputError: there is no such run, it cannot go on (the message says why), or its task is a Python function:
-            call `train` with it and `resume=True` then.
+        InputError: there is no such run, it cannot resume (the message says why), or its task is a Python function:
+            then call `train` with it and `resume=True`.
         Interrupted, StorageFailure, CallbackFailure: as `train`.
     """
     end_if_unguarded()
@@ -172,16 +172,16 @@ def resume(
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
     if steps is not None:
-        longer = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
-        for run, config in zip(runs.runs, longer, strict=True):
+        configs = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
+        for run, config in zip(runs.runs, configs, strict=True):
             refuse_differences(run, config, algorithm.cadence.has_schedule)
-        _change(runs.runs, longer)
+        _set_configs(runs.runs, configs)
     existing = {run.seed: run for run in runs.runs}
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
     tensorboard = any(run.tensorboard.exists() for run in runs.runs)
     wandb = any((run.path / "wandb").exists() for run in runs.runs)
-    how = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
-    template = Program((), algorithm, config.task, 1, *how)
+    settings = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
+    template = Program((), algorithm, config.task, 1, *settings)
     programs = programs_of(template, [[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
 
@@ -197,7 +197,7 @@ def _check_arguments(resume: bool, directory: str | Path | None, wandb: bool | s
 
 
 def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
-    """Remove those of these new runs that no process has begun, and their folder if nothing else is in it."""
+    """Remove the new runs that no process has begun, and their folder if nothing else is in it."""
     for run in runs:
         if RunDirectory.open(run.path).manifest.process is None:
             shutil.rmtree(run.path)
@@ -205,8 +205,8 @@ def _remove_unbegun(place: Path, runs: Sequence[RunDirectory]) -> None:
         place.rmdir()
 
 
-def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
-    """Give each run its configuration. Raises InputError, before any is changed, where one cannot go on."""
+def _set_configs(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
+    """Give each run its new configuration. Raises InputError, before any is changed, if one cannot resume."""
     with ExitStack() as locks:
         for run in runs:
             locks.enter_context(run.locked())
@@ -215,10 +215,10 @@ def _change(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> None:
             run.update_manifest(config=config)
 
 
-def _existing(
+def _existing_runs(
     place: Path, configs: Sequence[RunConfig], resume: bool, source: Source | None, has_schedule: bool
 ) -> dict[int, RunDirectory]:
-    """Return the runs that are there and to be resumed. Raises InputError where something is in the way."""
+    """Return the existing runs, to resume them. Raises InputError if they or the directory do not allow it."""
     existing = {}
     for config in configs:
         path = run_path(place, config.seed)
@@ -228,8 +228,8 @@ def _existing(
             existing[config.seed] = run = RunDirectory.open(path)
             refuse_differences(run, config, has_schedule)
     known = (".", "seed-", "curve.png")
-    strangers = [] if existing or not place.is_dir() else [p for p in place.iterdir() if not p.name.startswith(known)]
-    if strangers or (place.exists() and not place.is_dir()):
+    unknown = [] if existing or not place.is_dir() else [p for p in place.iterdir() if not p.name.startswith(known)]
+    if unknown or (place.exists() and not place.is_dir()):
         raise InputError(f"{place} is not empty and holds no set of runs: choose a new or an empty directory")
     if source:
         for config in configs:
@@ -245,34 +245,34 @@ def _create(
     source: Source | None,
     demonstrations: Demonstrations | None,
 ) -> TrainedRuns:
-    """Create the run of each configuration; an existing one takes over what may differ where it goes on, such as steps.
+    """Create the run of each configuration; give existing ones the settings that a resume may change, such as steps.
 
-    New runs are made aside and named together: who is killed before leaves none of them, not some or a half of one.
-    Raises InputError where an existing run is in use, or a directory cannot be written.
+    New runs are created under temporary names and then renamed: a kill before that leaves none, rather than some or
+    half of one. Raises InputError if an existing run is in use, or a directory cannot be written.
     """
     changed = [config for config in configs if config.seed in existing and config != existing[config.seed].config]
-    _change([existing[config.seed] for config in changed], changed)
+    _set_configs([existing[config.seed] for config in changed], changed)
     new = [config for config in configs if config.seed not in existing]
-    aside = {config.seed: name_aside(run_path(place, config.seed)) for config in new}
+    temporary = {config.seed: name_aside(run_path(place, config.seed)) for config in new}
     try:
         for config in new:
             program = next(group for group in groups if config.seed in group)
             manifest = Manifest(config=config, program=tuple(program))
-            run = RunDirectory.create(aside[config.seed], source.begun(manifest) if source else manifest)
+            run = RunDirectory.create(temporary[config.seed], source.forked_manifest(manifest) if source else manifest)
             if source:
                 source.copy_to(run)
             if demonstrations:
                 demonstrations.write(run)
-        for seed, path in aside.items():
+        for seed, path in temporary.items():
             RunDirectory.open(path).rename(run_path(place, seed))
     finally:
-        for path in aside.values():
+        for path in temporary.values():
             shutil.rmtree(path, ignore_errors=True)
     return TrainedRuns(place, [RunDirectory.open(run_path(place, config.seed)) for config in configs])
 
 
 def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[str]) -> TrainedRuns:
-    """Train every program that is not over, show it, and draw the curve. Raises as `train`."""
+    """Train every program that is not over, show progress, and draw the curve. Raises as `train`."""
     done = {run.path for run in runs.runs if watch.is_over(run)}
     programs = [program for program in programs if not done.issuperset(program.directories)]
     reporter = watch.reporter
