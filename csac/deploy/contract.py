@@ -181,7 +181,7 @@ def _as_float32(value: Any, name: str) -> np.ndarray:
 def write_with_checksum(path: Path, content: bytes, fields: Mapping[str, Any] | None = None) -> None:
     """Write a file, and its SHA-256 into the `contract.json` beside it. Raises OSError.
 
-    During the write the contract lists the checksums of both the old and the new file, so that a kill leaves a match.
+    During the write the contract lists the checksums of the old and the new file: a kill leaves a file that matches.
     `fields`, if given, become the contract; if they differ from its old fields, other files' checksums are dropped.
     """
     place, before = path.with_name(CONTRACT), {}

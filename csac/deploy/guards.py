@@ -22,7 +22,7 @@ class Guards:
     """What an artefact checks and limits; nothing without a `fallback`. Arrays are float32 [action].
 
     If any number of the observation or of the policy's action is not finite, the action is replaced: by the previous
-    action if `repeats_last` is set and there is one, else by `fallback`. `largest_change` is how far each action, also
+    action if `repeats_last` is set and there is one, else by `fallback`. `largest_change` is how far each action, even
     a fallback, may be from the previous one; the first action after a reset is not limited.
     """
 

@@ -37,7 +37,7 @@ class Latency(NamedTuple):
 def measure(
     artefact: Artefact, calls: int = 100_000, rate: float | None = None, seconds: float = 10.0
 ) -> tuple[Latency, ...]:
-    """Time `calls` calls of an artefact back to back, and then calls at a fixed rate for `seconds`.
+    """Time an artefact's actions for `calls` calls back to back, and then for `seconds` at a fixed rate.
 
     An artefact in C is timed inside its compiled library, the others around `act`, with the garbage collector off.
     Observations are standard normal.

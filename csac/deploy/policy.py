@@ -103,7 +103,7 @@ class Policy:
         return actions[np.argmax(values, axis=0), np.arange(len(observations))]
 
     def candidates(self, observations: np.ndarray, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return each actor's actions in [-1, 1], [actor, n, action], and their values by its critic, [actor, n].
+        """Return each actor's actions in [-1, 1], [actor, n, action], and its critic's values of them, [actor, n].
 
         The values are None for a single actor. For each row, `act` takes the action with the highest value, the first
         in a tie. For float64 observations, the computation is in float64.

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from csac.deploy.policy import Policy
 
 TOLERANCE = 1e-5  # relative to an action's range
-ROUNDING = 10.0  # an artefact may be this many times as inexact as the policy itself in float32
-MOST_RECORDED = 2_000  # recorded observations to compare at most
+ROUNDING = 10.0  # times the policy's own float32 rounding error: an artefact's error may be as large
+MOST_RECORDED = 2_000  # recorded observations that are compared at most
 RANDOM = 1_000  # additional observations, with twice the standard deviation of those recorded
 
 
@@ -29,8 +29,8 @@ class Comparison(NamedTuple):
 def compare_actions(artefact: Artefact, policy: Policy, recorded: np.ndarray | None = None) -> Comparison:
     """Compare an artefact with its policy and guards, on observations `recorded` in episodes and on random ones.
 
-    Raises InputError if actions differ by more than 1e-5 of their range, and also by more than ten times the rounding
-    error of the policy itself in float32 on such observations.
+    Raises InputError if actions differ by more than both 1e-5 of their range and ten times the policy's own float32
+    rounding error on such observations.
     """
     generator, contract = np.random.default_rng(0), policy.contract
     observations = _observations(policy, recorded, generator)

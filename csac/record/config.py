@@ -1,6 +1,6 @@
-"""What a run is: one settings object that the command line fills, `train` takes, the manifest stores and studies list.
+"""The configuration of a run: one object that the command line, `train`, the manifest and studies share.
 
-Plain values and no JAX, so that every room can read it.
+It holds plain values without JAX, so that every part of csac can import it.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from csac.checks import check_whole
 from csac.seeds import EVALUATION_SEED
 from csac.types import InputError
 
-STEPS_LIMIT = 2**31 - 1  # learners count their steps in 32 bits
-SEED_LIMIT = 2**32  # a key is made of a seed's lowest 32 bits
+STEPS_LIMIT = 2**31 - 1  # learners count their steps in int32
+SEED_LIMIT = 2**32  # a random key uses only the lowest 32 bits of a seed
 NEVER = 10**15  # an interval longer than any run
 MOST_EPISODES = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """Everything that decides what one run computes. Steps are environment steps.
+    """Everything that determines what one run computes. Steps are environment steps.
 
-    Raises InputError for a number outside its range, or values that JSON would change.
+    Raises InputError for a number outside its range, or a value that JSON would change.
     """
 
     task: str
@@ -68,7 +68,7 @@ class RunConfig:
 
     @property
     def extra_transitions(self) -> int:
-        """How many transitions the replay is given at most beside those of the steps."""
+        """Upper bound on the transitions that the replay buffer receives beyond those of the steps."""
         return self.steps * self.hindsight + self.demonstrations.get("transitions", 0)
 
     def __post_init__(self) -> None:
@@ -89,7 +89,7 @@ class RunConfig:
 
     @property
     def title(self) -> str:
-        """The algorithm's name in tables and pictures: SAC of sac, MySAC of my_module:MySAC."""
+        """The algorithm's name in tables and plots: SAC for sac, MySAC for my_module:MySAC."""
         module, _, name = self.algorithm.rpartition(":")
         return name if module else name.upper()
 
@@ -109,9 +109,9 @@ _RANGES = (
 
 
 def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Return keyword arguments as JSON gives them back; tuples become lists, NumPy's numbers plain ones.
+    """Return keyword arguments as JSON reads them back: tuples become lists, NumPy scalars plain numbers.
 
-    Raises InputError where JSON would change a value, so that a resumed run would be another run.
+    Raises InputError if JSON would change a value, since a resumed run would then not be the same run.
     """
     plain = _plain(values)
     try:
@@ -124,7 +124,7 @@ def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    if hasattr(value, "tolist") and not getattr(value, "shape", None):  # NumPy's numbers
+    if hasattr(value, "tolist") and not getattr(value, "shape", None):  # a NumPy scalar
         return value.tolist()
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
@@ -132,7 +132,7 @@ def _plain(value: Any) -> Any:
 
 
 def same(old: Any, new: Any) -> bool:
-    """Return whether two values from JSON are equal; a NaN equals itself here."""
+    """Return whether two JSON values are equal, where NaN equals NaN."""
     if isinstance(old, list) and isinstance(new, list):
         return len(old) == len(new) and all(map(same, old, new))
     if isinstance(old, dict) and isinstance(new, dict):
@@ -141,7 +141,7 @@ def same(old: Any, new: Any) -> bool:
 
 
 def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
-    """Return "name is X, not Y" for each value that differs; hyperparameters and arguments one by one."""
+    """Return "name is X, not Y" for each value that differs, with one line per hyperparameter or argument."""
     lines = []
     for name in sorted(before.keys() | now.keys()):
         old, new = before.get(name), now.get(name)

@@ -1,4 +1,4 @@
-"""manifest.json as a value: a run's configuration, where it was made, how far it is and what has happened to it."""
+"""The content of manifest.json: a run's configuration, origin, progress and history."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ State = Literal["running", "finished", "failed", "interrupted"]
 
 @dataclass(frozen=True)
 class Machine:
-    """What the last bits of a run depend on, and where it runs."""
+    """The machine that runs a run: where it is, and what the last bits of its numbers depend on."""
 
     processor: str = ""
     cores: int = 0
@@ -33,20 +33,20 @@ class Machine:
 
 @dataclass(frozen=True)
 class Origin:
-    """The checkpoint of another run that a run began with, and what is different in this one."""
+    """The other run's checkpoint that a run was forked from, and which of its settings differ."""
 
     directory: str
     step: int
     changes: tuple[str, ...] = ()
 
     def changed(self, *names: str) -> bool:
-        """Return whether a change is of one of these settings."""
+        """Return whether one of these settings was changed."""
         return any(text.startswith(names) for text in self.changes)
 
 
 @dataclass(frozen=True)
 class Continuation:
-    """That a run was resumed: when, at which step, and whether it is the run that was never stopped, bit for bit."""
+    """A resume of a run: when, at which step, and whether it is bit for bit as if the run had never stopped."""
 
     resumed: str
     step: int
@@ -87,11 +87,11 @@ class Manifest:
 
 
 class NewerError(InputError):
-    """A manifest of another schema."""
+    """A manifest has another schema version."""
 
 
 def read(content: bytes) -> Manifest:
-    """Return the manifest in a file's content. Raises InputError with what is wrong with it."""
+    """Parse the content of a manifest file. Raises InputError that says what is wrong with it."""
     try:
         fields = json.loads(without_controls(content))
         version = fields.pop("schema_version", None)
@@ -103,7 +103,7 @@ def read(content: bytes) -> Manifest:
 
 
 def written(manifest: Manifest) -> bytes:
-    """Return the content of the file that `read` takes."""
+    """Return the content of the manifest's file, which `read` parses."""
     fields = {"schema_version": SCHEMA_VERSION, **dataclasses.asdict(manifest)}
     return (json.dumps(fields, indent=2) + "\n").encode()
 
@@ -112,7 +112,7 @@ _TOLD = {int: "a whole number", str: "a text", bool: "true or false", tuple: "a 
 
 
 def value(kind: Any, given: Any, name: str) -> Any:
-    """Return a JSON value as one of this type. Raises InputError, with its name, where it is none."""
+    """Return a JSON value as a value of type `kind`. Raises InputError, naming `name`, if it has another type."""
     origin, arguments = get_origin(kind), get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(given, dict):
         return _dataclass(kind, given, name)
