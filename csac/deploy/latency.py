@@ -27,11 +27,11 @@ class Latency(NamedTuple):
     """Measured times of single calls, in nanoseconds."""
 
     durations: np.ndarray
-    """From right before a call to right after it, int64 [calls]."""
+    """From right before each call to right after it, int64 [calls]."""
     lateness: np.ndarray | None = None
-    """How long after it was due a call began, int64 [calls]; None if calls followed each other at once."""
+    """How late each call began after it was due, int64 [calls]; None if calls ran back to back."""
     rate: float | None = None
-    """Calls per second that were due."""
+    """Scheduled calls per second; None if calls ran back to back."""
 
 
 def measure(

@@ -31,40 +31,40 @@ class RunConfig:
     algorithm: str = "csac"
     """The algorithm, or module:Class for one of your own; its own options are listed below."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)
-    """Every hyperparameter of the algorithm, so that no later default changes what a run is."""
+    """All hyperparameters of the algorithm, so that a later change of a default does not change the run."""
     seed: int = 0
-    """Seed of the networks, of exploration, of the replay's draws and of the training episodes."""
+    """Seed of the networks, of exploration, of replay sampling and of the training episodes."""
     steps: int = 1_000_000
     """Environment steps per seed, warm-up included."""
     environments: int = 1
-    """Environments that each seed steps side by side; steps are those of all of them together."""
+    """Environments that each seed steps in parallel; steps are counted over all of them."""
     device: Literal["cpu", "gpu", "cuda"] = "cpu"
-    """Device that the networks are trained on; cuda is gpu."""
+    """Device that the networks are trained on; cuda means gpu."""
     evaluation_interval: int = 5_000
-    """Environment steps between evaluations; there is always one at the last step. 0: none at all."""
+    """Environment steps between evaluations; there is also one at the last step. 0: no evaluations."""
     evaluation_episodes: int = 10
     """Episodes per evaluation."""
     evaluation_environments: int = 10
-    """Environments of an evaluation, side by side and kept open. 0: the training environment, between its episodes."""
+    """Parallel environments for evaluations, kept open. 0: the training environment, between its episodes."""
     evaluation_seed: int = EVALUATION_SEED
-    """Resets the first evaluation episode; the next ones have the numbers after it."""
+    """Seed of the first evaluation episode; each next episode has the next number."""
     checkpoint_interval: int = 50_000
-    """Environment steps between checkpoints; there is also one every ten minutes and at the end. 0: none at all."""
+    """Environment steps between checkpoints; there is also one every ten minutes and at the end. 0: no checkpoints."""
     keep_checkpoints: int = 2
     """Number of newest checkpoints to keep; 0 keeps all."""
     environment_arguments: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments for the environment."""
     perturbations: tuple[str, ...] = ()
-    """Changes of the task in mid-training, such as friction=1.5@300000."""
+    """Changes of the task during training, such as friction=1.5@300000."""
     hindsight: int = 0
-    """Copies of each transition with goals that its episode reached later (HER); for tasks with goals."""
+    """Copies of each transition, relabelled with goals that its episode reached later (HER); for tasks with goals."""
     demonstrations: dict[str, Any] = field(default_factory=dict)
-    """What the replay begins with: where it came from, how many transitions, and their file's checksum."""
+    """Demonstrations that the replay buffer begins with: origin, number of transitions, and their file's checksum."""
     events: tuple[str, ...] = ()
-    """Names in the last `info` of an episode, or NAME:sum and NAME:mean over its steps; each is a column of
+    """Names in the last `info` of an episode, or NAME:sum and NAME:mean over its steps; each becomes a column of
     evaluations.csv and episodes.csv."""
     task_is_callable: bool = False
-    """Whether the task is a Python function, which no manifest can name."""
+    """Whether the task is a Python function, which a manifest cannot name."""
 
     @property
     def extra_transitions(self) -> int:

@@ -23,10 +23,10 @@ class Machine:
 
     processor: str = ""
     cores: int = 0
-    """Cores that XLA divides its work for."""
+    """CPU cores that XLA divides its work among."""
     host: str = ""
     gpu: str = ""
-    """Its model, where the run computes on one."""
+    """The GPU's model, if the run computes on one."""
     xla_flags: str = ""
     matmul_precision: str = ""
 
@@ -54,7 +54,7 @@ class Continuation:
     notes: tuple[str, ...] = ()
     command: str | None = None
     previous: dict[str, Any] = field(default_factory=dict)
-    """Steps, machine, versions and commit before."""
+    """Steps, machine, versions and commit before the resume."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ class Manifest:
 
     config: RunConfig
     program: tuple[int, ...] = ()
-    """The seeds that share the run's program; its last bits depend on their number."""
+    """The seeds that share the run's compiled program; the last bits of its numbers depend on how many there are."""
     machine: Machine = Machine()
     versions: dict[str, str] = field(default_factory=dict)
     commit: str | None = None
@@ -75,9 +75,9 @@ class Manifest:
     last_checkpoint: int = 0
     """Step of the newest checkpoint; 0 before the first."""
     failure: str = ""
-    """How the run failed, if it did."""
+    """Why the run failed, if it did."""
     restarts_episode: bool = False
-    """Whether a resume restarts the episode in progress, since the environment cannot be saved."""
+    """Whether a resume restarts the current episode, because the environment cannot be saved."""
     forked_from: Origin | None = None
     history: tuple[Continuation, ...] = ()
 

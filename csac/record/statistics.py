@@ -165,17 +165,17 @@ class Recovery(NamedTuple):
     before: float
     """Mean return of the last three evaluations up to and including the perturbation's step."""
     drop: float
-    """`before` minus the lowest return after it, 0 where none is lower."""
+    """`before` minus the lowest return after the perturbation, 0 if none is lower."""
     relative_drop: float
     """The drop as a share of |before|."""
     steps_to_regain: float
-    """Environment steps from the perturbation to 90 % of `before`: 0 if no evaluation fell below, infinite if never."""
+    """Environment steps from the perturbation to 90 % of `before`: 0 if none fell below, infinite if never."""
     area_lost: float
     """Integral of max(0, before - return) over the steps after the perturbation, in return times steps."""
     final: float
-    """Mean return of the last three evaluations after the perturbation, or of all where none is after it."""
+    """Mean return of the last three evaluations after the perturbation, or of the curve if none is after it."""
     worst_drawdown: float
-    """The largest fall from the highest return so far, over the whole curve, before the perturbation and after it."""
+    """Largest fall from the highest return so far, over the whole curve, before and after the perturbation."""
 
 
 def recovery(rows: np.ndarray, step: int, until: int | None = None, since: int = -1) -> dict[int, Recovery]:

@@ -40,10 +40,10 @@ class RecoverySummary(NamedTuple):
     seeds: dict[int, Recovery]
     failed: frozenset[int]
     metrics: dict[str, OverSeeds]
-    """By the fields of `Recovery`, over the seeds where it is known. No mean of steps where a seed never came back."""
+    """For each field of `Recovery`, over the seeds where it is known; no mean of steps if a seed never recovered."""
     regained: int
     known: int
-    """Of how many seeds the recovery is known, and how many of them came back."""
+    """Number of seeds whose recovery is known; `regained` of them recovered."""
 
 
 class CaseSummary(NamedTuple):
