@@ -73,15 +73,15 @@ def choose_run(runs: RunSet, seed: int | None = None) -> RunDirectory:
         if isinstance(seed, bool) or not isinstance(seed, Integral):
             raise InputError(f"seed is the label of one, a whole number, not {seed!r:.40}")
         return runs.run(int(seed))
-    sound = [run for run in runs.runs if run.manifest.state != "failed" and has_policy(run, "last")]
-    if not sound and runs.failures:
+    candidates = [run for run in runs.runs if run.manifest.state != "failed" and has_policy(run, "last")]
+    if not candidates and runs.failures:
         failed, reason = next(iter(runs.failures.items()))
         raise InputError(f"every seed of {runs.path} failed (seed {failed} at {reason}): train again, or give a seed")
-    if not sound:
+    if not candidates:
         raise InputError(f"{runs.path} holds no policies: an evaluation writes them")
-    scores = last_evaluations(RunSet(runs.path, sound).evaluations)
+    scores = last_evaluations(RunSet(runs.path, candidates).evaluations)
     scores = {seed: score for seed, score in scores.items() if not math.isnan(score)}
-    if len(sound) > 1 and not scores:
+    if len(candidates) > 1 and not scores:
         seeds = ", ".join(map(str, runs.seeds))
         raise InputError(f"{runs.path} has no evaluations to choose by: give a seed, one of {seeds}")
-    return max(sound, key=lambda run: (scores.get(run.seed, -math.inf), -run.seed))
+    return max(candidates, key=lambda run: (scores.get(run.seed, -math.inf), -run.seed))

@@ -86,8 +86,8 @@ class Contract:
         for expected in [shape] * (key is None) + [(self.spec.observation_size,)]:
             if (flat := _flat(array, expected)) is not None:
                 return flat
-        taken = shape if key is None else f"a dict of {[key for key, _ in self.observation_parts]}"
-        raise InputError(f"the observation has shape {array.shape}; the policy takes {taken}, or a batch of it")
+        accepted = shape if key is None else f"a dict of {[key for key, _ in self.observation_parts]}"
+        raise InputError(f"the observation has shape {array.shape}; the policy takes {accepted}, or a batch of it")
 
     def to_environment(self, action: np.ndarray) -> np.ndarray:
         """Map actions from [-1, 1], [..., action], to the environment's scale: float32 [..., *action_shape]."""
@@ -119,9 +119,9 @@ class Contract:
 
     def _flatten_dict(self, observation: Mapping[str | None, Any]) -> np.ndarray:
         keys = [key for key, _ in self.observation_parts]
-        if (given := sorted(observation, key=str)) != keys:
-            taken = "one array and no dict" if keys == [None] else keys
-            raise InputError(f"the observation has the keys {given}; the policy takes {taken}")
+        if (given_keys := sorted(observation, key=str)) != keys:
+            accepted = "one array and no dict" if keys == [None] else keys
+            raise InputError(f"the observation has the keys {given_keys}; the policy takes {accepted}")
         parts = []
         for key, shape in self.observation_parts:
             array = _as_float32(observation[key], f"observation[{key!r}]")
@@ -159,8 +159,8 @@ def _contract(fields: Any) -> Contract:
         raise ValueError("action bounds and action_shape disagree")
     if not (np.isfinite([low, high]).all() and (low <= high).all()):
         raise ValueError("action bounds are not finite or not in order")
-    given = {name: fields[name] for name in ("task", "algorithm", *names)}
-    return Contract(**given, observation_parts=parts, action_shape=action_shape, action_low=low, action_high=high)
+    texts = {name: fields[name] for name in ("task", "algorithm", *names)}
+    return Contract(**texts, observation_parts=parts, action_shape=action_shape, action_low=low, action_high=high)
 
 
 def _shape(numbers: Any) -> tuple[int, ...]:
@@ -184,19 +184,19 @@ def write_with_checksum(path: Path, content: bytes, fields: Mapping[str, Any] | 
     During the write the contract lists the checksums of the old and the new file: a kill leaves a file that matches.
     `fields`, if given, become the contract; if they differ from its old fields, other files' checksums are dropped.
     """
-    place, before = path.with_name(CONTRACT), {}
+    contract_path, kept_fields = path.with_name(CONTRACT), {}
     with suppress(InputError):  # missing or damaged
-        before |= read_json(place)
-    checksums = before.pop("sha256", {})
-    if fields is not None and before != {**fields}:
-        before, checksums = {**fields}, {}
+        kept_fields |= read_json(contract_path)
+    checksums = kept_fields.pop("sha256", {})
+    if fields is not None and kept_fields != {**fields}:
+        kept_fields, checksums = {**fields}, {}
     old, new = checksums.get(path.name, ""), hashlib.sha256(content).hexdigest()
 
-    def write_contract(known: str) -> None:
-        write_json(place, {**before, "sha256": dict(sorted({**checksums, path.name: known}.items()))})
+    def write_contract(checksum: str) -> None:
+        write_json(contract_path, {**kept_fields, "sha256": dict(sorted({**checksums, path.name: checksum}.items()))})
 
-    there = sha256_of(path) if path.exists() else ""
-    write_contract(f"{new} {there}" if there in old else new)
+    current = sha256_of(path) if path.exists() else ""
+    write_contract(f"{new} {current}" if current in old else new)
     write_atomically(path, content)
     write_contract(new)
 

@@ -49,13 +49,13 @@ def model(policy: Policy, guards: Guards, fields: dict[str, Any]) -> bytes:
 
     nodes = [helper.make_node(kind, names, [output], output, **options) for kind, names, output, options in graph.nodes]
     constants = [onnx.numpy_helper.from_array(array, name) for name, array in graph.constants.items()]
-    built = helper.make_graph(nodes, "policy", values(inputs), values(outputs), constants)
-    made = helper.make_model(
-        built, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="csac"
+    onnx_graph = helper.make_graph(nodes, "policy", values(inputs), values(outputs), constants)
+    onnx_model = helper.make_model(
+        onnx_graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="csac"
     )
-    helper.set_model_props(made, {"contract": json.dumps(fields, allow_nan=False)})
-    checker.check_model(made, full_check=True)
-    return made.SerializeToString(deterministic=True)
+    helper.set_model_props(onnx_model, {"contract": json.dumps(fields, allow_nan=False)})
+    checker.check_model(onnx_model, full_check=True)
+    return onnx_model.SerializeToString(deterministic=True)
 
 
 def _missing(package: str) -> InputError:
@@ -74,22 +74,22 @@ class Session:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        self._first = np.zeros((1, policy.contract.spec.action_size + 1), np.float32) if guards.has_state else None
+        self._zeros = np.zeros((1, policy.contract.spec.action_size + 1), np.float32) if guards.has_state else None
         self.reset()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return the action for an observation."""
-        given = {"observation": observation[None]}
+        inputs = {"observation": observation[None]}
         if self._state is not None:
-            given["state"] = self._state
-        outputs: Any = self._session.run(None, given)
+            inputs["state"] = self._state
+        outputs: Any = self._session.run(None, inputs)
         if self._state is not None:
             self._state = outputs[1]
         return outputs[0][0]
 
     def reset(self) -> None:
         """Forget the previous action."""
-        self._state = self._first
+        self._state = self._zeros
 
 
 class _Graph:

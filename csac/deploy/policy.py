@@ -63,8 +63,8 @@ class Policy:
         if kinds != (self.contract.activation, self.contract.head, self.contract.critic_activation):
             raise InputError(f"the policy is {network.activation}/{network.head}, not as its contract says")
         try:
-            given = np.zeros((1, observation_size), np.float32), False, np.zeros((1, action_size), np.float32)
-            fits = self.act(*given).shape == (1, action_size)
+            arguments = np.zeros((1, observation_size), np.float32), False, np.zeros((1, action_size), np.float32)
+            fits = self.act(*arguments).shape == (1, action_size)
         except (ValueError, TypeError, IndexError):
             fits = False
         if not fits:
@@ -166,18 +166,18 @@ class Policy:
             InputError: a file is missing or damaged, or the contract is that of another policy.
         """
         path = Path(path)
-        place = path.with_name(CONTRACT)
-        agreement = Contract.of_fields(fields := read_json(place), place)
+        contract_path = path.with_name(CONTRACT)
+        contract = Contract.of_fields(fields := read_json(contract_path), contract_path)
         check_checksum(path, fields)
         try:
             with safetensors.safe_open(path, "numpy") as file:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
                 step = (file.metadata() or {}).get("step")
-            kinds = agreement.activation, agreement.head, agreement.critic_activation
+            kinds = contract.activation, contract.head, contract.critic_activation
             network = PolicyNetwork(from_tensors(tensors), *kinds)
-            return Policy(network, agreement, step=None if step is None else int(step))
+            return Policy(network, contract, step=None if step is None else int(step))
         except (safetensors.SafetensorError, ValueError) as error:  # InputError is a ValueError
-            raise InputError(f"{path} is not a policy of {place.name} ({error}): restore both from a copy") from error
+            raise InputError(f"{path} is not a policy of {CONTRACT} ({error}): restore both from a copy") from error
 
 
 class _Actor(NamedTuple):

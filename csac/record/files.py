@@ -23,7 +23,7 @@ except ImportError:  # Windows: two processes are not kept apart
 SECONDS_FOR_LOCK = 0.2  # `is_locked` in another process holds a lock for an instant
 
 # Files whose locks this process holds; closed ones may stay in the set.
-_own: WeakSet[IO[str]] = WeakSet()
+_held_locks: WeakSet[IO[str]] = WeakSet()
 
 
 @contextmanager
@@ -59,17 +59,17 @@ def name_aside(path: Path) -> Path:
 
 def kept_from_children(file: IO[str]) -> IO[str]:
     """Return the file, which forked processes will close: a task's helper process would otherwise keep its lock."""
-    _own.add(file)
+    _held_locks.add(file)
     return file
 
 
-def _close_own() -> None:
-    for file in list(_own):
+def _close_held_locks() -> None:
+    for file in list(_held_locks):
         file.close()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_close_own)
+    os.register_at_fork(after_in_child=_close_held_locks)
 
 
 def take(file: IO[str], path: Path) -> None:

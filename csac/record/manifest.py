@@ -108,7 +108,7 @@ def written(manifest: Manifest) -> bytes:
     return (json.dumps(fields, indent=2) + "\n").encode()
 
 
-_TOLD = {int: "a whole number", str: "a text", bool: "true or false", tuple: "a list"}
+_TYPE_NAMES = {int: "a whole number", str: "a text", bool: "true or false", tuple: "a list"}
 
 
 def value(kind: Any, given: Any, name: str) -> Any:
@@ -128,8 +128,8 @@ def value(kind: Any, given: Any, name: str) -> Any:
         return {key: value(arguments[1], item, name) for key, item in given.items()}
     if kind in (int, str, bool) and type(given) is kind:
         return given
-    told = " or ".join(map(repr, arguments)) if origin is Literal else _TOLD.get(origin or kind, "a table")
-    raise InputError(f"{name!r} is {given!r:.60}, not {told}")
+    expected = " or ".join(map(repr, arguments)) if origin is Literal else _TYPE_NAMES.get(origin or kind, "a table")
+    raise InputError(f"{name!r} is {given!r:.60}, not {expected}")
 
 
 def _dataclass(kind: Any, given: dict[str, Any], name: str) -> Any:

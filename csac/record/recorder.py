@@ -27,35 +27,35 @@ class Recorder:
 
     def __init__(self, run: RunDirectory, begin: int, tensorboard: bool, wandb: bool | str = False) -> None:
         self.run = run
-        self._waiting: dict[Table, list[dict[str, Any]]] = defaultdict(list)
-        origin, known = run.manifest.forked_from, run.evaluations
+        self._queued: dict[Table, list[dict[str, Any]]] = defaultdict(list)
+        origin, rows = run.manifest.forked_from, run.evaluations
         if origin and origin.changed("task ", "environment_arguments"):  # earlier returns are of another task
-            known = known[known["step"] > origin.step]
-        self.best = best_return(known) if run.policy_file("best").exists() else -np.inf
+            rows = rows[rows["step"] > origin.step]
+        self.best = best_return(rows) if run.policy_file("best").exists() else -np.inf
         self._log = self._wandb = None
         if tensorboard or wandb:
             from csac.record.tensorboard import TensorBoardLog  # slow to import
 
             episodes = run.rows("episodes")
-            before = [dict(zip(episodes.dtype.names or (), row, strict=True)) for row in episodes.tolist()[-100:]]
-            cases = [name for name in known.dtype.names or () if name not in _NUMBERS and is_case(known[name])]
-            self._log = TensorBoardLog(run.tensorboard, begin, before, cases)
+            recent = [dict(zip(episodes.dtype.names or (), row, strict=True)) for row in episodes.tolist()[-100:]]
+            cases = [name for name in rows.dtype.names or () if name not in _NUMBERS and is_case(rows[name])]
+            self._log = TensorBoardLog(run.tensorboard, begin, recent, cases)
         if wandb:
-            self._wandb = self._guarded(lambda: WandbLog(run, wandb))
+            self._wandb = self._call_wandb(lambda: WandbLog(run, wandb))
 
     def add(self, table: Table, rows: Sequence[dict[str, Any]]) -> None:
         """Queue rows of a table until the next `flush`."""
-        self._waiting[table] += rows
+        self._queued[table] += rows
 
     def flush(self, *tables: Table) -> None:
         """Write the queued rows, of all tables unless some are given. Raises OSError."""
         for table in tables or TABLES:
-            if rows := self._waiting.pop(table, []):
-                rows = _joined(rows) if table == "metrics" else rows
+            if rows := self._queued.pop(table, []):
+                rows = _merged_by_step(rows) if table == "metrics" else rows
                 self.run.append(table, rows)
                 points = self._log.write(table, rows) if self._log else {}
                 if self._wandb:
-                    self._guarded(lambda points=points: self._wandb and self._wandb.write(points))
+                    self._call_wandb(lambda points=points: self._wandb and self._wandb.write(points))
 
     def sync(self) -> None:
         """Write the queued rows and TensorBoard's buffer: a resume does not repeat rows from before the checkpoint."""
@@ -68,9 +68,9 @@ class Recorder:
         if self._log:
             self._log.close()
         if self._wandb:
-            self._guarded(self._wandb.close)
+            self._call_wandb(self._wandb.close)
 
-    def _guarded(self, call: Callable[[], Any]) -> Any:
+    def _call_wandb(self, call: Callable[[], Any]) -> Any:
         """Return the result of a W&B call; if it fails, stop logging to W&B and continue the run."""
         try:
             return call()
@@ -79,9 +79,9 @@ class Recorder:
             self.run.log(f"W&B gets no more of this run: {type(error).__name__}: {error}")
 
 
-def _joined(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _merged_by_step(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Merge the rows of each step into one: the algorithm's metrics and what callbacks log."""
-    joined: dict[int, dict[str, Any]] = {}
+    merged: dict[int, dict[str, Any]] = {}
     for row in rows:
-        joined[row["step"]] = {**joined.get(row["step"], {}), **row}
-    return [joined[step] for step in sorted(joined)]
+        merged[row["step"]] = {**merged.get(row["step"], {}), **row}
+    return [merged[step] for step in sorted(merged)]

@@ -40,8 +40,8 @@ def results_table(rows: np.ndarray, failed: Collection[int] = (), episodes: Mapp
     In the summary, "best" is the point with the highest mean over seeds, and "last" the last point that all seeds have.
     `episodes` are each seed's numbers of training episodes. A single seed has no summary; one without a return, no row.
     """
-    three, (steps, labels, returns) = last_evaluations(rows), evaluation_matrix(rows)
-    lines = {seed: line for seed, line in zip(labels.tolist(), returns, strict=True) if seed in three}
+    means, (steps, labels, returns) = last_evaluations(rows), evaluation_matrix(rows)
+    lines = {seed: line for seed, line in zip(labels.tolist(), returns, strict=True) if seed in means}
     largest = max((float(np.nanmax(np.abs(line))) for line in lines.values()), default=0.0)
 
     def cells(*values: float) -> list[Cell]:
@@ -50,16 +50,16 @@ def results_table(rows: np.ndarray, failed: Collection[int] = (), episodes: Mapp
     body = []
     for seed, line in lines.items():
         last, best = float(line[~np.isnan(line)][-1]), int(np.nanargmax(line))
-        own = [_whole(seed), *cells(last, three[seed], float(line[best])), _whole(int(steps[best]))]
+        numbers = [_whole(seed), *cells(last, means[seed], float(line[best])), _whole(int(steps[best]))]
         kind = "failed" if seed in failed else "plain"
-        body.append(Row((*own, _whole((episodes or {}).get(seed, 0))), kind))
+        body.append(Row((*numbers, _whole((episodes or {}).get(seed, 0))), kind))
     sound = [seed for seed in lines if seed not in failed]
-    together = np.array([lines[seed] for seed in sound]).reshape(len(sound), len(steps))
-    common = ~np.isnan(together).any(axis=0)
+    sound_returns = np.array([lines[seed] for seed in sound]).reshape(len(sound), len(steps))
+    common = ~np.isnan(sound_returns).any(axis=0)
     if len(sound) > 1 and common.any():
-        steps, together = steps[common], together[:, common]
-        best = int(together.mean(axis=0).argmax())
-        over = [over_seeds(values) for values in (together[:, -1], [three[seed] for seed in sound], together[:, best])]
+        steps, sound_returns = steps[common], sound_returns[:, common]
+        best = int(sound_returns.mean(axis=0).argmax())
+        over = list(map(over_seeds, (sound_returns[:, -1], [means[seed] for seed in sound], sound_returns[:, best])))
         body.append(_summary("mean", *cells(*(one.mean for one in over)), _whole(int(steps[best])), EMPTY))
         body.append(_summary("± std", *cells(*(one.std for one in over)), EMPTY, EMPTY))
         body += interval_rows(over, largest, blank=2)
@@ -80,15 +80,15 @@ def comparison_table(
     sound = [rows[~np.isin(rows["seed"], list(lost))] for (_, rows), lost in zip(runs, failed, strict=True)]
     scores = [np.array(list(last_evaluations(rows, points).values())) for rows in sound]
     shares = [_success(rows, points) for rows in sound]
-    has_middles = any(len(own) >= FEWEST_FOR_BOOTSTRAP for own in scores)
+    has_middles = any(len(seed_means) >= FEWEST_FOR_BOOTSTRAP for seed_means in scores)
     first, body = over_seeds(scores[0]).mean if scores else math.nan, []
-    for (label, rows), lost, own_rows, own, share in zip(runs, failed, sound, scores, shares, strict=True):
-        over = over_seeds(own)
+    for (label, rows), lost, sound_rows, seed_means, share in zip(runs, failed, sound, scores, shares, strict=True):
+        over = over_seeds(seed_means)
         ratio = over.mean / first if first > 0 else math.nan
         count = Cell(str(over.seeds) + (f" ({len(lost)} failed)" if lost else ""), over.seeds)
         cells = [Cell(label), count, _whole(int(rows["step"].max(initial=0))), plus_minus(over), interval(over)]
-        cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(own_rows)]
-        cells += [middle(own), EMPTY if own is scores[0] else above(own, scores[0])] * has_middles
+        cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(sound_rows)]
+        cells += [middle(seed_means), EMPTY if seed_means is scores[0] else above(seed_means, scores[0])] * has_middles
         cells += [plus_minus(share, ".0%") if share else EMPTY] * any(shares)
         body.append(Row(tuple(cells)))
     last = f"last {'three' if points == 3 else points} evaluations"
@@ -114,8 +114,8 @@ def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
             cells = (*label, _whole(seed), *_recovery_cells(one, largest))
             rows.append(Row(cells, "failed" if seed in run.failed else "plain"))
         if run.known > 1:
-            for name, of in (("mean", lambda one: one.mean), ("± std", lambda one: one.std)):
-                cells = _recovery_cells(Recovery(*(of(run.metrics[field]) for field in Recovery._fields)), largest)
+            for name, get in (("mean", lambda one: one.mean), ("± std", lambda one: one.std)):
+                cells = _recovery_cells(Recovery(*(get(run.metrics[field]) for field in Recovery._fields)), largest)
                 if name == "mean" and run.regained < run.known:
                     cells[3] = Cell(f"{run.regained} of {run.known}", math.inf)
                 rows.append(Row((*label, Cell(name, math.nan), *cells), "summary"))

@@ -84,7 +84,7 @@ class RunDirectory:
         check_path("a run directory", path)
         path = Path(os.path.abspath(path))
         reason = "does not exist"
-        for place in (path / MANIFEST, *_copies(path)):
+        for place in (path / MANIFEST, *_manifest_copies(path)):
             try:
                 manifest = manifests.read(place.read_bytes())
                 if place.parent != path and not multiprocessing.parent_process():  # which has warned
@@ -141,22 +141,22 @@ class RunDirectory:
 
         If the file was altered or truncated since the newest checkpoint, return the checkpoint's rows, with a warning.
         """
-        path = self._sound(name)
+        path = self._intact_file(name)
         rows = read_rows(path) if path.exists() else structured(COLUMNS[name], [])
         if missing := set(COLUMNS[name]) - set(rows.dtype.names or ()):
             raise InputError(f"{path} is damaged: it has no column {min(missing)}; restore it")
         return rows
 
-    def _sound(self, name: Table) -> Path:
+    def _intact_file(self, name: Table) -> Path:
         """Return the path of a table, or of its copy in the newest checkpoint if the table does not continue it."""
         path = self.table(name)
-        for manifest in _copies(self.path)[:1]:
+        for manifest in _manifest_copies(self.path)[:1]:
             copy = manifest.with_name(path.name)
-            content = copy.read_bytes() if copy.is_file() else b""
-            known = path.read_bytes() if path.is_file() else b""
+            saved = copy.read_bytes() if copy.is_file() else b""
+            current = path.read_bytes() if path.is_file() else b""
             is_saved = self.manifest.state == "finished" and self.manifest.steps_done == self.manifest.last_checkpoint
-            is_more = is_saved and known.count(b"\n") > content.count(b"\n")
-            if (is_more or not continues(known, content)) and _is_listed(copy, content):
+            is_more = is_saved and current.count(b"\n") > saved.count(b"\n")
+            if (is_more or not continues(current, saved)) and _matches_checksum(copy, saved):
                 warnings.warn(f"{path} has changed since the newest checkpoint: its copy there is read", stacklevel=4)
                 return copy
         return path
@@ -197,10 +197,10 @@ def now() -> str:
 
 def is_run(path: str | Path) -> bool:
     """Return whether there is a run in this directory, intact or damaged."""
-    return os.path.exists(Path(path) / MANIFEST) or bool(_copies(Path(path)))
+    return os.path.exists(Path(path) / MANIFEST) or bool(_manifest_copies(Path(path)))
 
 
-def _is_listed(copy: Path, content: bytes) -> bool:
+def _matches_checksum(copy: Path, content: bytes) -> bool:
     """Return whether a checkpoint's file has the checksum in the checkpoint's list."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         files = json.loads((copy.parent / "checkpoint.json").read_bytes())["files"]
@@ -208,7 +208,7 @@ def _is_listed(copy: Path, content: bytes) -> bool:
     return False
 
 
-def _copies(path: Path) -> list[Path]:
+def _manifest_copies(path: Path) -> list[Path]:
     """Return the paths of the manifest's copies in a run's checkpoints, newest first."""
     steps = {int(copy.parent.name[5:]): copy for copy in path.glob(f"checkpoint/step_[0-9]*/{MANIFEST}")}
     return [steps[step] for step in sorted(steps, reverse=True)]

@@ -40,15 +40,15 @@ def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
     with open(path, "ab+") as file:
         drop_torn_line(file)
         file.seek(0)
-        known = _header(path, file.readline())
-        header = list(dict.fromkeys([*(known or columns), *(column for row in rows for column in row)]))
+        old = _header(path, file.readline())
+        header = list(dict.fromkeys([*(old or columns), *(column for row in rows for column in row)]))
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        if header != known:
+        if header != old:
             writer.writerow(header)
-            text.writelines(line + "," * (len(header) - len(known)) + "\n" for line in file.read().decode().split())
+            text.writelines(line + "," * (len(header) - len(old)) + "\n" for line in file.read().decode().split())
         writer.writerows([_cell(path, column, row.get(column)) for column in header] for row in rows)
-        if not known or header == known:
+        if not old or header == old:
             file.write(text.getvalue().encode())
             return
     write_atomically(path, text.getvalue().encode())

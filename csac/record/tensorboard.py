@@ -84,13 +84,13 @@ class TensorBoardLog:
         self._recent.extend(rows)
         tags = {"rollout/ep_rew_mean": "return", "rollout/ep_len_mean": "length"}
         tags |= {f"rollout/{name}": name for name in rows[-1] if name not in COLUMNS["episodes"]}
-        told = {tag: np.array([row.get(name) for row in self._recent], float) for tag, name in tags.items()}
-        return {tag: float(np.nanmean(values)) for tag, values in told.items() if not np.isnan(values).all()}
+        columns = {tag: np.array([row.get(name) for row in self._recent], float) for tag, name in tags.items()}
+        return {tag: float(np.nanmean(values)) for tag, values in columns.items() if not np.isnan(values).all()}
 
     def _metrics(self, rows: Sequence[Row]) -> dict[str, float]:
         row, elapsed = rows[-1], time.monotonic() - self._began
-        told = {name: value for name, value in row.items() if name not in COLUMNS["metrics"]}
-        values = {name if "/" in name else f"train/{name}": float(value) for name, value in told.items()}
+        metrics = {name: value for name, value in row.items() if name not in COLUMNS["metrics"]}
+        values = {name if "/" in name else f"train/{name}": float(value) for name, value in metrics.items()}
         return {**values, "time/fps": (row["step"] - self._begin) / max(elapsed, 1e-9)}
 
     def _evaluations(self, rows: Sequence[Row]) -> dict[str, float]:
@@ -99,12 +99,12 @@ class TensorBoardLog:
             "eval/mean_ep_length": float(np.mean([row["length"] for row in rows])),
         }
         for name in ("success", *(name for name in rows[0] if name not in COLUMNS["evaluations"])):
-            told = np.array([row.get(name) for row in rows], float)
-            if is_case(told):
+            column = np.array([row.get(name) for row in rows], float)
+            if is_case(column):
                 self._cases.add(name)
-            elif not np.isnan(told).all():
+            elif not np.isnan(column).all():
                 self._cases.discard(name)
-            mean = mean_over_episodes(told, name in self._cases)
+            mean = mean_over_episodes(column, name in self._cases)
             if not np.isnan(mean):
                 values["eval/success_rate" if name == "success" else f"eval/{name}"] = mean
         return values

@@ -34,10 +34,10 @@ class WandbLog:
     def __init__(self, run: RunDirectory, project: bool | str) -> None:
         wandb, mode = import_wandb(), os.environ.get("WANDB_MODE", "online")
         mode = "offline" if mode == "online" and not wandb.api.api_key else mode
-        known = run.path / "wandb" / "project.txt"  # for when the run is resumed
-        before = known.read_text() if known.exists() else os.environ.get("WANDB_PROJECT", "csac")
+        project_file = run.path / "wandb" / "project.txt"  # for when the run is resumed
+        default_project = project_file.read_text() if project_file.exists() else os.environ.get("WANDB_PROJECT", "csac")
         self._run = wandb.init(
-            project=project if isinstance(project, str) else before,
+            project=project if isinstance(project, str) else default_project,
             group="/".join(run.path.parts[-3:-1]),
             name=f"{run.path.parent.name} {run.path.name}",
             id=hashlib.sha256(f"{run.path} {run.manifest.created}".encode()).hexdigest()[:16],
@@ -48,7 +48,7 @@ class WandbLog:
             reinit="create_new",
             settings=wandb.Settings(**_SETTINGS),
         )
-        known.write_text(self._run.project)
+        project_file.write_text(self._run.project)
         self._run.define_metric("*", step_metric="global_step")  # W&B's own step counter would refuse a late evaluation
 
     def write(self, points: Mapping[int, Mapping[str, float]]) -> None:
