@@ -97,7 +97,7 @@ def read(content: bytes) -> Manifest:
         version = fields.pop("schema_version", None)
     except (ValueError, RecursionError, AttributeError, TypeError):
         raise InputError("it is not a JSON object") from None
-    if version != SCHEMA_VERSION or isinstance(version, bool):
+    if version != SCHEMA_VERSION:
         raise NewerError(f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}")
     return value(Manifest, fields, "")
 

@@ -41,7 +41,7 @@ class Recorder:
             cases = [name for name in rows.dtype.names or () if name not in _NUMBERS and is_case(rows[name])]
             self._log = TensorBoardLog(run.tensorboard, begin, recent, cases)
         if wandb:
-            self._wandb = self._call_wandb(lambda: WandbLog(run, wandb))
+            self._wandb = self._call_wandb(WandbLog, run, wandb)
 
     def add(self, table: Table, rows: Sequence[dict[str, Any]]) -> None:
         """Queue rows of a table until the next `flush`."""
@@ -55,7 +55,7 @@ class Recorder:
                 self.run.append(table, rows)
                 points = self._log.write(table, rows) if self._log else {}
                 if self._wandb:
-                    self._call_wandb(lambda points=points: self._wandb and self._wandb.write(points))
+                    self._call_wandb(self._wandb.write, points)
 
     def sync(self) -> None:
         """Write the queued rows and TensorBoard's buffer: a resume does not repeat rows from before the checkpoint."""
@@ -70,10 +70,10 @@ class Recorder:
         if self._wandb:
             self._call_wandb(self._wandb.close)
 
-    def _call_wandb(self, call: Callable[[], Any]) -> Any:
+    def _call_wandb(self, call: Callable[..., Any], *arguments: Any) -> Any:
         """Return the result of a W&B call; if it fails, stop logging to W&B and continue the run."""
         try:
-            return call()
+            return call(*arguments)
         except Exception as error:
             self._wandb = None
             self.run.log(f"W&B gets no more of this run: {type(error).__name__}: {error}")

@@ -96,7 +96,7 @@ def stratified_bootstrap_interval(
     entirely; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of
     the Statistical Precipice".
     """
-    return _bootstrap_interval([scores], statistic, repetitions, seed, confidence=0.95)
+    return _bootstrap_interval([scores], statistic, repetitions, seed)
 
 
 def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
@@ -112,11 +112,9 @@ def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
     return float(np.mean(_divide(np.nansum(above, axis=(0, 1)), pairs)))
 
 
-def improvement_interval(
-    scores: np.ndarray, others: np.ndarray, repetitions: int = 2000, seed: int = 0, confidence: float = 0.95
-) -> tuple[float, float] | None:
+def improvement_interval(scores: np.ndarray, others: np.ndarray, repetitions: int = 2000) -> tuple[float, float] | None:
     """Return the stratified bootstrap interval of `probability_of_improvement`; None if either has under five seeds."""
-    return _bootstrap_interval([scores, others], probability_of_improvement, repetitions, seed, confidence)
+    return _bootstrap_interval([scores, others], probability_of_improvement, repetitions)
 
 
 def maximum_average_return(rows: np.ndarray) -> tuple[float, int]:
@@ -217,9 +215,9 @@ def _recovery(steps: np.ndarray, returns: np.ndarray, step: int, since: int) -> 
 
 
 def _bootstrap_interval(
-    samples: Sequence[np.ndarray], statistic: Callable[..., float], repetitions: int, seed: int, confidence: float
+    samples: Sequence[np.ndarray], statistic: Callable[..., float], repetitions: int, seed: int = 0
 ) -> tuple[float, float] | None:
-    """Return the percentile interval of `statistic(*samples)`, resampling each sample [seed, ...] independently."""
+    """Return the 95 % percentile interval of `statistic(*samples)`, resampling each sample [seed, ...] on its own."""
     arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
     arrays = [array[~np.isnan(array).any(axis=tuple(range(1, array.ndim)))] for array in arrays]
     if min(map(len, arrays)) < FEWEST_FOR_BOOTSTRAP:
@@ -230,7 +228,7 @@ def _bootstrap_interval(
         return np.take_along_axis(array, generator.integers(len(array), size=array.shape), axis=0)
 
     values = [statistic(*map(resampled, arrays)) for _ in range(repetitions)]
-    low, high = np.quantile(values, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    low, high = np.quantile(values, [0.5 - 0.95 / 2, 0.5 + 0.95 / 2])
     return float(low), float(high)
 
 
