@@ -71,7 +71,7 @@ def choose_run(runs: RunSet, seed: int | None = None) -> RunDirectory:
     """Return the run whose policy `load` returns. Raises InputError as `load` does."""
     if seed is not None:
         if isinstance(seed, bool) or not isinstance(seed, Integral):
-            raise InputError(f"seed is the label of one, a whole number, not {seed!r:.40}")
+            raise InputError(f"seed must be a seed's label, a whole number, not {seed!r:.40}")
         return runs.run(int(seed))
     candidates = [run for run in runs.runs if run.manifest.state != "failed" and has_policy(run, "last")]
     if not candidates and runs.failures:
