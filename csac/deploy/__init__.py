@@ -1,1 +1,1 @@
-"""What leaves: a trained policy as an artefact that runs without JAX."""
+"""Load trained policies and export them as artefacts that run without JAX."""

@@ -1,7 +1,7 @@
-"""A policy that has left its run, in any format: written to a folder, opened again, and run as its user runs it.
+"""Write a policy as an artefact in any format, open an artefact, and run it as its user does.
 
-The folder holds `policy.safetensors`, what runs it (`policy.py`, `policy.onnx` or `policy.h`), and `contract.json`: the
-policy's contract with the checksums of these files, the guards, and where the policy comes from.
+Its folder holds `policy.safetensors`, the file that runs it (`policy.py`, `policy.onnx` or `policy.h`), and
+`contract.json`: the policy's contract with the checksums of these files, the guards, and the policy's provenance.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 Format = Literal["numpy", "onnx", "c"]
 
-_LOADER = FOLDER / "policy.py"  # runs every policy with NumPy alone, copied beside its safetensors
+_LOADER = FOLDER / "policy.py"  # runs any policy with NumPy alone; copied next to policy.safetensors
 FILES: dict[str, str] = {"numpy": "policy.py", "onnx": "policy.onnx", "c": "policy.h"}
 
 
 class Artefact:
-    """An exported policy. Made by `open_artefact`.
+    """An exported policy, as opened by `open_artefact`.
 
-    `fields` is what its `contract.json` holds, `runner` what computes its actions.
+    `fields` is the content of its `contract.json`; `runner` computes its actions.
     """
 
     def __init__(
@@ -54,15 +54,15 @@ class Artefact:
         return self.runner.act(observation)
 
     def reset(self) -> None:
-        """Begin an episode: the guards forget the action before."""
+        """Begin an episode: the guards forget the previous action."""
         self.runner.reset()
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, Any]:
-        """Return the action for one of the environment's observations, [*action_shape], and `state` as it came.
+        """Return the action for one of the environment's observations, [*action_shape], and `state` unchanged.
 
-        In Stable-Baselines3's shape; the action is always deterministic.
+        The signature is that of Stable-Baselines3; the action is always deterministic.
         """
         if episode_start is not None and np.any(episode_start):
             self.reset()
@@ -70,7 +70,7 @@ class Artefact:
 
 
 def write_artefact(folder: Path, policy: Policy, format: Format, guards: Guards, facts: Mapping[str, Any]) -> None:
-    """Write an artefact into an empty folder. `facts` are further fields of its contract."""
+    """Write an artefact into an empty folder. `facts` are additional fields of its `contract.json`."""
     fields = {
         **policy.contract.fields(),
         "observation_size": policy.contract.spec.observation_size,
@@ -90,11 +90,11 @@ def write_artefact(folder: Path, policy: Policy, format: Format, guards: Guards,
 
 
 def open_artefact(path: str | Path, optimise: bool = False) -> Artefact:
-    """Open an artefact, given its folder or a file in it. `optimise` compiles C for this machine's own processor.
+    """Open an artefact, given its folder or a file in it. `optimise` compiles C code for this machine's processor.
 
-    Only csac's own code is run: a loader or a header that differs from what this csac writes is refused.
+    Only csac's own code is run: a loader or header that differs from what this version of csac writes is refused.
 
-    Raises InputError for a damaged or foreign artefact, and where nothing here can run it.
+    Raises InputError for a damaged or foreign artefact, or if ONNX Runtime or the C compiler that it needs is missing.
     """
     check_path("the folder of an artefact", path)
     path = Path(path)
@@ -125,7 +125,7 @@ def open_artefact(path: str | Path, optimise: bool = False) -> Artefact:
 
 
 def _as_json(value: Any) -> Any:
-    """Return a value with the text `Infinity`, `-Infinity` or `NaN` for numbers that JSON has no word for."""
+    """Return a value with the strings `Infinity`, `-Infinity` or `NaN` for numbers that JSON cannot represent."""
     match value:
         case dict():
             return {name: _as_json(item) for name, item in value.items()}

@@ -1,4 +1,4 @@
-"""A policy as one C99 header: `templates/policy.h.jinja` with the arrays of its layers."""
+"""Export a policy as one C99 header: `templates/policy.h.jinja` filled with the arrays of its layers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from csac.deploy.guards import Guards
     from csac.deploy.policy import Policy
 
-BLOCK = 16  # outputs of a layer that are summed side by side: as many as the registers of a Cortex-M4 hold well
+BLOCK = 16  # outputs of a layer that are summed in parallel: as many as fit into a Cortex-M4's registers
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 
 _WIDTH = 120
@@ -45,7 +45,7 @@ int64_t artefact_step(const float *observation, float *action)
 
 
 def header(policy: Policy, guards: Guards, control_rate: float | None) -> str:
-    """Return the header that runs a policy."""
+    """Return the C header that runs a policy."""
     contract, (observation_size, action_size) = policy.contract, policy.contract.spec[:2]
     parameters = deterministic(policy.network.parameters, action_size)
     networks = parameters.actors + parameters.critics
@@ -81,7 +81,7 @@ def header(policy: Policy, guards: Guards, control_rate: float | None) -> str:
 
 
 def _array(name: str, array: np.ndarray) -> str:
-    """Return the definition of a constant array."""
+    """Return the C definition of a constant array."""
     numbers = _in_blocks(array) if array.ndim == 2 else np.atleast_1d(array)
     lines = textwrap.wrap(" ".join(f"{_number(number)}f," for number in numbers), _WIDTH - 4, break_on_hyphens=False)
     return "\n    ".join([f"static const float csac_{name}[{len(numbers)}] = {{", *lines]) + "\n};"
@@ -95,7 +95,7 @@ def _in_blocks(weight: np.ndarray) -> np.ndarray:
 
 
 def _number(number: float) -> str:
-    """Return a float32 number so that C reads the same one."""
+    """Return a float32 number as text that C reads back exactly."""
     if not math.isfinite(number):
         raise InputError(f"the policy has a number {number}, which cannot be written in C")
     text = f"{number:.9g}"
@@ -103,12 +103,12 @@ def _number(number: float) -> str:
 
 
 def _in_comment(text: str) -> str:
-    """Return a text that cannot end the comment that it stands in: a contract may be anybody's."""
+    """Return `text` without characters that could end a C comment: the contract may be untrusted."""
     return re.sub(r"[^\w.:/ -]", "_", text)
 
 
 def compile_c(*arguments: str | Path, program: str = "cc") -> None:
-    """Run a C compiler. Raises InputError if there is none, or with its first error."""
+    """Run a C compiler. Raises InputError if it is not found, or with its first error message."""
     if shutil.which(program) is None:
         raise InputError(f"an artefact in C needs a C compiler, and {program} is not found: install gcc or clang")
     result = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
@@ -118,20 +118,20 @@ def compile_c(*arguments: str | Path, program: str = "cc") -> None:
 
 
 class Library:
-    """Runs a header, compiled into a shared library."""
+    """Run a header, compiled into a shared library."""
 
     def __init__(self, path: Path, policy: Policy, guards: Guards, control_rate: float | None, optimise: bool) -> None:
         text = header(policy, guards, control_rate)
         if read_file(path) != text.encode():
             raise InputError(f"{path} is not the header of this csac, which compiles no other code: export it again")
-        # In a folder of its own: next to the artefact, a stranger's math.h would be taken for the system's.
+        # Not in the artefact's folder: a foreign math.h there would be included instead of the system's.
         with tempfile.TemporaryDirectory(prefix="csac-") as name:
             source, library = Path(name, "artefact.c"), Path(name, "artefact.so")
             Path(name, "policy.h").write_text(text)
             source.write_text(_LIBRARY)
             native = ("-march=native",) if optimise else ()
             compile_c(*STRICT, "-fPIC", "-shared", "-O3", *native, source, "-o", library, "-lm")
-            self._library = ctypes.CDLL(str(library))  # stays in memory without its file
+            self._library = ctypes.CDLL(str(library))  # stays loaded when its file is deleted
         self._step = self._library.artefact_step
         self._step.restype = ctypes.c_int64
         self._action_size = policy.contract.spec.action_size
@@ -143,10 +143,10 @@ class Library:
         return action
 
     def time(self, observation: np.ndarray) -> int:
-        """Return the nanoseconds of a step, by a clock read inside the library."""
+        """Return the duration of a step in nanoseconds, by a clock read inside the library."""
         action = np.empty(self._action_size, np.float32)
         return self._step(ctypes.c_void_p(observation.ctypes.data), ctypes.c_void_p(action.ctypes.data))
 
     def reset(self) -> None:
-        """Forget the action before."""
+        """Forget the previous action."""
         self._library.artefact_reset()

@@ -1,4 +1,4 @@
-"""A model card beside an artefact: Markdown with a header in the form of the Hugging Face Hub."""
+"""Write an artefact's model card: Markdown with the metadata header of the Hugging Face Hub."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ CURVE = "curve.png"
 
 
 def model_card(fields: dict[str, Any], has_curve: bool) -> str:
-    """Return the card of an artefact with these fields in contract.json: what it does, how well, how it was made."""
+    """Return the card for an artefact with these contract.json fields: what it does, how well, how it was trained."""
     return render(
         "card.md.jinja",
         **fields,
         has_curve=has_curve,
         returns=fields["verification"].get("returns") or fields["provenance"]["evaluation"],
-        quoted=json.dumps,  # what JSON writes, YAML reads
+        quoted=json.dumps,  # a JSON string is valid YAML
         with_deviation=_with_deviation,
         with_interval=_with_interval,
         code=_code,
@@ -27,7 +27,7 @@ def model_card(fields: dict[str, Any], has_curve: bool) -> str:
 
 
 def _with_deviation(returns: dict[str, Any]) -> str:
-    """Return a mean and the standard deviation, as cards on the Hub have them: without commas."""
+    """Return `mean +/- standard deviation`, without commas, as cards on the Hub do."""
     mean, deviation = returns["mean_return"], returns["standard_deviation"] or 0.0
     form = ".3g" if 0 < abs(mean) < SMALL else ".2f"
     return f"{mean:{form}} +/- {deviation:{form}}"
@@ -42,6 +42,6 @@ def _with_interval(returns: dict[str, Any]) -> str:
 
 
 def _code(value: Any) -> str:
-    """Return a value as code in a cell of a table."""
+    """Return a value as inline code for a table cell."""
     text = value if isinstance(value, str) else json.dumps(value)
     return "`" + text.replace("|", "\\|").replace("`", "'") + "`"

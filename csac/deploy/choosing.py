@@ -1,4 +1,4 @@
-"""Which policy to load: of a run one seed's, or that of the seed with the best last evaluations; or a saved one."""
+"""Load a saved policy, or one of a run: a given seed's, or that of the seed with the best last evaluations."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from csac.types import InputError
 
 
 def load(directory: str | os.PathLike[str], seed: int | None = None, which: Which = "last") -> Policy:
-    """Return a policy of a run, or one that was saved by itself (`Policy.save`).
+    """Return a policy of a run, or one saved on its own by `Policy.save`.
 
     Args:
-        directory: a set of runs, a run, or the folder of a policy that was saved by itself.
+        directory: a set of runs, a run, or the folder of a policy saved on its own.
         seed: the seed's label; by default the seed with the best mean return over its last three evaluation points,
-            among those that did not fail. That choice favours a lucky seed: report the policy on fresh evaluation
-            seeds.
+            among those that did not fail. That choice favours a lucky seed: report the policy's return on fresh
+            evaluation seeds.
         which: the seed's `last` policy, or the one of its `best` evaluation. The best is a maximum over all evaluation
-            points, each a mean over a few fixed starts (ten by default), so that its own number is too high, and more
-            so the noisier they are: evaluate it on fresh seeds before you say how good it is.
+            points, each a mean over a few fixed starts (ten by default), so its recorded return is biased upwards,
+            the more so the noisier the evaluations: evaluate it on fresh seeds before you report it.
 
     Raises:
-        InputError: no run there, no such seed (the message names those there), a damaged file, or every seed failed and
-            none was asked for.
+        InputError: there is no run or no such seed (the message names the seeds there are), a file is damaged, or every
+            seed failed and none was given.
     """
     if which not in get_args(Which):
         raise InputError(f"which={which!r}: choose 'last' or 'best'")
@@ -48,7 +48,7 @@ def load(directory: str | os.PathLike[str], seed: int | None = None, which: Whic
 
 
 class TrainedRuns(RunSet):
-    """What `train` and `resume` return: runs, and their policies."""
+    """The runs that `train` and `resume` return, with a method that loads their policies."""
 
     def policy(self, seed: int | None = None, which: Which = "last") -> Policy:
         """Return the policy that `load` would. Raises InputError as `load` does."""
@@ -56,32 +56,32 @@ class TrainedRuns(RunSet):
 
 
 def load_run(run: RunDirectory, which: Which = "last") -> Policy:
-    """Return a policy of one run. Raises InputError where it has none, or a damaged file."""
+    """Return a policy of one run. Raises InputError if it has none yet or the file is damaged."""
     if not has_policy(run, which):
         raise InputError(f"{run.path} has no {which} policy yet: its first evaluation writes it")
     return Policy.load(run.policy_file(which))
 
 
 def has_policy(run: RunDirectory, which: Which) -> bool:
-    """Return whether a run has left this policy; a best one comes with its first evaluation."""
+    """Return whether a run has written this policy; the best one is first written at the first evaluation."""
     return run.policy_file(which).exists()
 
 
 def choose_run(runs: RunSet, seed: int | None = None) -> RunDirectory:
-    """Return the run that `load` takes. Raises InputError as `load` does."""
+    """Return the run whose policy `load` returns. Raises InputError as `load` does."""
     if seed is not None:
         if isinstance(seed, bool) or not isinstance(seed, Integral):
-            raise InputError(f"seed is the label of one, a whole number, not {seed!r:.40}")
+            raise InputError(f"seed must be a seed's label, a whole number, not {seed!r:.40}")
         return runs.run(int(seed))
-    sound = [run for run in runs.runs if run.manifest.state != "failed" and has_policy(run, "last")]
-    if not sound and runs.failures:
+    candidates = [run for run in runs.runs if run.manifest.state != "failed" and has_policy(run, "last")]
+    if not candidates and runs.failures:
         failed, reason = next(iter(runs.failures.items()))
         raise InputError(f"every seed of {runs.path} failed (seed {failed} at {reason}): train again, or give a seed")
-    if not sound:
+    if not candidates:
         raise InputError(f"{runs.path} holds no policies: an evaluation writes them")
-    scores = last_evaluations(RunSet(runs.path, sound).evaluations)
+    scores = last_evaluations(RunSet(runs.path, candidates).evaluations)
     scores = {seed: score for seed, score in scores.items() if not math.isnan(score)}
-    if len(sound) > 1 and not scores:
+    if len(candidates) > 1 and not scores:
         seeds = ", ".join(map(str, runs.seeds))
         raise InputError(f"{runs.path} has no evaluations to choose by: give a seed, one of {seeds}")
-    return max(sound, key=lambda run: (scores.get(run.seed, -math.inf), -run.seed))
+    return max(candidates, key=lambda run: (scores.get(run.seed, -math.inf), -run.seed))

@@ -1,4 +1,4 @@
-"""What a policy and its task agree on: flattening, shapes and action bounds, kept as JSON beside the policy."""
+"""The contract of a policy with its task: flattening, shapes and action bounds, kept as JSON beside the policy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 CONTRACT = "contract.json"
 SCHEMA_VERSION = 2
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-BOUNDS_ROUNDING = 1e-6  # of a bound: a few times what float32 rounds by
+BOUNDS_ROUNDING = 1e-6  # relative to the bound: a few times float32's rounding error
 
 Head = Literal["tanh_gaussian", "tanh", "clipped_gaussian"]
 
@@ -37,7 +37,7 @@ class ActionBounds:
         self.half, self.centre = 0.5 * high - 0.5 * low, 0.5 * high + 0.5 * low
 
     def scale(self, action: np.ndarray) -> np.ndarray:
-        """Return a new array of actions [..., action], clipped so that rounding does not leave the bounds."""
+        """Map actions [..., action] to the bounds, in a new array; clipped, since rounding may exceed them."""
         scaled = action * self.half
         scaled += self.centre
         np.maximum(scaled, self._low, out=scaled)
@@ -46,10 +46,10 @@ class ActionBounds:
 
 @dataclass(frozen=True, eq=False)
 class Contract:
-    """What the policy and its task agree on: how observations are flattened and what actions mean.
+    """The contract of a policy with its task: how observations are flattened and what actions mean.
 
     `observation_parts` lists (key, shape) in the order of the flat observation: one part with the key None for a plain
-    Box, else the parts of a Dict sorted by name. Actions inside lie in [-1, 1]; `action_low` and `action_high`,
+    Box, else the parts of a Dict sorted by name. The network's actions lie in [-1, 1]; `action_low` and `action_high`,
     float32 [action], are the environment's bounds.
     """
 
@@ -77,7 +77,7 @@ class Contract:
     def flatten(self, observation: Any) -> np.ndarray:
         """Return `observation` as float32 [observation], or a batch of them as [n, observation].
 
-        Takes what the environment gives (an array, or a dict of arrays), a batch of it, or what is flat already.
+        Accepts the environment's observations (an array, or a dict of arrays), batches of them, and flat arrays.
         """
         if isinstance(observation, dict):
             return self._flatten_dict(observation)
@@ -86,15 +86,15 @@ class Contract:
         for expected in [shape] * (key is None) + [(self.spec.observation_size,)]:
             if (flat := _flat(array, expected)) is not None:
                 return flat
-        taken = shape if key is None else f"a dict of {[key for key, _ in self.observation_parts]}"
-        raise InputError(f"the observation has shape {array.shape}; the policy takes {taken}, or a batch of it")
+        accepted = shape if key is None else f"a dict of {[key for key, _ in self.observation_parts]}"
+        raise InputError(f"the observation has shape {array.shape}; the policy takes {accepted}, or a batch of it")
 
     def to_environment(self, action: np.ndarray) -> np.ndarray:
-        """Return actions of [-1, 1], [..., action], on the environment's scale: float32 [..., *action_shape]."""
+        """Map actions from [-1, 1], [..., action], to the environment's scale: float32 [..., *action_shape]."""
         return self.bounds.scale(action).reshape(action.shape[:-1] + self.action_shape)
 
     def fields(self) -> dict[str, Any]:
-        """Return what its JSON holds."""
+        """Return the content of its JSON file."""
         return {
             "schema_version": SCHEMA_VERSION,
             "task": self.task,
@@ -110,7 +110,7 @@ class Contract:
 
     @staticmethod
     def of_fields(fields: Any, path: str | Path) -> Contract:
-        """Return the contract with these `fields`. Raises InputError, which names `path`, if they are invalid."""
+        """Return the contract with these `fields`. Raises InputError, naming `path`, if they are invalid."""
         try:
             return _contract(fields)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -119,9 +119,9 @@ class Contract:
 
     def _flatten_dict(self, observation: Mapping[str | None, Any]) -> np.ndarray:
         keys = [key for key, _ in self.observation_parts]
-        if (given := sorted(observation, key=str)) != keys:
-            taken = "one array and no dict" if keys == [None] else keys
-            raise InputError(f"the observation has the keys {given}; the policy takes {taken}")
+        if (given_keys := sorted(observation, key=str)) != keys:
+            accepted = "one array and no dict" if keys == [None] else keys
+            raise InputError(f"the observation has the keys {given_keys}; the policy takes {accepted}")
         parts = []
         for key, shape in self.observation_parts:
             array = _as_float32(observation[key], f"observation[{key!r}]")
@@ -134,7 +134,7 @@ class Contract:
 
 
 def _flat(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Return an array of this shape as [size], a batch of them as [n, size], and None for any other."""
+    """Return an array of this shape as [size], a batch of such arrays as [n, size], and None for any other shape."""
     if array.shape != shape and (array.ndim == 0 or array.shape[1:] != shape):
         return None
     return array.reshape((*array.shape[: array.ndim - len(shape)], math.prod(shape)))
@@ -153,14 +153,14 @@ def _contract(fields: Any) -> Contract:
     if keys != [None] and not (keys and all(isinstance(key, str) for key in keys) and keys == sorted(set(keys))):
         raise ValueError("observation_parts are not one plain part or sorted, distinct keys")
     action_shape = _shape(fields["action_shape"])
-    with np.errstate(over="ignore"):  # becomes infinite, which is refused
+    with np.errstate(over="ignore"):  # overflow gives infinity, which is refused below
         low, high = (np.array(fields[name], np.float32) for name in ("action_low", "action_high"))
     if not low.shape == high.shape == (math.prod(action_shape),):
         raise ValueError("action bounds and action_shape disagree")
     if not (np.isfinite([low, high]).all() and (low <= high).all()):
         raise ValueError("action bounds are not finite or not in order")
-    given = {name: fields[name] for name in ("task", "algorithm", *names)}
-    return Contract(**given, observation_parts=parts, action_shape=action_shape, action_low=low, action_high=high)
+    texts = {name: fields[name] for name in ("task", "algorithm", *names)}
+    return Contract(**texts, observation_parts=parts, action_shape=action_shape, action_low=low, action_high=high)
 
 
 def _shape(numbers: Any) -> tuple[int, ...]:
@@ -179,30 +179,30 @@ def _as_float32(value: Any, name: str) -> np.ndarray:
 
 
 def write_with_checksum(path: Path, content: bytes, fields: Mapping[str, Any] | None = None) -> None:
-    """Write a file, and its SHA-256 into `contract.json` beside it. Raises OSError.
+    """Write a file, and its SHA-256 into the `contract.json` beside it. Raises OSError.
 
-    Meanwhile the contract has the checksums of both the old and the new file, so that a kill leaves files that match.
-    With `fields` these are the contract's, and checksums of files of another contract go.
+    During the write the contract lists the checksums of the old and the new file: a kill leaves a file that matches.
+    `fields`, if given, become the contract; if they differ from its old fields, other files' checksums are dropped.
     """
-    place, before = path.with_name(CONTRACT), {}
-    with suppress(InputError):  # none there, or a damaged one
-        before |= read_json(place)
-    checksums = before.pop("sha256", {})
-    if fields is not None and before != {**fields}:
-        before, checksums = {**fields}, {}
+    contract_path, kept_fields = path.with_name(CONTRACT), {}
+    with suppress(InputError):  # missing or damaged
+        kept_fields |= read_json(contract_path)
+    checksums = kept_fields.pop("sha256", {})
+    if fields is not None and kept_fields != {**fields}:
+        kept_fields, checksums = {**fields}, {}
     old, new = checksums.get(path.name, ""), hashlib.sha256(content).hexdigest()
 
-    def write_contract(known: str) -> None:
-        write_json(place, {**before, "sha256": dict(sorted({**checksums, path.name: known}.items()))})
+    def write_contract(checksum: str) -> None:
+        write_json(contract_path, {**kept_fields, "sha256": dict(sorted({**checksums, path.name: checksum}.items()))})
 
-    there = sha256_of(path) if path.exists() else ""
-    write_contract(f"{new} {there}" if there in old else new)
+    current = sha256_of(path) if path.exists() else ""
+    write_contract(f"{new} {current}" if current in old else new)
     write_atomically(path, content)
     write_contract(new)
 
 
 def check_checksum(path: Path, fields: Any) -> None:
-    """Raise InputError if the contract's `fields` hold no checksum of a file, or another one."""
+    """Raise InputError if the contract's `fields` have no checksum of a file, or a different one."""
     checksums = fields.get("sha256") if isinstance(fields, dict) else None
     known = checksums.get(path.name) if isinstance(checksums, dict) else None
     if not isinstance(known, str):
@@ -226,7 +226,7 @@ def read_file(path: Path) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """Return what a JSON file holds. Raises InputError if it cannot be read, or is none."""
+    """Return the content of a JSON file. Raises InputError if it cannot be read or parsed."""
     content = read_file(path)
     try:
         return json.loads(without_controls(content).decode())
@@ -235,5 +235,5 @@ def read_json(path: Path) -> Any:
 
 
 def write_json(path: Path, fields: Mapping[str, Any]) -> None:
-    """Write `fields` as JSON, whole or not at all."""
+    """Write `fields` as JSON, atomically."""
     write_atomically(path, (json.dumps(fields, indent=2, allow_nan=False) + "\n").encode())

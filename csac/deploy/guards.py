@@ -1,6 +1,6 @@
-"""Guards between a policy and an actuator: a fallback for what is not finite, and a limit on change.
+"""Guards between a policy and an actuator: a fallback for non-finite numbers, and a limit on the action's change.
 
-This is the definition. An artefact of every format has the same in its own language, and is tested against this one.
+This is the reference: artefacts of every format implement it in their own language and are tested against it.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Guards:
-    """What an artefact checks and limits, as float32 [action]; nothing without a `fallback`.
+    """What an artefact checks and limits; nothing without a `fallback`. Arrays are float32 [action].
 
-    Where a number of the observation or of the policy's action is not finite, the fallback replaces the action: the
-    action before if `repeats_last`, and `fallback` if not or if there was none. `largest_change` is how far each action
-    may be from the one before, a fallback included; the first action after a reset is not limited.
+    If any number of the observation or of the policy's action is not finite, the action is replaced: by the previous
+    action if `repeats_last` is set and there is one, else by `fallback`. `largest_change` is how far each action, even
+    a fallback, may be from the previous one; the first action after a reset is not limited.
     """
 
     fallback: np.ndarray | None = None
@@ -32,11 +32,11 @@ class Guards:
 
     @property
     def has_state(self) -> bool:
-        """Whether an action depends on the one before."""
+        """Whether an action depends on the previous one."""
         return self.repeats_last or self.largest_change is not None
 
     def fields(self) -> dict[str, Any]:
-        """Return what its JSON holds."""
+        """Return the fields as JSON values."""
         return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(self).items()}
 
     @staticmethod
@@ -54,7 +54,7 @@ class Guards:
     def apply(
         self, action: np.ndarray, observation: np.ndarray, last: np.ndarray | None, contract: Contract
     ) -> np.ndarray:
-        """Return a new array, [action], to send instead of the policy's `action`; `last` was sent before, if any."""
+        """Return the action to send, a new array [action]; `last` is the action sent before, None after a reset."""
         if self.fallback is not None and not (np.isfinite(observation).all() and np.isfinite(action).all()):
             action = last if self.repeats_last and last is not None else self.fallback
         if self.largest_change is not None and last is not None:
@@ -64,11 +64,11 @@ class Guards:
 
 
 def make_guards(contract: Contract, fallback: str | None = None, rate_limit: float | None = None) -> Guards:
-    """Return the guards for what a user asks for. Raises InputError.
+    """Return the guards for `--fallback` and `--rate-limit`. Raises InputError.
 
-    The fallback is `zero`, `middle` of the bounds, `last` action, or numbers with commas between them, one per action.
-    The limit is how much an action may change in a step, as a share of its range. It needs a fallback, because NaN
-    cannot be limited: `last` by default.
+    `fallback` is `zero`, `middle` (of the bounds), `last` (the previous action), or comma-separated numbers, one per
+    action. `rate_limit` is how much an action may change in a step, as a share of its range. It needs a fallback,
+    because NaN cannot be limited: `last` by default.
     """
     low, high, half = contract.action_low, contract.action_high, contract.bounds.half
     change = None

@@ -1,4 +1,4 @@
-"""How long an artefact takes for one action, call by call: one after the other, and at the rate of a controller."""
+"""Measure the latency of an artefact's actions, call by call: back to back, and at the rate of a controller."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ if TYPE_CHECKING:
 
     from csac.deploy.artefact import Artefact
 
-USUAL_RATE = 100.0  # Hz, if neither the contract nor the user says one
-MOST_CALLS = 10_000_000  # of one measurement
+USUAL_RATE = 100.0  # Hz, if neither the contract nor the user gives one
+MOST_CALLS = 10_000_000  # per measurement
 
-_OBSERVATIONS = 1_024  # random ones, used in turn
-_WARM_UP = 1_000  # calls that are not counted
+_OBSERVATIONS = 1_024  # random observations, used in turn
+_WARM_UP = 1_000  # calls that are not measured
 
 
 class Latency(NamedTuple):
-    """What was measured of single calls, in nanoseconds."""
+    """Measured times of single calls, in nanoseconds."""
 
     durations: np.ndarray
-    """From right before a call to right after it, int64 [calls]."""
+    """From right before each call to right after it, int64 [calls]."""
     lateness: np.ndarray | None = None
-    """How long after it was due a call began, int64 [calls]; None if calls followed each other at once."""
+    """How late each call began after it was due, int64 [calls]; None if calls ran back to back."""
     rate: float | None = None
-    """Calls per second that were due."""
+    """Scheduled calls per second; None if calls ran back to back."""
 
 
 def measure(
     artefact: Artefact, calls: int = 100_000, rate: float | None = None, seconds: float = 10.0
 ) -> tuple[Latency, ...]:
-    """Return what an artefact takes for `calls` one after the other, and then for `seconds` at a rate.
+    """Time an artefact's actions for `calls` calls back to back, and then for `seconds` at a fixed rate.
 
-    An artefact in C is timed inside its compiled library, one in Python around `act`, with the garbage collector off.
+    An artefact in C is timed inside its compiled library, the others around `act`, with the garbage collector off.
     Observations are standard normal.
 
     Args:
-        artefact: opened with `optimise`, to time C as it would be compiled for this machine.
+        artefact: open it with `optimise` to time C code compiled for this machine.
         calls: at least 1.
         rate: Hz; by default the control rate of the task, or 100 if it is not known.
-        seconds: 0 leaves the second measurement out.
+        seconds: 0 skips the second measurement.
     """
     rate = float((artefact.fields["control_rate_hz"] or USUAL_RATE) if rate is None else rate)
     paced = rate * seconds
@@ -76,7 +76,7 @@ def _timed(artefact: Artefact) -> Callable[[np.ndarray], int]:
 def time_calls(
     time_call: Callable[[np.ndarray], int], observations: list[np.ndarray], calls: int, period: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nanoseconds of each call and how late it began, int64 [calls]; each is due `period` after another."""
+    """Return how long each call took and how late it began, int64 [calls], for calls due every `period`, all in ns."""
     durations, lateness = np.zeros((2, calls), np.int64)
     due, is_collecting = time.perf_counter_ns(), gc.isenabled()
     gc.disable()

@@ -1,4 +1,4 @@
-"""A policy as an ONNX graph, from the raw observation to the environment's action, built node by node."""
+"""Export a policy as an ONNX graph, from the raw observation to the environment's action, built node by node."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from csac.deploy.policy import Policy
     from csac.types import Layer
 
-OPSET = 17  # of 2022: every runtime in use has it
-IR_VERSION = 8  # the oldest that goes with it
+OPSET = 17  # from 2022: every runtime in use supports it
+IR_VERSION = 8  # the oldest that allows this opset
 
 
 def model(policy: Policy, guards: Guards, fields: dict[str, Any]) -> bytes:
-    """Return the file of an ONNX model, with the contract as metadata. Everything in it is float32.
+    """Return the content of an ONNX model file, with the contract as metadata. All numbers are float32.
 
-    Inputs: `observation` [n, observation]; `state` [n, action + 1] if the guards remember the action before: zeros at
-    first and after a reset, then what `next_state` gave. Outputs: `action` [n, action] on the environment's scale, and
-    `next_state`.
+    Inputs: `observation` [n, observation]; `state` [n, action + 1] if the guards remember the previous action: zeros at
+    first and after a reset, then the last `next_state`. Outputs: `action` [n, action] on the environment's scale, and
+    `next_state` if there is a `state`.
     """
-    for package in ("onnx", "onnxruntime"):  # the one writes the graph, the other runs it to verify it
+    for package in ("onnx", "onnxruntime"):  # onnx writes the graph, onnxruntime runs it for verification
         if importlib.util.find_spec(package) is None:
             raise _missing(package)
     import onnx
@@ -49,13 +49,13 @@ def model(policy: Policy, guards: Guards, fields: dict[str, Any]) -> bytes:
 
     nodes = [helper.make_node(kind, names, [output], output, **options) for kind, names, output, options in graph.nodes]
     constants = [onnx.numpy_helper.from_array(array, name) for name, array in graph.constants.items()]
-    built = helper.make_graph(nodes, "policy", values(inputs), values(outputs), constants)
-    made = helper.make_model(
-        built, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="csac"
+    onnx_graph = helper.make_graph(nodes, "policy", values(inputs), values(outputs), constants)
+    onnx_model = helper.make_model(
+        onnx_graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="csac"
     )
-    helper.set_model_props(made, {"contract": json.dumps(fields, allow_nan=False)})
-    checker.check_model(made, full_check=True)
-    return made.SerializeToString(deterministic=True)
+    helper.set_model_props(onnx_model, {"contract": json.dumps(fields, allow_nan=False)})
+    checker.check_model(onnx_model, full_check=True)
+    return onnx_model.SerializeToString(deterministic=True)
 
 
 def _missing(package: str) -> InputError:
@@ -63,7 +63,7 @@ def _missing(package: str) -> InputError:
 
 
 class Session:
-    """Runs a graph by ONNX Runtime, in one thread: a controller shares its processor."""
+    """Run a graph with ONNX Runtime, in one thread: a controller shares its processor."""
 
     def __init__(self, path: Path, policy: Policy, guards: Guards) -> None:
         try:
@@ -74,33 +74,33 @@ class Session:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        self._first = np.zeros((1, policy.contract.spec.action_size + 1), np.float32) if guards.has_state else None
+        self._zeros = np.zeros((1, policy.contract.spec.action_size + 1), np.float32) if guards.has_state else None
         self.reset()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return the action for an observation."""
-        given = {"observation": observation[None]}
+        inputs = {"observation": observation[None]}
         if self._state is not None:
-            given["state"] = self._state
-        outputs: Any = self._session.run(None, given)
+            inputs["state"] = self._state
+        outputs: Any = self._session.run(None, inputs)
         if self._state is not None:
             self._state = outputs[1]
         return outputs[0][0]
 
     def reset(self) -> None:
-        """Forget the action before."""
-        self._state = self._first
+        """Forget the previous action."""
+        self._state = self._zeros
 
 
 class _Graph:
-    """Nodes in the order in which they run, and the arrays that they use."""
+    """Nodes in execution order, and the constant arrays that they use."""
 
     def __init__(self) -> None:
         self.nodes: list[tuple[str, list[str], str, dict[str, Any]]] = []
         self.constants: dict[str, np.ndarray] = {}
 
     def add(self, kind: str, inputs: Sequence[Any], output: str = "", **options: Any) -> str:
-        """Add a node; return the name of its output. An array or a number among the inputs becomes a constant."""
+        """Add a node; return the name of its output. Arrays and numbers among the inputs become constants."""
         output = output or f"{kind.lower()}_{len(self.nodes)}"
         names = [item if isinstance(item, str) else self._constant(np.asarray(item)) for item in inputs]
         self.nodes.append((kind, names, output, options))
@@ -112,11 +112,11 @@ class _Graph:
         return name
 
     def clip(self, name: str, low: Any, high: Any) -> str:
-        """Return values within [low, high]; bounds may differ from number to number, and be computed."""
+        """Clip values to [low, high]; return the output's name. Bounds may be arrays or names of other outputs."""
         return self.add("Min", [self.add("Max", [name, low]), high])
 
     def network(self, layers: tuple[Layer, ...], inputs: str, activation: str) -> str:
-        """Return the output of an MLP."""
+        """Add an MLP; return the name of its output."""
         for index, (weight, bias, scale, shift) in enumerate(layers):
             inputs = inputs if index == 0 else self.activated(inputs, activation)
             inputs = self.add("Gemm", [inputs, weight, bias])
@@ -125,7 +125,7 @@ class _Graph:
         return inputs
 
     def activated(self, name: str, activation: str) -> str:
-        """Return the activation of values; this version of ONNX has no SiLU and no GELU."""
+        """Add an activation; return the name of its output. This opset has no SiLU and no GELU."""
         match activation:
             case "silu":
                 return self.add("Mul", [name, self.add("Sigmoid", [name])])
@@ -138,13 +138,13 @@ class _Graph:
         return self.add(activation.capitalize(), [name])
 
     def is_finite(self, name: str) -> str:
-        """Return whether all numbers of a row are finite, [n, 1]."""
-        zeros = self.add("Mul", [name, 0.0])  # NaN where it is not finite, which no sum loses, unlike a maximum
+        """Add a test whether all numbers of each row are finite; return the name of its output, [n, 1]."""
+        zeros = self.add("Mul", [name, 0.0])  # NaN where not finite; a sum keeps NaN, a maximum may not
         return self.add("Equal", [self.add("ReduceSum", [zeros, np.array([1])], keepdims=1), 0.0])
 
 
 def _action(graph: _Graph, policy: Policy) -> str:
-    """Add everything from the observation to the action within its bounds; return the action's name."""
+    """Add all nodes from the observation to the action within its bounds; return the action's name."""
     contract, inputs = policy.contract, "observation"
     parameters = deterministic(policy.network.parameters, contract.spec.action_size)
     if (normaliser := parameters.normaliser) is not None:
@@ -157,7 +157,7 @@ def _action(graph: _Graph, policy: Policy) -> str:
     for layers, candidate in zip(parameters.critics, actions, strict=bool(parameters.critics)):
         value = graph.network(layers, graph.add("Concat", [inputs, candidate], axis=1), contract.critic_activation)
         if best:
-            # As for NumPy, a NaN is above all: what goes wrong is for the guards to see.
+            # As in NumPy's argmax, NaN counts as the highest value, so that the guards see it.
             is_first_nan = graph.add("And", [graph.add("IsNaN", [value]), graph.add("Equal", [best, best])])
             is_more = graph.add("Or", [graph.add("Greater", [value, best]), is_first_nan])
             action = graph.add("Where", [is_more, candidate, action])
@@ -170,7 +170,7 @@ def _action(graph: _Graph, policy: Policy) -> str:
 def _guarded(graph: _Graph, guards: Guards, contract: Contract, action: str) -> str:
     """Add the guards, as `csac.deploy.guards` defines them; return the name of the action to send.
 
-    The state holds the action before, and 1 once there is one.
+    The state holds the previous action, and a flag that is 1 once there is one.
     """
     if guards.fallback is None:
         return action

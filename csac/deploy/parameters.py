@@ -1,4 +1,4 @@
-"""The arrays of a policy: by name in a file, copied, and without those that a deterministic action does not need."""
+"""A policy's arrays: named for a file, copied, or reduced to those that a deterministic action needs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def copied(parameters: PolicyParameters) -> PolicyParameters:
-    """Return the same numbers as float32 arrays of their own."""
+    """Return a copy of the parameters as float32 arrays."""
     return from_tensors(
         {name: np.array(array, np.float32, order="C") for name, array in to_tensors(parameters).items()}
     )
@@ -31,7 +31,7 @@ def deterministic(parameters: PolicyParameters, action_size: int) -> PolicyParam
 
 
 def to_tensors(parameters: PolicyParameters) -> dict[str, Any]:
-    """Return every array by the name that it has in a file."""
+    """Return every array by its name in a file."""
     tensors = {
         f"{kind}.{number}.{index}.{name}": array
         for kind, networks in (("actor", parameters.actors), ("critic", parameters.critics))
@@ -48,7 +48,7 @@ def to_tensors(parameters: PolicyParameters) -> dict[str, Any]:
 
 
 def from_tensors(tensors: Mapping[str, np.ndarray]) -> PolicyParameters:
-    """Return the parameters that `to_tensors` named so."""
+    """Return the parameters for arrays named by `to_tensors`."""
     normaliser = [tensors.get(f"normaliser.{name}") for name in Normaliser._fields]
     return PolicyParameters(
         _networks(tensors, "actor"),

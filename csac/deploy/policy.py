@@ -1,4 +1,4 @@
-"""A trained policy as an artefact: plain layers and the contract with the task, run by NumPy alone."""
+"""A trained policy, run by NumPy alone: plain layers and the contract with the task."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from csac.types import LAYER_NORM_EPSILON, InputError, Layer, Normaliser, Policy
 if TYPE_CHECKING:
     from csac.types import Activation
 
-POLICY = "policy.safetensors"  # in the folder of a policy that was saved by itself, and of an artefact
-# What a folder holds that is a run, its policies or an artefact.
+POLICY = "policy.safetensors"  # file name in the folder of an artefact, or of a policy saved on its own
+# Any of these files shows that a folder is a run, a run's policies or an artefact.
 OCCUPIED = {"manifest.json", "last.safetensors", "best.safetensors", "policy.py", "policy.onnx", "policy.h"}
 LOG_STD_RANGE = (-20.0, 2.0)
 GELU_SCALE, GELU_CUBE = (2 / math.pi) ** 0.5, 0.044715  # Hendrycks and Gimpel 2016, section 2
 
-_STREAM = 0x706F6C69  # far from what a task that spawns generators of its own would use: 0, 1, 2, ...
+_STREAM = 0x706F6C69  # far from the spawn keys of a task's own generators: 0, 1, 2, ...
 
 
 def noise_generator(seed: int) -> np.random.Generator:
     """Return the generator of the stochastic actions of `seed`.
 
-    Gymnasium gives `default_rng(seed)` to a task that is reset with `seed`. This is another stream: actions drawn from
-    the same numbers as the task's own chances would foresee them.
+    Gymnasium gives `default_rng(seed)` to a task that is reset with `seed`. This is a different stream: otherwise the
+    actions' noise would be correlated with the task's randomness.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STREAM,)))
 
 
 class Policy:
-    """A policy network on NumPy, with `predict` in Stable-Baselines3's shape.
+    """A policy network in NumPy, with the signature of Stable-Baselines3's `predict`.
 
     Args:
         network: the layers; copied, so that the caller may donate or change them afterwards.
-        contract: how observations become flat and actions leave [-1, 1].
-        seed: of the generator of stochastic actions.
-        step: how many environment steps its seed had made when it was taken, if that is known.
+        contract: how observations are flattened and actions mapped from [-1, 1] to the environment's bounds.
+        seed: seed of the generator of stochastic actions.
+        step: the environment step in training that the policy is from, if known.
 
     Raises:
         InputError: layers that do not fit each other or the contract.
@@ -63,8 +63,8 @@ class Policy:
         if kinds != (self.contract.activation, self.contract.head, self.contract.critic_activation):
             raise InputError(f"the policy is {network.activation}/{network.head}, not as its contract says")
         try:
-            given = np.zeros((1, observation_size), np.float32), False, np.zeros((1, action_size), np.float32)
-            fits = self.act(*given).shape == (1, action_size)
+            arguments = np.zeros((1, observation_size), np.float32), False, np.zeros((1, action_size), np.float32)
+            fits = self.act(*arguments).shape == (1, action_size)
         except (ValueError, TypeError, IndexError):
             fits = False
         if not fits:
@@ -73,14 +73,14 @@ class Policy:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, Any]:
-        """Return the action on the environment's scale, and `state` as it came.
+        """Return the action on the environment's scale, and `state` unchanged.
 
-        Deterministic unless told otherwise, as a controller is; Stable-Baselines3's `predict` samples unless told.
+        Deterministic by default, as a controller is; Stable-Baselines3's `predict` samples by default.
         One observation gives float32 [*action_shape], a batch of n (or a dict of such batches) [n, *action_shape].
-        One that is not finite gives an action that is not: `csac export` builds in guards that replace it.
+        A non-finite observation gives a non-finite action: `csac export` builds in guards that replace it.
 
         Raises:
-            InputError: an observation that is not of the task's shape, or `deterministic` is no bool.
+            InputError: an observation does not have the task's shape, or `deterministic` is not a bool.
         """
         check_flag("deterministic", deterministic)
         flat = self.contract.flatten(observation)
@@ -91,7 +91,7 @@ class Policy:
         """Return actions in [-1, 1], [n, action], for flat float32 observations [n, observation].
 
         A stochastic action adds std * noise to the mean before the head's tanh or clip; `noise`, standard normal
-        [n, action], is drawn if not given. The head `tanh` has no spread: it gives the same action either way.
+        [n, action], is drawn if not given. The head `tanh` has no std: it gives the same action either way.
         """
         if not deterministic and noise is None:
             noise = self._generator.standard_normal(
@@ -103,14 +103,14 @@ class Policy:
         return actions[np.argmax(values, axis=0), np.arange(len(observations))]
 
     def candidates(self, observations: np.ndarray, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return each actor's actions in [-1, 1], [actor, n, action], and its own critic's values, [actor, n].
+        """Return each actor's actions in [-1, 1], [actor, n, action], and its critic's values of them, [actor, n].
 
-        The values are None for a single actor. `act` takes row by row the action with the highest value, the first of
-        equals. Observations in float64 are computed on in float64.
+        The values are None for a single actor. For each row, `act` takes the action with the highest value, the first
+        in a tie. For float64 observations, the computation is in float64.
         """
         normaliser = self.network.parameters.normaliser
         inputs = observations if normaliser is None else _normalised(observations, normaliser)
-        with np.errstate(over="ignore", invalid="ignore"):  # an action that is not a number is refused by its name
+        with np.errstate(over="ignore", invalid="ignore"):  # non-finite actions are refused where they are used
             if len(self._actors) == 1:
                 return self._action(self._actors[0], inputs, noise)[None], None
             actions = [self._action(actor, inputs, noise) for actor in self._actors]
@@ -134,7 +134,7 @@ class Policy:
         return np.tanh(action, out=action)
 
     def save(self, directory: str | Path) -> None:
-        """Write the policy and its contract into a folder, made if needed; `csac.load` reads it.
+        """Write the policy and its contract into a folder, created if needed; `csac.load` reads it.
 
         Raises:
             InputError: the folder holds a run or an artefact, or cannot be written.
@@ -149,39 +149,39 @@ class Policy:
             self.write(folder / POLICY)
 
     def write(self, path: Path) -> None:
-        """Write the policy's file, and its contract with the file's checksum beside it. Raises OSError."""
+        """Write the policy's file and, beside it, its contract with the file's checksum. Raises OSError."""
         path.parent.mkdir(exist_ok=True)
         write_with_checksum(path, self.encode(), self.contract.fields())
 
     def encode(self) -> bytes:
-        """Return the content of its safetensors file: the layers, and the step as metadata."""
+        """Return the content of the policy's safetensors file: the layers, and the step as metadata."""
         metadata = None if self.step is None else {"step": str(self.step)}
         return safetensors.numpy.save(to_tensors(self.network.parameters), metadata)
 
     @staticmethod
     def load(path: str | Path) -> Policy:
-        """Read a policy's file and `contract.json` beside it.
+        """Read a policy's file and the `contract.json` beside it.
 
         Raises:
-            InputError: a file that is missing or damaged, or a policy that the contract does not belong to.
+            InputError: a file is missing or damaged, or the contract is that of another policy.
         """
         path = Path(path)
-        place = path.with_name(CONTRACT)
-        agreement = Contract.of_fields(fields := read_json(place), place)
+        contract_path = path.with_name(CONTRACT)
+        contract = Contract.of_fields(fields := read_json(contract_path), contract_path)
         check_checksum(path, fields)
         try:
             with safetensors.safe_open(path, "numpy") as file:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
                 step = (file.metadata() or {}).get("step")
-            kinds = agreement.activation, agreement.head, agreement.critic_activation
+            kinds = contract.activation, contract.head, contract.critic_activation
             network = PolicyNetwork(from_tensors(tensors), *kinds)
-            return Policy(network, agreement, step=None if step is None else int(step))
+            return Policy(network, contract, step=None if step is None else int(step))
         except (safetensors.SafetensorError, ValueError) as error:  # InputError is a ValueError
-            raise InputError(f"{path} is not a policy of {place.name} ({error}): restore both from a copy") from error
+            raise InputError(f"{path} is not a policy of {CONTRACT} ({error}): restore both from a copy") from error
 
 
 class _Actor(NamedTuple):
-    """An actor's layers, its last one split into what gives the mean and, in some heads, the log standard deviation."""
+    """An actor's layers; the last is split into those of the mean and, in some heads, the log standard deviation."""
 
     hidden: tuple[Layer, ...]
     mean: Layer

@@ -1,4 +1,4 @@
-"""Whether an artefact computes the actions of its policy."""
+"""Verify that an artefact computes the same actions as its policy."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from csac.deploy.artefact import Artefact
     from csac.deploy.policy import Policy
 
-TOLERANCE = 1e-5  # of an action's range
-ROUNDING = 10.0  # times the difference that float32 makes to the policy itself: an artefact may be no worse
-MOST_RECORDED = 2_000  # observations of episodes that are compared
-RANDOM = 1_000  # more observations, twice as far from their mean as those recorded
+TOLERANCE = 1e-5  # relative to an action's range
+ROUNDING = 10.0  # times the policy's own float32 rounding error: an artefact's error may be as large
+MOST_RECORDED = 2_000  # recorded observations that are compared at most
+RANDOM = 1_000  # additional observations, with twice the standard deviation of those recorded
 
 
 class Comparison(NamedTuple):
-    """How far an artefact's actions are from the policy's, as shares of an action's range."""
+    """How far an artefact's actions are from the policy's, relative to an action's range."""
 
     observations: int
     largest: float
@@ -27,10 +27,10 @@ class Comparison(NamedTuple):
 
 
 def compare_actions(artefact: Artefact, policy: Policy, recorded: np.ndarray | None = None) -> Comparison:
-    """Run an artefact beside its policy and guards, on observations `recorded` in episodes and on random ones.
+    """Compare an artefact with its policy and guards, on observations `recorded` in episodes and on random ones.
 
-    Raises InputError for other actions: a difference above 1e-5 of the action's range, and above ten times what float32
-    itself does to the policy on such observations.
+    Raises InputError if actions differ by more than both 1e-5 of their range and ten times the policy's own float32
+    rounding error on such observations.
     """
     generator, contract = np.random.default_rng(0), policy.contract
     observations = _observations(policy, recorded, generator)
@@ -60,7 +60,7 @@ def compare_actions(artefact: Artefact, policy: Policy, recorded: np.ndarray | N
 
 
 def _observations(policy: Policy, recorded: np.ndarray | None, generator: np.random.Generator) -> np.ndarray:
-    """Return observations as they are to be expected, and some farther away: float32 [n, observation]."""
+    """Return typical observations, and some farther away: float32 [n, observation]."""
     normaliser, size = policy.network.parameters.normaliser, policy.contract.spec.observation_size
     mean, std = (np.zeros(size), np.ones(size)) if normaliser is None else (normaliser.mean, normaliser.std)
     chosen = np.zeros((0, size))
@@ -72,7 +72,7 @@ def _observations(policy: Policy, recorded: np.ndarray | None, generator: np.ran
 
 
 def _is_clear(policy: Policy, observations: np.ndarray) -> np.ndarray:
-    """Return [n] whether the critics choose between actors by more than rounding."""
+    """Return [n], whether the critics' choice between the actors is clearer than rounding errors."""
     _, values = policy.candidates(observations, None)
     if values is None:
         return np.ones(len(observations), bool)

@@ -1,1 +1,1 @@
-"""What is written: run directories, statistics over seeds, pictures. Nothing here imports JAX."""
+"""Write and read run directories, compute statistics over seeds, draw plots. Nothing here imports JAX."""

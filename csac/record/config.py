@@ -1,6 +1,6 @@
-"""What a run is: one settings object that the command line fills, `train` takes, the manifest stores and studies list.
+"""The configuration of a run: one object that the command line, `train`, the manifest and studies share.
 
-Plain values and no JAX, so that every room can read it.
+It holds plain values without JAX, so that every part of csac can import it.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from csac.checks import check_whole
 from csac.seeds import EVALUATION_SEED
 from csac.types import InputError
 
-STEPS_LIMIT = 2**31 - 1  # learners count their steps in 32 bits
-SEED_LIMIT = 2**32  # a key is made of a seed's lowest 32 bits
+STEPS_LIMIT = 2**31 - 1  # learners count their steps in int32
+SEED_LIMIT = 2**32  # a random key uses only the lowest 32 bits of a seed
 NEVER = 10**15  # an interval longer than any run
 MOST_EPISODES = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """Everything that decides what one run computes. Steps are environment steps.
+    """Everything that determines what one run computes. Steps are environment steps.
 
-    Raises InputError for a number outside its range, or values that JSON would change.
+    Raises InputError for a number outside its range, or a value that JSON would change.
     """
 
     task: str
@@ -31,44 +31,44 @@ class RunConfig:
     algorithm: str = "csac"
     """The algorithm, or module:Class for one of your own; its own options are listed below."""
     hyperparameters: dict[str, Any] = field(default_factory=dict)
-    """Every hyperparameter of the algorithm, so that no later default changes what a run is."""
+    """All hyperparameters of the algorithm, so that a later change of a default does not change the run."""
     seed: int = 0
-    """Seed of the networks, of exploration, of the replay's draws and of the training episodes."""
+    """Seed of the networks, of exploration, of replay sampling and of the training episodes."""
     steps: int = 1_000_000
     """Environment steps per seed, warm-up included."""
     environments: int = 1
-    """Environments that each seed steps side by side; steps are those of all of them together."""
+    """Environments that each seed steps in parallel; steps are counted over all of them."""
     device: Literal["cpu", "gpu", "cuda"] = "cpu"
-    """Device that the networks are trained on; cuda is gpu."""
+    """Device that the networks are trained on; cuda means gpu."""
     evaluation_interval: int = 5_000
-    """Environment steps between evaluations; there is always one at the last step. 0: none at all."""
+    """Environment steps between evaluations; there is also one at the last step. 0: no evaluations."""
     evaluation_episodes: int = 10
     """Episodes per evaluation."""
     evaluation_environments: int = 10
-    """Environments of an evaluation, side by side and kept open. 0: the training environment, between its episodes."""
+    """Parallel environments for evaluations, kept open. 0: the training environment, between its episodes."""
     evaluation_seed: int = EVALUATION_SEED
-    """Resets the first evaluation episode; the next ones have the numbers after it."""
+    """Seed of the first evaluation episode; each next episode has the next number."""
     checkpoint_interval: int = 50_000
-    """Environment steps between checkpoints; there is also one every ten minutes and at the end. 0: none at all."""
+    """Environment steps between checkpoints; there is also one every ten minutes and at the end. 0: no checkpoints."""
     keep_checkpoints: int = 2
     """Number of newest checkpoints to keep; 0 keeps all."""
     environment_arguments: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments for the environment."""
     perturbations: tuple[str, ...] = ()
-    """Changes of the task in mid-training, such as friction=1.5@300000."""
+    """Changes of the task during training, such as friction=1.5@300000."""
     hindsight: int = 0
-    """Copies of each transition with goals that its episode reached later (HER); for tasks with goals."""
+    """Copies of each transition, relabelled with goals that its episode reached later (HER); for tasks with goals."""
     demonstrations: dict[str, Any] = field(default_factory=dict)
-    """What the replay begins with: where it came from, how many transitions, and their file's checksum."""
+    """Demonstrations that the replay buffer begins with: origin, number of transitions, and their file's checksum."""
     events: tuple[str, ...] = ()
-    """Names in the last `info` of an episode, or NAME:sum and NAME:mean over its steps; each is a column of
+    """Names in the last `info` of an episode, or NAME:sum and NAME:mean over its steps; each becomes a column of
     evaluations.csv and episodes.csv."""
     task_is_callable: bool = False
-    """Whether the task is a Python function, which no manifest can name."""
+    """Whether the task is a Python function, which a manifest cannot name."""
 
     @property
     def extra_transitions(self) -> int:
-        """How many transitions the replay is given at most beside those of the steps."""
+        """Upper bound on the transitions that the replay buffer receives beyond those of the steps."""
         return self.steps * self.hindsight + self.demonstrations.get("transitions", 0)
 
     def __post_init__(self) -> None:
@@ -89,7 +89,7 @@ class RunConfig:
 
     @property
     def title(self) -> str:
-        """The algorithm's name in tables and pictures: SAC of sac, MySAC of my_module:MySAC."""
+        """The algorithm's name in tables and plots: SAC for sac, MySAC for my_module:MySAC."""
         module, _, name = self.algorithm.rpartition(":")
         return name if module else name.upper()
 
@@ -109,9 +109,9 @@ _RANGES = (
 
 
 def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Return keyword arguments as JSON gives them back; tuples become lists, NumPy's numbers plain ones.
+    """Return keyword arguments as JSON reads them back: tuples become lists, NumPy scalars plain numbers.
 
-    Raises InputError where JSON would change a value, so that a resumed run would be another run.
+    Raises InputError if JSON would change a value, since a resumed run would then not be the same run.
     """
     plain = _plain(values)
     try:
@@ -124,7 +124,7 @@ def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    if hasattr(value, "tolist") and not getattr(value, "shape", None):  # NumPy's numbers
+    if hasattr(value, "tolist") and not getattr(value, "shape", None):  # a NumPy scalar
         return value.tolist()
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
@@ -132,7 +132,7 @@ def _plain(value: Any) -> Any:
 
 
 def same(old: Any, new: Any) -> bool:
-    """Return whether two values from JSON are equal; a NaN equals itself here."""
+    """Return whether two JSON values are equal, where NaN equals NaN."""
     if isinstance(old, list) and isinstance(new, list):
         return len(old) == len(new) and all(map(same, old, new))
     if isinstance(old, dict) and isinstance(new, dict):
@@ -141,7 +141,7 @@ def same(old: Any, new: Any) -> bool:
 
 
 def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
-    """Return "name is X, not Y" for each value that differs; hyperparameters and arguments one by one."""
+    """Return "name is X, not Y" for each value that differs, with one line per hyperparameter or argument."""
     lines = []
     for name in sorted(before.keys() | now.keys()):
         old, new = before.get(name), now.get(name)

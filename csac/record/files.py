@@ -1,4 +1,4 @@
-"""Files that are whole or not there, whenever their writer is killed, and locks, which a dying process gives back."""
+"""Atomic file writes, safe against a kill at any time, and file locks, which a dying process releases."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 
 try:
     import fcntl
-except ImportError:  # Windows: nothing keeps two processes apart there
+except ImportError:  # Windows: two processes are not kept apart
     fcntl = None
 
-SECONDS_FOR_LOCK = 0.2  # whoever asks whether a lock is held holds it for an instant
+SECONDS_FOR_LOCK = 0.2  # `is_locked` in another process holds a lock for an instant
 
-# Files whose locks are this process's own; a closed one may stay.
-_own: WeakSet[IO[str]] = WeakSet()
+# Files whose locks this process holds; closed ones may stay in the set.
+_held_locks: WeakSet[IO[str]] = WeakSet()
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Raise InputError where what a user wants at `path` cannot be written in this block."""
+    """Raise InputError, naming `path`, for an OSError of this block."""
     try:
         yield
     except OSError as error:
@@ -36,9 +36,9 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write beside `path`, sync, rename: a reader meets the old file or the whole new one, never a part.
+    """Write a file beside `path`, sync it and rename it: readers see the old file or the whole new one, never a part.
 
-    Of several writers, on machines that share the folder too, one is the last.
+    If there are several writers, even on machines that share the folder, the last one wins.
     """
     aside = name_aside(path)
     try:
@@ -52,28 +52,28 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def name_aside(path: Path) -> Path:
-    """Return what a file is called until it is whole: a name that no other writer takes, on whatever machine."""
-    unique = secrets.token_hex(4)  # containers on several machines often have the same process number
+    """Return the temporary name of a file until it is complete, unique among all writers on all machines."""
+    unique = secrets.token_hex(4)  # containers on several machines often have equal process ids
     return path.with_name(f".{path.name}.{unique}.{os.getpid()}")
 
 
 def kept_from_children(file: IO[str]) -> IO[str]:
-    """Return a file that is closed in every forked process: a task's helper would keep the lock while it lives."""
-    _own.add(file)
+    """Return the file, which forked processes will close: a task's helper process would otherwise keep its lock."""
+    _held_locks.add(file)
     return file
 
 
-def _close_own() -> None:
-    for file in list(_own):
+def _close_held_locks() -> None:
+    for file in list(_held_locks):
         file.close()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_close_own)
+    os.register_at_fork(after_in_child=_close_held_locks)
 
 
 def take(file: IO[str], path: Path) -> None:
-    """Take a run's lock. Raises InputError where another process has it, and keeps it."""
+    """Take a run's lock. Raises InputError if another process holds it and does not release it."""
     if fcntl is None:
         return
     deadline = time.monotonic() + SECONDS_FOR_LOCK
@@ -93,7 +93,7 @@ def take(file: IO[str], path: Path) -> None:
 def is_locked(path: str | Path) -> bool:
     """Return whether a process holds the lock of this file, on this machine or one that shares the folder.
 
-    Where the system has no locks, say so of every file: nobody is known to have died.
+    Where the system has no locks, return True for every file: no process is known to have died.
     """
     if fcntl is None:
         return True

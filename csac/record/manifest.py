@@ -1,4 +1,4 @@
-"""manifest.json as a value: a run's configuration, where it was made, how far it is and what has happened to it."""
+"""The content of manifest.json: a run's configuration, origin, progress and history."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ State = Literal["running", "finished", "failed", "interrupted"]
 
 @dataclass(frozen=True)
 class Machine:
-    """What the last bits of a run depend on, and where it runs."""
+    """The machine that runs a run: where it is, and what the last bits of its numbers depend on."""
 
     processor: str = ""
     cores: int = 0
-    """Cores that XLA divides its work for."""
+    """CPU cores that XLA divides its work among."""
     host: str = ""
     gpu: str = ""
-    """Its model, where the run computes on one."""
+    """The GPU's model, if the run computes on one."""
     xla_flags: str = ""
     matmul_precision: str = ""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The checkpoint of another run that a run began with, and what is different in this one."""
+    """The other run's checkpoint that a run was forked from, and which of its settings differ."""
 
     directory: str
     step: int
     changes: tuple[str, ...] = ()
 
     def changed(self, *names: str) -> bool:
-        """Return whether a change is of one of these settings."""
+        """Return whether one of these settings was changed."""
         return any(text.startswith(names) for text in self.changes)
 
 
 @dataclass(frozen=True)
 class Continuation:
-    """That a run was resumed: when, at which step, and whether it is the run that was never stopped, bit for bit."""
+    """A resume of a run: when, at which step, and whether it is bit for bit as if the run had never stopped."""
 
     resumed: str
     step: int
@@ -54,7 +54,7 @@ class Continuation:
     notes: tuple[str, ...] = ()
     command: str | None = None
     previous: dict[str, Any] = field(default_factory=dict)
-    """Steps, machine, versions and commit before."""
+    """Steps, machine, versions and commit before the resume."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ class Manifest:
 
     config: RunConfig
     program: tuple[int, ...] = ()
-    """The seeds that share the run's program; its last bits depend on their number."""
+    """The seeds that share the run's compiled program; the last bits of its numbers depend on how many there are."""
     machine: Machine = Machine()
     versions: dict[str, str] = field(default_factory=dict)
     commit: str | None = None
@@ -75,9 +75,9 @@ class Manifest:
     last_checkpoint: int = 0
     """Step of the newest checkpoint; 0 before the first."""
     failure: str = ""
-    """How the run failed, if it did."""
+    """Why the run failed, if it did."""
     restarts_episode: bool = False
-    """Whether a resume restarts the episode in progress, since the environment cannot be saved."""
+    """Whether a resume restarts the current episode, because the environment cannot be saved."""
     forked_from: Origin | None = None
     history: tuple[Continuation, ...] = ()
 
@@ -87,32 +87,32 @@ class Manifest:
 
 
 class NewerError(InputError):
-    """A manifest of another schema."""
+    """A manifest has another schema version."""
 
 
 def read(content: bytes) -> Manifest:
-    """Return the manifest in a file's content. Raises InputError with what is wrong with it."""
+    """Parse the content of a manifest file. Raises InputError that says what is wrong with it."""
     try:
         fields = json.loads(without_controls(content))
         version = fields.pop("schema_version", None)
     except (ValueError, RecursionError, AttributeError, TypeError):
         raise InputError("it is not a JSON object") from None
-    if version != SCHEMA_VERSION or isinstance(version, bool):
+    if version != SCHEMA_VERSION:
         raise NewerError(f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}")
     return value(Manifest, fields, "")
 
 
 def written(manifest: Manifest) -> bytes:
-    """Return the content of the file that `read` takes."""
+    """Return the content of the manifest's file, which `read` parses."""
     fields = {"schema_version": SCHEMA_VERSION, **dataclasses.asdict(manifest)}
     return (json.dumps(fields, indent=2) + "\n").encode()
 
 
-_TOLD = {int: "a whole number", str: "a text", bool: "true or false", tuple: "a list"}
+_TYPE_NAMES = {int: "a whole number", str: "a text", bool: "true or false", tuple: "a list"}
 
 
 def value(kind: Any, given: Any, name: str) -> Any:
-    """Return a JSON value as one of this type. Raises InputError, with its name, where it is none."""
+    """Return a JSON value as a value of type `kind`. Raises InputError, naming `name`, if it has another type."""
     origin, arguments = get_origin(kind), get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(given, dict):
         return _dataclass(kind, given, name)
@@ -128,8 +128,8 @@ def value(kind: Any, given: Any, name: str) -> Any:
         return {key: value(arguments[1], item, name) for key, item in given.items()}
     if kind in (int, str, bool) and type(given) is kind:
         return given
-    told = " or ".join(map(repr, arguments)) if origin is Literal else _TOLD.get(origin or kind, "a table")
-    raise InputError(f"{name!r} is {given!r:.60}, not {told}")
+    expected = " or ".join(map(repr, arguments)) if origin is Literal else _TYPE_NAMES.get(origin or kind, "a table")
+    raise InputError(f"{name!r} is {given!r:.60}, not {expected}")
 
 
 def _dataclass(kind: Any, given: dict[str, Any], name: str) -> Any:

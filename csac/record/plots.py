@@ -1,6 +1,6 @@
-"""Learning curves as pictures: PNG for the screen, SVG for a page, PDF for a paper. Equal rows give equal files.
+"""Plot learning curves: PNG for the screen, SVG for a page, PDF for a paper. Equal rows give equal files.
 
-Few seeds are shown as few: one or two as themselves, three and four with their range, more with an interval.
+One or two seeds are drawn as single lines, three or four with their range, more with a confidence interval.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours, distinct to colour-blind eyes; yellow is left out, too pale for a line.
+# Okabe and Ito's palette for colour-blind readers, without yellow, which is too pale for a line.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#444444")
 LineStyle = Literal["-", "--", "-.", ":"]
 Look = tuple[str, LineStyle]  # a colour and a line style
 LINE_STYLES: tuple[LineStyle, ...] = get_args(LineStyle)
-FEWEST_FOR_BAND = 3  # seeds: two have no range that their lines do not show
-FEWEST_FOR_INTERVAL_BAND = 5  # seeds: of three, a t-interval is so high that nothing else is seen
-WIDTH, HEIGHT = 5.0, 3.5  # inches: in a column of 3.4 inches text is still 6 points
-PIXELS = 1200  # from side to side
-CHARACTERS = 13  # of a legend in an inch
-LINE = 0.2  # inches from line to line of a legend or a title
+FEWEST_FOR_BAND = 3  # seeds: the lines of two already show their range
+FEWEST_FOR_INTERVAL_BAND = 5  # seeds: with three, a t-interval is so wide that it dwarfs everything else
+WIDTH, HEIGHT = 5.0, 3.5  # inches: scaled down to a column of 3.4 inches, text is still 6 points
+PIXELS = 1200  # width of an image
+CHARACTERS = 13  # of legend text per inch
+LINE = 0.2  # inches per line of a legend or a title
 RETURN = "return per evaluation episode"
 STYLE: Mapping[str, Any] = {
     "font.size": 10.0,
@@ -71,12 +71,12 @@ class Curve(NamedTuple):
 
     @property
     def seeds(self) -> int:
-        """How many seeds it has."""
+        """Number of seeds."""
         return len(self.returns)
 
     @classmethod
     def of(cls, label: str, rows: np.ndarray) -> Curve:
-        """Return the curve of the rows of evaluations.csv."""
+        """Return the curve for rows of evaluations.csv."""
         steps, seeds, returns = evaluation_matrix(rows)
         mean, low, high = mean_and_interval(returns)
         if len(seeds) < FEWEST_FOR_INTERVAL_BAND:
@@ -87,7 +87,7 @@ class Curve(NamedTuple):
 def learning_curve(
     runs: Sequence[tuple[str, np.ndarray]], path: str | Path, title: str = "", marks: Sequence[tuple[int, str]] = ()
 ) -> None:
-    """Draw evaluation returns against environment steps per seed and save them as `path`, a .png, .svg or .pdf file."""
+    """Plot evaluation returns against environment steps per seed and save them as `path`, a .png, .svg or .pdf file."""
     path = Path(path)
     write_atomically(path, encoded(figure_of(runs, title, marks), path.suffix[1:]))
 
@@ -102,8 +102,8 @@ def figure_of(
 ) -> Figure:
     """Return a figure with the curve of each run, given as `(label, rows of evaluations.csv)`.
 
-    `marks` are `(step, what changed there)`; `quantity` is what the column `return` holds, and `limits` those of its
-    axis; `looks` are those that labels have elsewhere.
+    `marks` are `(step, what changed there)`; `quantity` names what the column `return` holds, and `limits` are those of
+    its axis; `looks` sets the looks of some labels, to match other figures.
     """
     curves = [Curve.of(*run) for run in runs if not np.isnan(run[1]["return"]).all()]
     looks = {**looks_of(label for label, _ in runs), **(looks or {})}
@@ -125,16 +125,16 @@ def figure_of(
 
 
 def encoded(figure: Figure, kind: str = "png") -> bytes:
-    """Return a figure as the content of a file of this kind: png, svg or pdf."""
+    """Return the content of a png, svg or pdf file of a figure."""
     data = io.BytesIO()
-    date = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[kind]  # what would differ from file to file
+    date = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[kind]  # would differ between equal figures
     with matplotlib.style.context(["default", dict(STYLE)]):
         figure.savefig(data, format=kind, dpi=figure.dpi, metadata={date: None})
     return data.getvalue()
 
 
 def looks_of(labels: Iterable[str]) -> dict[str, Look]:
-    """Return a colour and a line style for each label; the style changes once the colours are used up."""
+    """Return a colour and a line style for each label; the line style changes once all colours are used."""
     looks: Iterator[Look] = itertools.cycle((colour, style) for style in LINE_STYLES for colour in COLOURS)
     return dict(zip(dict.fromkeys(labels), looks, strict=False))
 
@@ -167,7 +167,7 @@ def _draw_curve(axes: Axes, curve: Curve, look: Look) -> None:
 
 
 def _limits(curves: Sequence[Curve]) -> tuple[float, float]:
-    """Return how far the axis goes: to show all seeds, and of the bands no more than a quarter beyond."""
+    """Return the axis limits: they show all seeds, and bands up to a quarter of the seeds' range beyond."""
     lowest, highest = (float(f([f(curve.returns) for curve in curves])) for f in (np.nanmin, np.nanmax))
     reach = 0.25 * (highest - lowest) or 1.0
     bands = [curve for curve in curves if curve.seeds >= FEWEST_FOR_BAND]
@@ -177,7 +177,7 @@ def _limits(curves: Sequence[Curve]) -> tuple[float, float]:
 
 
 def _draw_legend(figure: Figure, curves: Sequence[Curve], looks: Mapping[str, Look]) -> None:
-    """Put the legend, and what lines and bands mean, below the axes; the picture grows by its lines."""
+    """Draw the legend, and what lines and bands mean, below the axes; the figure grows by its height."""
     texts = {f"{c.label} ({c.seeds} seed{'s' * (c.seeds > 1)})": looks[c.label] for c in curves}
     wrapped = {text: textwrap.wrap(text, int(CHARACTERS * WIDTH) - 8) for text in texts}
     handles = [
@@ -193,7 +193,7 @@ def _draw_legend(figure: Figure, curves: Sequence[Curve], looks: Mapping[str, Lo
 
 
 def _note(curves: Sequence[Curve]) -> str:
-    """Return what lines and bands mean in a picture of these curves; nothing where there is one seed each."""
+    """Return what lines and bands mean in a plot of these curves; empty if all have a single seed."""
     counts = [curve.seeds for curve in curves]
     if max(counts) == 1:
         return ""

@@ -1,4 +1,4 @@
-"""Writes what one run has to tell: tables, TensorBoard, policies and log."""
+"""Write the rows of one run to its tables, TensorBoard and W&B."""
 
 from __future__ import annotations
 
@@ -16,49 +16,49 @@ if TYPE_CHECKING:
 
     from csac.record.run import RunDirectory, Table
 
-_NUMBERS = ("seed", "step", "episode", "return", "length")  # of evaluations, which are no events
+_NUMBERS = ("seed", "step", "episode", "return", "length")  # columns of evaluations.csv that are not events
 
 
 class Recorder:
-    """Writes the rows of one run, a few hundred steps at a time.
+    """Write the rows of one run, in batches of a few hundred steps.
 
-    `begin` is the step that it goes on from; `wandb` may name the project to log to, with TensorBoard's values.
+    `begin` is the step that the run continues from; `wandb` may name the W&B project that gets TensorBoard's values.
     """
 
     def __init__(self, run: RunDirectory, begin: int, tensorboard: bool, wandb: bool | str = False) -> None:
         self.run = run
-        self._waiting: dict[Table, list[dict[str, Any]]] = defaultdict(list)
-        origin, known = run.manifest.forked_from, run.evaluations
-        if origin and origin.changed("task ", "environment_arguments"):  # whose returns are of another task
-            known = known[known["step"] > origin.step]
-        self.best = best_return(known) if run.policy_file("best").exists() else -np.inf
+        self._queued: dict[Table, list[dict[str, Any]]] = defaultdict(list)
+        origin, rows = run.manifest.forked_from, run.evaluations
+        if origin and origin.changed("task ", "environment_arguments"):  # earlier returns are of another task
+            rows = rows[rows["step"] > origin.step]
+        self.best = best_return(rows) if run.policy_file("best").exists() else -np.inf
         self._log = self._wandb = None
         if tensorboard or wandb:
             from csac.record.tensorboard import TensorBoardLog  # slow to import
 
             episodes = run.rows("episodes")
-            before = [dict(zip(episodes.dtype.names or (), row, strict=True)) for row in episodes.tolist()[-100:]]
-            cases = [name for name in known.dtype.names or () if name not in _NUMBERS and is_case(known[name])]
-            self._log = TensorBoardLog(run.tensorboard, begin, before, cases)
+            recent = [dict(zip(episodes.dtype.names or (), row, strict=True)) for row in episodes.tolist()[-100:]]
+            cases = [name for name in rows.dtype.names or () if name not in _NUMBERS and is_case(rows[name])]
+            self._log = TensorBoardLog(run.tensorboard, begin, recent, cases)
         if wandb:
-            self._wandb = self._guarded(lambda: WandbLog(run, wandb))
+            self._wandb = self._call_wandb(WandbLog, run, wandb)
 
     def add(self, table: Table, rows: Sequence[dict[str, Any]]) -> None:
-        """Take rows of a table, to be written at the next `flush`."""
-        self._waiting[table] += rows
+        """Queue rows of a table until the next `flush`."""
+        self._queued[table] += rows
 
     def flush(self, *tables: Table) -> None:
-        """Write the rows that wait, of all tables unless some are given. Raises OSError."""
+        """Write the queued rows, of all tables unless some are given. Raises OSError."""
         for table in tables or TABLES:
-            if rows := self._waiting.pop(table, []):
-                rows = _joined(rows) if table == "metrics" else rows
+            if rows := self._queued.pop(table, []):
+                rows = _merged_by_step(rows) if table == "metrics" else rows
                 self.run.append(table, rows)
                 points = self._log.write(table, rows) if self._log else {}
                 if self._wandb:
-                    self._guarded(lambda points=points: self._wandb and self._wandb.write(points))
+                    self._call_wandb(self._wandb.write, points)
 
     def sync(self) -> None:
-        """Write the rows that wait, and TensorBoard's: what comes before a checkpoint is not made again."""
+        """Write the queued rows and TensorBoard's buffer: a resume does not repeat rows from before the checkpoint."""
         self.flush()
         if self._log:
             self._log.flush()
@@ -68,20 +68,20 @@ class Recorder:
         if self._log:
             self._log.close()
         if self._wandb:
-            self._guarded(self._wandb.close)
+            self._call_wandb(self._wandb.close)
 
-    def _guarded(self, call: Callable[[], Any]) -> Any:
-        """Return what a call to W&B gives; where it fails, W&B gets no more of this run, which goes on."""
+    def _call_wandb(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        """Return the result of a W&B call; if it fails, stop logging to W&B and continue the run."""
         try:
-            return call()
+            return call(*arguments)
         except Exception as error:
             self._wandb = None
             self.run.log(f"W&B gets no more of this run: {type(error).__name__}: {error}")
 
 
-def _joined(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows with those of one step as one: an algorithm's metrics and what callbacks log."""
-    joined: dict[int, dict[str, Any]] = {}
+def _merged_by_step(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Merge the rows of each step into one: the algorithm's metrics and what callbacks log."""
+    merged: dict[int, dict[str, Any]] = {}
     for row in rows:
-        joined[row["step"]] = {**joined.get(row["step"], {}), **row}
-    return [joined[step] for step in sorted(joined)]
+        merged[row["step"]] = {**merged.get(row["step"], {}), **row}
+    return [merged[step] for step in sorted(merged)]

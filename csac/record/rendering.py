@@ -1,4 +1,4 @@
-"""Tables of text, and how they look in Markdown and in HTML; `console` shows them on a terminal."""
+"""Text tables, rendered as Markdown or HTML; `console` shows them in a terminal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Cell(NamedTuple):
-    """What stands in a cell, and the number behind it, by which a column is sorted and set to the right."""
+    """The text of a cell and, if it is numeric, its value, used to sort the column and to align it right."""
 
     text: str
     value: float | None = None
@@ -21,14 +21,14 @@ EMPTY = Cell("", math.nan)
 
 
 class Row(NamedTuple):
-    """The cells of a row. A summary is over the rows above it; what failed is shown but not in the summary."""
+    """The cells of a row. A summary row is over the rows above it, without the failed ones."""
 
     cells: tuple[Cell, ...]
     kind: Literal["plain", "failed", "summary"] = "plain"
 
 
 class Table(NamedTuple):
-    """Headings, and rows with as many cells; a title above and a note below."""
+    """Headings, rows with as many cells, a title above and a note below."""
 
     headings: tuple[str, ...]
     rows: tuple[Row, ...]
@@ -36,21 +36,21 @@ class Table(NamedTuple):
     note: str = ""
 
     def is_numeric(self, column: int) -> bool:
-        """Return whether every cell of a column has a number behind it."""
+        """Return whether every cell of a column has a value."""
         return all(row.cells[column].value is not None for row in self.rows)
 
 
-SMALL = 0.1  # below which two decimals tell too little of a return
+SMALL = 0.1  # returns below this get three significant digits instead of two decimals
 
 
 def number(value: float, largest: float | None = None) -> str:
-    """Return a return as people read it, a small one with three digits; `largest` sets the form of a whole column."""
+    """Format a return, a small one with three significant digits; `largest` sets the format of a whole column."""
     size = abs(value if largest is None else largest)
     return f"{value:.3g}" if 0 < size < SMALL else f"{value:,.{1 if size >= 100 else 2}f}"
 
 
 def short(steps: float) -> str:
-    """Return a number of steps in little room: 500, 12.5k, 1M."""
+    """Format a number of steps briefly: 500, 12.5k, 1M."""
     for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(steps) >= size:
             return f"{steps / size:.4g}{suffix}"
@@ -58,12 +58,12 @@ def short(steps: float) -> str:
 
 
 def numeric(value: float, text: str) -> Cell:
-    """Return a cell with a number, empty where it is not one."""
+    """Return a cell with a number, or an empty one for NaN."""
     return EMPTY if math.isnan(value) else Cell(text, value)
 
 
 def markdown(table: Table) -> str:
-    """Return the table in Markdown, numbers to the right."""
+    """Return the table in Markdown, with numeric columns aligned right."""
     columns = range(len(table.headings))
     lines = [f"**{_escaped(table.title)}**", ""] if table.title else []
     lines.append(_line(table.headings))
@@ -74,7 +74,7 @@ def markdown(table: Table) -> str:
 
 
 def html(table: Table) -> str:
-    """Return the table as an HTML element: rows by class `plain`, `failed` and `summary`, numbers in `data-value`."""
+    """Return the table in HTML: rows have the class `plain`, `failed` or `summary`, values are in `data-value`."""
     headings = "".join(
         f'<th scope="col"{_class(table, column)}>{html_text.escape(heading)}</th>'
         for column, heading in enumerate(table.headings)

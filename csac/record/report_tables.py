@@ -1,4 +1,4 @@
-"""Results, comparisons, recoveries and cases per 1,000 rollouts as tables of text: see `rendering`."""
+"""Build text tables (see `rendering`) of results, comparisons, recoveries, and cases per 1,000 rollouts."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 
     from csac.record.summaries import CaseSummary, RecoverySummary
 
-ROLLOUTS = 1_000  # that cases are counted in, as in the paper
-MOST_COLUMNS = 5  # of seeds in that table; of more, only the mean and the deviation
+ROLLOUTS = 1_000  # cases are given per this many rollouts, as in the paper
+MOST_COLUMNS = 5  # of seeds in that table; with more seeds, only mean and deviation
 
 
 def results_table(rows: np.ndarray, failed: Collection[int] = (), episodes: Mapping[int, int] | None = None) -> Table:
     """Return one row per seed of a run; below them mean, standard deviation and interval over those that did not fail.
 
-    The best of the mean is the best evaluation of all seeds together, and the last is where all are. `episodes` are the
-    training episodes of each seed. Below two seeds there is no summary, and no row for a seed without a return.
+    In the summary, "best" is the point with the highest mean over seeds, and "last" the last point that all seeds have.
+    `episodes` are each seed's numbers of training episodes. A single seed has no summary; one without a return, no row.
     """
-    three, (steps, labels, returns) = last_evaluations(rows), evaluation_matrix(rows)
-    lines = {seed: line for seed, line in zip(labels.tolist(), returns, strict=True) if seed in three}
+    means, (steps, labels, returns) = last_evaluations(rows), evaluation_matrix(rows)
+    lines = {seed: line for seed, line in zip(labels.tolist(), returns, strict=True) if seed in means}
     largest = max((float(np.nanmax(np.abs(line))) for line in lines.values()), default=0.0)
 
     def cells(*values: float) -> list[Cell]:
@@ -50,16 +50,16 @@ def results_table(rows: np.ndarray, failed: Collection[int] = (), episodes: Mapp
     body = []
     for seed, line in lines.items():
         last, best = float(line[~np.isnan(line)][-1]), int(np.nanargmax(line))
-        own = [_whole(seed), *cells(last, three[seed], float(line[best])), _whole(int(steps[best]))]
+        numbers = [_whole(seed), *cells(last, means[seed], float(line[best])), _whole(int(steps[best]))]
         kind = "failed" if seed in failed else "plain"
-        body.append(Row((*own, _whole((episodes or {}).get(seed, 0))), kind))
+        body.append(Row((*numbers, _whole((episodes or {}).get(seed, 0))), kind))
     sound = [seed for seed in lines if seed not in failed]
-    together = np.array([lines[seed] for seed in sound]).reshape(len(sound), len(steps))
-    common = ~np.isnan(together).any(axis=0)
+    sound_returns = np.array([lines[seed] for seed in sound]).reshape(len(sound), len(steps))
+    common = ~np.isnan(sound_returns).any(axis=0)
     if len(sound) > 1 and common.any():
-        steps, together = steps[common], together[:, common]
-        best = int(together.mean(axis=0).argmax())
-        over = [over_seeds(values) for values in (together[:, -1], [three[seed] for seed in sound], together[:, best])]
+        steps, sound_returns = steps[common], sound_returns[:, common]
+        best = int(sound_returns.mean(axis=0).argmax())
+        over = list(map(over_seeds, (sound_returns[:, -1], [means[seed] for seed in sound], sound_returns[:, best])))
         body.append(_summary("mean", *cells(*(one.mean for one in over)), _whole(int(steps[best])), EMPTY))
         body.append(_summary("± std", *cells(*(one.std for one in over)), EMPTY, EMPTY))
         body += interval_rows(over, largest, blank=2)
@@ -70,25 +70,25 @@ def results_table(rows: np.ndarray, failed: Collection[int] = (), episodes: Mapp
 def comparison_table(
     runs: Sequence[tuple[str, np.ndarray]], failed: Sequence[Collection[int]] = (), points: int = 3
 ) -> Table:
-    """Return one row per run, given as `(label, rows)`: its last evaluations, how certain they are, its maximum.
+    """Return one row per run, given as `(label, rows)`: last evaluations, their interval, maximum average return.
 
-    `failed` are the seeds of each run that failed, which are counted and left out. The ratio to the first is one of
-    positive returns only: of costs, it would be the larger the worse. Interquartile means are shown where any run has
-    seeds enough for their interval.
+    `failed` are each run's failed seeds, which are counted and left out. The ratio to the first run is given for
+    positive returns only: for costs, a worse run would have a larger ratio. Interquartile means are shown if any run
+    has enough seeds for their interval.
     """
     failed = failed or [()] * len(runs)
     sound = [rows[~np.isin(rows["seed"], list(lost))] for (_, rows), lost in zip(runs, failed, strict=True)]
     scores = [np.array(list(last_evaluations(rows, points).values())) for rows in sound]
     shares = [_success(rows, points) for rows in sound]
-    has_middles = any(len(own) >= FEWEST_FOR_BOOTSTRAP for own in scores)
+    has_middles = any(len(seed_means) >= FEWEST_FOR_BOOTSTRAP for seed_means in scores)
     first, body = over_seeds(scores[0]).mean if scores else math.nan, []
-    for (label, rows), lost, own_rows, own, share in zip(runs, failed, sound, scores, shares, strict=True):
-        over = over_seeds(own)
+    for (label, rows), lost, sound_rows, seed_means, share in zip(runs, failed, sound, scores, shares, strict=True):
+        over = over_seeds(seed_means)
         ratio = over.mean / first if first > 0 else math.nan
         count = Cell(str(over.seeds) + (f" ({len(lost)} failed)" if lost else ""), over.seeds)
         cells = [Cell(label), count, _whole(int(rows["step"].max(initial=0))), plus_minus(over), interval(over)]
-        cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(own_rows)]
-        cells += [middle(own), EMPTY if own is scores[0] else above(own, scores[0])] * has_middles
+        cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(sound_rows)]
+        cells += [middle(seed_means), EMPTY if seed_means is scores[0] else above(seed_means, scores[0])] * has_middles
         cells += [plus_minus(share, ".0%") if share else EMPTY] * any(shares)
         body.append(Row(tuple(cells)))
     last = f"last {'three' if points == 3 else points} evaluations"
@@ -99,10 +99,10 @@ def comparison_table(
 
 
 def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
-    """Return what a perturbation cost each seed, and below the seeds of each run their mean and standard deviation.
+    """Return what a perturbation cost each seed and, below each run's seeds, their mean and standard deviation.
 
-    Where a seed never came back there is no mean of the steps, but how many did. Several runs are told apart by their
-    labels; that of a single one is the title.
+    If a seed never recovered, the mean number of steps is replaced by how many seeds did. The label of a single run is
+    the title; several runs have a column of labels.
     """
     headings = ("seed", "before", "drop", "relative", f"steps to {REGAINED:.0%}".replace("%", " %"))
     headings += ("area lost", "final", "drawdown")
@@ -114,8 +114,8 @@ def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
             cells = (*label, _whole(seed), *_recovery_cells(one, largest))
             rows.append(Row(cells, "failed" if seed in run.failed else "plain"))
         if run.known > 1:
-            for name, of in (("mean", lambda one: one.mean), ("± std", lambda one: one.std)):
-                cells = _recovery_cells(Recovery(*(of(run.metrics[field]) for field in Recovery._fields)), largest)
+            for name, get in (("mean", lambda one: one.mean), ("± std", lambda one: one.std)):
+                cells = _recovery_cells(Recovery(*(get(run.metrics[field]) for field in Recovery._fields)), largest)
                 if name == "mean" and run.regained < run.known:
                     cells[3] = Cell(f"{run.regained} of {run.known}", math.inf)
                 rows.append(Row((*label, Cell(name, math.nan), *cells), "summary"))
@@ -124,11 +124,11 @@ def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
 
 
 def case_table(rows: np.ndarray) -> Table | None:
-    """Return the paper's case table of one run: how often success and each event came in 1,000 rollouts, seed by seed.
+    """Return the paper's case table of one run: how often success and each event occurred per 1,000 rollouts, by seed.
 
-    A rollout that does not speak of a case counts as one without it. What is a count in itself, such as waypoints
-    reached, is a mean per rollout instead, over those that tell it. The last columns are over the seeds, where there
-    are several. None where the task says nothing. `rows` [episode] are as in evaluations.csv.
+    A rollout that does not report a case counts as one without it. A number, such as waypoints reached, is shown as
+    its mean over the rollouts that report it. With several seeds, the last columns are their mean and deviation.
+    None if the task reports nothing. `rows` [episode] are those of evaluations.csv.
     """
     found = cases(rows)
     if not found:
@@ -147,7 +147,7 @@ def case_table(rows: np.ndarray) -> Table | None:
 def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | None:
     """Return the case table of several runs, given as `(label, rows)`: a column for each, mean ± std over its seeds.
 
-    Above the cases stands the return of these episodes.
+    The first row is the return of these episodes.
     """
     names = case_names([rows for _, rows in runs])
     if not names:
@@ -163,14 +163,14 @@ def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | Non
 
 
 def plus_minus(over: OverSeeds, form: str = "") -> Cell:
-    """Return `mean ± std`, of one seed the mean alone; without a form whole from 20 on, but for a spread below 1."""
+    """Return `mean ± std`, or the mean of one seed. By default integers from 20 on, unless the deviation is below 1."""
     form = form or _form(over.mean, over.std)
     spread = "" if math.isnan(over.std) else f" ± {over.std:{form}}"
     return numeric(over.mean, f"{over.mean:{form}}{spread}")
 
 
 def interval(over: OverSeeds) -> Cell:
-    """Return the interval of a mean, or that there are too few seeds for one."""
+    """Return the interval of a mean, or a note that there are too few seeds for one."""
     if over.seeds < FEWEST_FOR_INTERVAL:
         return Cell(no_interval(over.seeds), math.nan)
     form = _form(over.mean, over.high - over.low)
@@ -178,7 +178,7 @@ def interval(over: OverSeeds) -> Cell:
 
 
 def interval_rows(over: Sequence[OverSeeds], largest: float, blank: int) -> list[Row]:
-    """Return a row with the reach of these intervals and `blank` empty cells, or none where there are too few seeds."""
+    """Return a row of the intervals' half-widths and `blank` empty cells, or no row if there are too few seeds."""
     if over[0].seeds < FEWEST_FOR_INTERVAL:
         return []
     reach = [numeric(one.high - one.mean, number(one.high - one.mean, largest)) for one in over]
@@ -186,7 +186,7 @@ def interval_rows(over: Sequence[OverSeeds], largest: float, blank: int) -> list
 
 
 def middle(scores: np.ndarray, form: str = "") -> Cell:
-    """Return the interquartile mean of scores [seed, ...] with its bootstrap interval; by itself it finds its form."""
+    """Return the interquartile mean of scores [seed, ...] with its bootstrap interval, in a format that suits it."""
     value = interquartile_mean(scores)
     return _with_interval(value, stratified_bootstrap_interval(scores, interquartile_mean), form or _form(value))
 
@@ -198,12 +198,12 @@ def above(scores: np.ndarray, first: np.ndarray) -> Cell:
 
 
 def few_seeds(count: int) -> str:
-    """Return what a table says where seeds are too few for an interval, nothing where there is but one."""
+    """Return a table's note if there are too few seeds for an interval; empty for a single seed."""
     return no_interval(count) if 1 < count < FEWEST_FOR_INTERVAL else ""
 
 
 def no_interval(seeds: int) -> str:
-    """Return what stands in an interval's place where these seeds are too few for one."""
+    """Return the text that replaces an interval if there are too few seeds for one."""
     return f"{seeds} seed{'s' * (seeds != 1)}: no interval"
 
 
@@ -224,7 +224,7 @@ def _form(value: float, spread: float = math.nan) -> str:
 def _maximum(rows: np.ndarray) -> Cell:
     try:
         best, step = maximum_average_return(rows)
-    except InputError:  # no evaluation holds every seed
+    except InputError:  # no evaluation point has every seed
         return EMPTY
     return Cell(f"{best:{_form(best)}} at {step:,}", best)
 
@@ -235,13 +235,13 @@ def _with_interval(value: float, bounds: tuple[float, float] | None, form: str) 
 
 
 def _success(rows: np.ndarray, points: int) -> OverSeeds | None:
-    """Return the share of successful episodes in the last evaluations, None where the task says nothing of success."""
+    """Return the share of successful episodes in the last evaluations, None if the task does not report success."""
     found = cases(last_rows(rows, points), {"success": True}) if is_case(rows["success"]) else []
     return found[0].over_seeds if found else None
 
 
 def _largest(run: RecoverySummary) -> float:
-    """The largest of the returns in a table, which sets their decimals."""
+    """Return the largest absolute return in a table, which sets their number format."""
     returns = [abs(value) for one in run.seeds.values() for value in (one.before, one.drop, one.final)]
     return max((value for value in returns if not math.isnan(value)), default=0.0)
 
@@ -259,7 +259,7 @@ def _recovery_cells(one: Recovery, largest: float) -> list[Cell]:
 
 
 def _rollouts(runs: Sequence[np.ndarray]) -> str:
-    """What the numbers of a case table are per, and what they are from where that is not the same."""
+    """Return the heading of a case table's numbers: per how many rollouts, and from how many if that differs."""
     per_seed = {int((rows["seed"] == seed).sum()) for rows in runs for seed in set(rows["seed"].tolist())}
     if per_seed == {ROLLOUTS}:
         return f"per {ROLLOUTS:,} rollouts"

@@ -1,4 +1,4 @@
-"""A run directory, which is one seed: its manifest, tables, log and lock, and what its files are called."""
+"""Read and write the directory of one run (one seed): its manifest, tables, log, lock and file names."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class StorageFailure(Failure):
 
 
 class RunDirectory:
-    """One run on disk: one seed.
+    """The directory of one run (one seed).
 
-    `checkpoints`, `tensorboard` and `policies`, which has their contract too, are its folders.
+    `checkpoints`, `tensorboard` and `policies` are its folders; `policies` also holds the policies' contract.
     """
 
     def __init__(self, path: Path, manifest: Manifest) -> None:
@@ -58,7 +58,7 @@ class RunDirectory:
 
     @classmethod
     def create(cls, path: str | Path, manifest: Manifest) -> RunDirectory:
-        """Start a run in a new or empty directory. Raises InputError where it is none, or cannot be written."""
+        """Create a run in a new or empty directory. Raises InputError if it is not empty or cannot be written."""
         path = Path(os.path.abspath(path))
         content = manifests.written(dataclasses.replace(manifest, created=manifest.created or now()))
         with writing(path):
@@ -69,7 +69,7 @@ class RunDirectory:
         return cls(path, manifests.read(content))
 
     def rename(self, path: Path) -> None:
-        """Have the run in another directory, new or empty. Raises InputError where there is something in it."""
+        """Move the run to a new or empty directory. Raises InputError if that is not empty."""
         try:
             os.rename(self.path, path)
         except OSError:
@@ -77,17 +77,17 @@ class RunDirectory:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> RunDirectory:
-        """Open a run that exists; where its manifest is lost or damaged, from the copy in its newest checkpoint.
+        """Open an existing run; if its manifest is lost or damaged, use the copy in its newest checkpoint.
 
-        Raises InputError where there is no run, or its manifest cannot be used.
+        Raises InputError if there is no run, or no usable manifest.
         """
         check_path("a run directory", path)
         path = Path(os.path.abspath(path))
         reason = "does not exist"
-        for place in (path / MANIFEST, *_copies(path)):
+        for place in (path / MANIFEST, *_manifest_copies(path)):
             try:
                 manifest = manifests.read(place.read_bytes())
-                if place.parent != path and not multiprocessing.parent_process():  # which has said so
+                if place.parent != path and not multiprocessing.parent_process():  # which has warned
                     warnings.warn(f"{path / MANIFEST} is lost or damaged: a checkpoint's copy is read", stacklevel=2)
                 return cls(path, manifest)
             except (FileNotFoundError, NotADirectoryError):
@@ -102,7 +102,7 @@ class RunDirectory:
 
     @property
     def config(self) -> RunConfig:
-        """What the run computes."""
+        """The configuration of the run."""
         return self.manifest.config
 
     @property
@@ -111,52 +111,52 @@ class RunDirectory:
         return self.manifest.config.seed
 
     def update_manifest(self, **changes: Any) -> None:
-        """Change fields of the manifest, on disk and in `manifest`."""
+        """Change fields of the manifest, on disk and in memory."""
         content = manifests.written(dataclasses.replace(self.manifest, **changes))
         write_atomically(self.path / MANIFEST, content)
         self.manifest = manifests.read(content)
 
     @property
     def state(self) -> str:
-        """The state of the manifest; where that says "running" and no process holds the lock, "killed" or "waiting"."""
+        """The state in the manifest; if that is "running" but no process holds the lock, "killed" or "waiting"."""
         state = self.manifest.state
         if state != "running" or is_locked(self.path / LOCK):
             return state
         return "waiting" if self.manifest.process is None else "killed"
 
     def policy_file(self, which: Which = "last") -> Path:
-        """Return the file of the last or the best policy."""
+        """Return the path of the last or the best policy."""
         return self.policies / f"{which}.safetensors"
 
     def table(self, name: Table) -> Path:
-        """Return the file of a table."""
+        """Return the path of a table."""
         return self.path / f"{name}.csv"
 
     def append(self, name: Table, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Add rows to a table, flushed on return (see `append_rows`)."""
+        """Append rows to a table, flushed on return (see `append_rows`)."""
         append_rows(self.table(name), COLUMNS[name], rows)
 
     def rows(self, name: Table) -> np.ndarray:
-        """Return every row of a table as a structured array; an empty one where nothing was written yet.
+        """Return all rows of a table as a structured array, empty if nothing was written yet.
 
-        Where the file was changed or cut since the newest checkpoint, the rows are the checkpoint's: a warning says so.
+        If the file was altered or truncated since the newest checkpoint, return the checkpoint's rows, with a warning.
         """
-        path = self._sound(name)
+        path = self._intact_file(name)
         rows = read_rows(path) if path.exists() else structured(COLUMNS[name], [])
         if missing := set(COLUMNS[name]) - set(rows.dtype.names or ()):
             raise InputError(f"{path} is damaged: it has no column {min(missing)}; restore it")
         return rows
 
-    def _sound(self, name: Table) -> Path:
-        """Return the file of a table, or its copy in the newest checkpoint if it does not continue that."""
+    def _intact_file(self, name: Table) -> Path:
+        """Return the path of a table, or of its copy in the newest checkpoint if the table does not continue it."""
         path = self.table(name)
-        for manifest in _copies(self.path)[:1]:
+        for manifest in _manifest_copies(self.path)[:1]:
             copy = manifest.with_name(path.name)
-            content = copy.read_bytes() if copy.is_file() else b""
-            known = path.read_bytes() if path.is_file() else b""
+            saved = copy.read_bytes() if copy.is_file() else b""
+            current = path.read_bytes() if path.is_file() else b""
             is_saved = self.manifest.state == "finished" and self.manifest.steps_done == self.manifest.last_checkpoint
-            is_more = is_saved and known.count(b"\n") > content.count(b"\n")
-            if (is_more or not continues(known, content)) and _is_listed(copy, content):
+            is_more = is_saved and current.count(b"\n") > saved.count(b"\n")
+            if (is_more or not continues(current, saved)) and _matches_checksum(copy, saved):
                 warnings.warn(f"{path} has changed since the newest checkpoint: its copy there is read", stacklevel=4)
                 return copy
         return path
@@ -167,13 +167,13 @@ class RunDirectory:
         return self.rows("evaluations")
 
     def log(self, line: str) -> None:
-        """Add a line to log.txt, after the time of now."""
+        """Append a line to log.txt, with a timestamp."""
         with open(self.path / LOG, "a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{now()} {line.rstrip()}\n")
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from writing to this run while this one lives. Raises InputError where it cannot."""
+        """Hold the run's lock, which keeps other processes from writing to it. Raises InputError if that fails."""
         for path in [*self.path.iterdir(), *self.checkpoints.glob("*")]:
             if path.is_symlink():  # what it points to would be overwritten
                 raise InputError(f"{path} is a link: replace it by what it points to")
@@ -191,24 +191,24 @@ class RunDirectory:
 
 
 def now() -> str:
-    """Return the moment, to the second, with its offset from universal time."""
+    """Return the current local time, to the second, with its UTC offset."""
     return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
 def is_run(path: str | Path) -> bool:
-    """Return whether there is a run in this directory, sound or not."""
-    return os.path.exists(Path(path) / MANIFEST) or bool(_copies(Path(path)))
+    """Return whether there is a run in this directory, intact or damaged."""
+    return os.path.exists(Path(path) / MANIFEST) or bool(_manifest_copies(Path(path)))
 
 
-def _is_listed(copy: Path, content: bytes) -> bool:
-    """Return whether a file of a checkpoint is as the checkpoint's list says."""
+def _matches_checksum(copy: Path, content: bytes) -> bool:
+    """Return whether a checkpoint's file has the checksum in the checkpoint's list."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         files = json.loads((copy.parent / "checkpoint.json").read_bytes())["files"]
         return files[copy.name]["sha256"] == hashlib.sha256(content).hexdigest()
     return False
 
 
-def _copies(path: Path) -> list[Path]:
-    """Return the copies of a run's manifest in its checkpoints, the newest first."""
+def _manifest_copies(path: Path) -> list[Path]:
+    """Return the paths of the manifest's copies in a run's checkpoints, newest first."""
     steps = {int(copy.parent.name[5:]): copy for copy in path.glob(f"checkpoint/step_[0-9]*/{MANIFEST}")}
     return [steps[step] for step in sorted(steps, reverse=True)]

@@ -1,4 +1,4 @@
-"""A set of runs, one seed each, in one folder: `seed-<k>` for each, or a run alone."""
+"""A set of runs, one per seed, in the folders `seed-<k>` of one folder, or a single run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class RunSet:
-    """The runs in one folder, `seed-<k>` each, or one run alone; `curve` is the picture of their evaluations."""
+    """The runs in the folders `seed-<k>` of one folder, or a single run; `curve` is the path of their plot."""
 
     def __init__(self, path: Path, runs: Sequence[RunDirectory]) -> None:
         self.path, self.runs, self.seeds = path, list(runs), [run.seed for run in runs]
@@ -37,7 +37,7 @@ class RunSet:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Self:
-        """Open the runs below a folder, or a run. Raises InputError where there is none, or a manifest is damaged."""
+        """Open the runs in a folder, or a single run. Raises InputError if there is none, or a manifest is damaged."""
         check_path("a run directory", path)
         path = Path(os.path.abspath(path))
         if is_run(path):
@@ -45,40 +45,40 @@ class RunSet:
         below = [folder for folder in path.glob("seed-*") if is_run(folder)]
         runs = sorted(map(RunDirectory.open, below), key=lambda run: run.seed)
         if not runs:
-            RunDirectory.open(path)  # which says what is there instead
+            RunDirectory.open(path)  # raises InputError that says what is there instead
         return cls(path, runs)
 
     @property
     def config(self) -> RunConfig:
-        """What the first run computes; the others differ by their seeds."""
+        """The configuration of the first run; the others differ in their seeds."""
         return self.runs[0].config
 
     @property
     def failures(self) -> dict[int, str]:
-        """How each seed that failed did."""
+        """The failure message of each failed seed."""
         return {run.seed: run.manifest.failure for run in self.runs if run.manifest.state == "failed"}
 
     @property
     def state(self) -> str:
-        """What the runs are, the most urgent of it: running, killed, interrupted, waiting, failed, or else finished."""
+        """The most urgent state among the runs: running, killed, interrupted, waiting, failed, or else finished."""
         states, order = {run.state for run in self.runs}, ("running", "killed", "interrupted", "waiting", "failed")
         return next((state for state in order if state in states), "finished")
 
     @property
     def steps_done(self) -> int:
-        """The fewest steps that a seed has made that did not fail."""
+        """The fewest steps done by any seed that did not fail."""
         steps = [run.manifest.steps_done for run in self.runs if run.manifest.state != "failed"]
         return min(steps or [run.manifest.steps_done for run in self.runs])
 
     def run(self, seed: int) -> RunDirectory:
-        """Return the run of one seed. Raises InputError where there is none."""
+        """Return the run of one seed. Raises InputError if there is none."""
         for run in self.runs:
             if run.seed == seed:
                 return run
         raise InputError(f"{self.path} has no seed {seed!r:.20}; it has {', '.join(map(str, self.seeds))}")
 
     def rows(self, name: Table) -> np.ndarray:
-        """Return the rows of a table of all runs, seed by seed, with the columns that all of them have."""
+        """Return all runs' rows of a table, seed by seed, with the columns that they have in common."""
         return joined(name, (run.rows(name) for run in self.runs))
 
     @property
@@ -99,7 +99,7 @@ def run_path(directory: Path, seed: int) -> Path:
 
 
 def new_set_directory(task: str, algorithm: str) -> Path:
-    """Return `runs/<task>/<algorithm>/<date-time>`, with a number behind it where that is taken."""
+    """Return `runs/<task>/<algorithm>/<date-time>`, with a number appended if that exists."""
     moment = datetime.now().strftime("%Y%m%d-%H%M%S")
     first = Path("runs", as_folder(task), as_folder(algorithm), moment).absolute()
     path, number = first, 1
@@ -110,21 +110,21 @@ def new_set_directory(task: str, algorithm: str) -> Path:
 
 
 def as_folder(name: str) -> str:
-    """Return the name of a task or of an algorithm as that of a folder."""
+    """Return the name of a task or algorithm as a folder name."""
     return name.replace("/", "-").replace(":", "-")
 
 
 def find_sets(directory: str | Path, on_damaged: Callable[[InputError], None] | None = None) -> list[RunSet]:
-    """Return every set of runs in `directory` and below, sorted by path; `on_damaged` is told why another is not.
+    """Return every set of runs in `directory` and below, sorted by path; `on_damaged` gets each damaged run's error.
 
-    Raises InputError where there is no such directory.
+    Raises InputError if there is no such directory.
     """
     directory = Path(directory)
     if not directory.is_dir():
         raise InputError(f"there is no directory {directory}; give one that holds runs")
     found: dict[Path, list[RunDirectory]] = {}
     for folder, below, files in os.walk(directory):
-        below[:] = [name for name in below if not name.startswith(".")]  # where runs are being made
+        below[:] = [name for name in below if not name.startswith(".")]  # temporary folders of runs being created
         if MANIFEST in files or ("checkpoint" in below and is_run(folder)):
             below.clear()
             try:
@@ -132,6 +132,6 @@ def find_sets(directory: str | Path, on_damaged: Callable[[InputError], None] | 
                 in_set = run.path == run_path(run.path.parent, run.seed) and Path(folder) != directory
                 found.setdefault(run.path.parent if in_set else run.path, []).append(run)
             except InputError as error:
-                if on_damaged and "evaluations.csv" in files:  # else it is the manifest of something else
+                if on_damaged and "evaluations.csv" in files:  # otherwise the manifest is not a run's
                     on_damaged(error)
     return [RunSet(path, sorted(runs, key=lambda run: run.seed)) for path, runs in sorted(found.items())]

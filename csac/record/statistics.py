@@ -1,6 +1,6 @@
-"""Statistics over episodes, seeds and tasks, and of one learning curve. docs/statistics.md defines each.
+"""Statistics over episodes, seeds and tasks, and of one learning curve, as defined in docs/statistics.md.
 
-A curve is `steps` [t] in order and `returns` [t], each the mean over one evaluation's episodes.
+A curve is `steps` [t] in increasing order and `returns` [t], each the mean over one evaluation's episodes.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-FEWEST_FOR_INTERVAL = 3  # seeds: of two, the t-interval is nine standard deviations to either side
+FEWEST_FOR_INTERVAL = 3  # seeds: with two, the t-interval is nine standard deviations to either side
 FEWEST_FOR_BOOTSTRAP = 5  # seeds: fewer have too few distinct resamples to say anything
-REGAINED = 0.9  # of the return before a perturbation: the policy is back
+REGAINED = 0.9  # share of the return before a perturbation at which a policy has recovered
 
 
 class Interval(NamedTuple):
-    """A mean and the bounds of its confidence interval, NaN where there is too little to tell."""
+    """A mean and the bounds of its confidence interval, NaN where there are too few values."""
 
     mean: np.ndarray
     low: np.ndarray
@@ -30,7 +30,7 @@ class Interval(NamedTuple):
 def evaluation_matrix(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return `(steps [t], seeds [s], returns [s, t])`, each return the mean over that evaluation's episodes.
 
-    NaN stands where a seed was not evaluated at a step. `rows` are those of evaluations.csv.
+    A return is NaN where a seed was not evaluated at a step. `rows` are those of evaluations.csv.
     """
     steps, step_index = np.unique(rows["step"], return_inverse=True)
     seeds, seed_index = np.unique(rows["seed"], return_inverse=True)
@@ -42,31 +42,31 @@ def evaluation_matrix(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def is_case(values: np.ndarray) -> bool:
-    """Return whether `values` [episode], NaN where an episode said nothing, are all 0 or 1.
+    """Return whether `values` [episode], NaN where an episode reported nothing, are all 0 or 1.
 
-    Then they tell of something that happens or does not, such as a crash. A table does not know a bool from a number,
-    so this is the only definition; where several runs stand side by side, it is asked of all their values together.
+    Such values describe something that happens or does not, such as a crash. Tables do not distinguish bools from
+    numbers, so this is the only definition; to compare several runs, apply it to all their values together.
     """
     known = values[~np.isnan(values)]
     return bool(len(known) and np.isin(known, (0.0, 1.0)).all())
 
 
 def mean_over_episodes(values: np.ndarray, is_case: bool) -> float:
-    """Return the mean over `values` [episode], NaN where an episode said nothing.
+    """Return the mean over `values` [episode], NaN where an episode reported nothing.
 
-    In a case, silence is a no: many tasks speak of a success or a crash only when there is one. A number that an
-    episode does not tell is unknown, and left out. NaN where nothing is known.
+    In a case, such a NaN counts as 0: many tasks report a success or a crash only when there is one. For other numbers
+    it is unknown, and left out. The mean is NaN if no value is known.
     """
     values = np.where(np.isnan(values), 0.0, values) if is_case else values[~np.isnan(values)]
     return float(values.mean()) if len(values) else np.nan
 
 
 def mean_and_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
-    """Mean over seeds and its t-interval, `mean ± t(n - 1) · s / √n`, for `values` [seed, ...].
+    """Return the mean over seeds and its t-interval, `mean ± t(n - 1) · s / √n`, for `values` [seed, ...].
 
-    NaNs are left out. One value alone has a mean but no interval.
+    NaNs are left out. A single value has a mean but no interval.
     """
-    from scipy import special  # slow to import, and what imports this module need not come so far
+    from scipy import special  # slow to import, and not always needed
 
     values = np.asarray(values, dtype=np.float64)
     present = ~np.isnan(values)
@@ -80,7 +80,7 @@ def mean_and_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
 
 
 def interquartile_mean(values: np.ndarray) -> float:
-    """Mean of the middle half of all values, NaNs left out; NaN where nothing is left."""
+    """Return the mean of the middle half of all values, NaNs left out; NaN if no value is left."""
     values = np.asarray(values, dtype=np.float64)
     ordered = np.sort(values[~np.isnan(values)])
     cut = len(ordered) // 4
@@ -90,20 +90,20 @@ def interquartile_mean(values: np.ndarray) -> float:
 def stratified_bootstrap_interval(
     scores: np.ndarray, statistic: Callable[[np.ndarray], float], repetitions: int = 2000, seed: int = 0
 ) -> tuple[float, float] | None:
-    """95 % percentile interval of `statistic`, resampling the seeds of `scores` [seed, ...] anew for every other index.
+    """Return the 95 % percentile interval of `statistic`, resampling the seeds of `scores` [seed, ...] for each task.
 
-    The other index is a task: where it is an evaluation of the same seed, average over it first. Seeds with a NaN are
-    left out whole; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge
-    of the Statistical Precipice".
+    The other axis is the task: average over several evaluations of a seed first. Seeds with any NaN are left out
+    entirely; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of
+    the Statistical Precipice".
     """
-    return _bootstrap_interval([scores], statistic, repetitions, seed, confidence=0.95)
+    return _bootstrap_interval([scores], statistic, repetitions, seed)
 
 
 def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
-    """Probability that a seed of `scores` [seed, task] is above one of `others` [seed, task], averaged over tasks.
+    """Return the probability that a seed of `scores` [seed, task] is above one of `others`, averaged over tasks.
 
-    An equal pair counts half; NaNs are left out, NaN where a task has no pair. One task may be given as [seed].
-    Agarwal et al. 2021, there P(X > Y).
+    An equal pair counts half; NaNs are left out; NaN if a task has no pair. One task may be given as [seed].
+    This is P(X > Y) of Agarwal et al. 2021.
     """
     scores = np.asarray(scores, dtype=np.float64)[:, None]  # [seed, other seed, ...]
     others = np.asarray(others, dtype=np.float64)[None, :]
@@ -112,17 +112,15 @@ def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
     return float(np.mean(_divide(np.nansum(above, axis=(0, 1)), pairs)))
 
 
-def improvement_interval(
-    scores: np.ndarray, others: np.ndarray, repetitions: int = 2000, seed: int = 0, confidence: float = 0.95
-) -> tuple[float, float] | None:
-    """Stratified bootstrap interval of `probability_of_improvement`; None where either has fewer than five seeds."""
-    return _bootstrap_interval([scores, others], probability_of_improvement, repetitions, seed, confidence)
+def improvement_interval(scores: np.ndarray, others: np.ndarray, repetitions: int = 2000) -> tuple[float, float] | None:
+    """Return the stratified bootstrap interval of `probability_of_improvement`; None if either has under five seeds."""
+    return _bootstrap_interval([scores, others], probability_of_improvement, repetitions)
 
 
 def maximum_average_return(rows: np.ndarray) -> tuple[float, int]:
-    """Return `(value, step)`: the highest mean over seeds among the evaluation points that hold every seed.
+    """Return `(value, step)`: the highest mean over seeds among the evaluation points that have every seed.
 
-    The first such point wins a tie. Raises InputError where no point holds every seed.
+    The first such point wins a tie. Raises InputError if no point has every seed.
     """
     steps, _, returns = evaluation_matrix(rows)
     average = returns.mean(axis=0) if returns.size else np.full(len(steps), np.nan)
@@ -133,59 +131,59 @@ def maximum_average_return(rows: np.ndarray) -> tuple[float, int]:
 
 
 def last_evaluations(rows: np.ndarray, points: int = 3) -> dict[int, float]:
-    """Return the mean return of each seed over its own last evaluation points, `points` of them or all there are."""
+    """Return each seed's mean return over its last evaluation points, `points` of them or all if there are fewer."""
     _, seeds, returns = evaluation_matrix(rows)
     last = (line[~np.isnan(line)][-points:] for line in returns)
     return {int(seed): float(line.mean()) for seed, line in zip(seeds, last, strict=True) if line.size}
 
 
 def best_return(rows: np.ndarray) -> float:
-    """Return the highest of a seed's evaluations, each the mean over its episodes; minus infinity where it has none."""
+    """Return the highest of a seed's evaluations, each the mean over its episodes; minus infinity if there is none."""
     return float(np.nanmax(evaluation_matrix(rows)[2], initial=-np.inf))
 
 
 def steps_to_reach(steps: np.ndarray, returns: np.ndarray, threshold: float) -> float:
-    """Environment steps at the first evaluation at `threshold` or above; infinite where none is: "not reached".
+    """Return the environment steps at the first evaluation at `threshold` or above; infinity if it is not reached.
 
-    An infinite number says that it took longer than the curve is, and no more: take medians over seeds, not means.
+    Infinity means only that it took longer than the curve: take medians over seeds, not means.
     """
-    reached = returns >= threshold  # never where it is NaN
+    reached = returns >= threshold  # False for NaN
     return float(steps[int(reached.argmax())]) if reached.any() else np.inf
 
 
 def drawdown(returns: np.ndarray) -> float:
-    """Largest fall from the highest return so far to a later one; 0 of a curve that never falls, NaN of none."""
+    """Return the largest fall from the highest return so far to a later one; 0 if none falls, NaN if there is none."""
     known = returns[~np.isnan(returns)]
     return float((np.maximum.accumulate(known) - known).max()) if len(known) else np.nan
 
 
 class Recovery(NamedTuple):
-    """What a perturbation did to the returns of one seed, and how they came back. NaN where nothing can be told."""
+    """What a perturbation did to the returns of one seed, and how they recovered. NaN where that is not known."""
 
     before: float
     """Mean return of the last three evaluations up to and including the perturbation's step."""
     drop: float
-    """`before` minus the lowest return after it, 0 where none is lower."""
+    """`before` minus the lowest return after the perturbation, 0 if none is lower."""
     relative_drop: float
     """The drop as a share of |before|."""
     steps_to_regain: float
-    """Environment steps from the perturbation to 90 % of `before`: 0 if no evaluation fell below, infinite if never."""
+    """Environment steps from the perturbation to 90 % of `before`: 0 if none fell below, infinite if never."""
     area_lost: float
     """Integral of max(0, before - return) over the steps after the perturbation, in return times steps."""
     final: float
-    """Mean return of the last three evaluations after the perturbation, or of all where none is after it."""
+    """Mean return of the last three evaluations after the perturbation, or of the curve if none is after it."""
     worst_drawdown: float
-    """The largest fall from the highest return so far, over the whole curve, before the perturbation and after it."""
+    """Largest fall from the highest return so far, over the whole curve, before and after the perturbation."""
 
 
 def recovery(rows: np.ndarray, step: int, until: int | None = None, since: int = -1) -> dict[int, Recovery]:
-    """Return each seed's `Recovery` from a perturbation after `step`, of the rows of evaluations.csv until `until`.
+    """Return each seed's `Recovery` from a perturbation after `step`, for rows of evaluations.csv up to step `until`.
 
-    What came until `since`, where the perturbation before it was, is no return before this one; an evaluation at `step`
-    itself still is. Of a negative return before, -100, 90 % are -110: `before` less a tenth of its size. The steps to
-    regain that end at the first evaluation that reaches it after the first one that did not. The area is the
-    trapezoids' between evaluations, beginning with no loss at `step`. Last evaluations are fewer than three where there
-    are no more; those of a seed that are NaN or missing are left out.
+    Evaluations up to `since`, the step of the previous perturbation, do not count as before this one; an evaluation at
+    `step` itself does. If `before` is negative, such as -100, its 90 % are -110: `before` minus a tenth of its size.
+    `steps_to_regain` ends at the first evaluation that reaches this threshold after the first one below it. The area is
+    computed by the trapezoidal rule between evaluations, from no loss at `step`. Means over the last three evaluations
+    are over fewer if there are no more; a seed's NaN or missing evaluations are left out.
     """
     steps, seeds, returns = evaluation_matrix(rows)
     wanted = steps <= (steps.max(initial=0) if until is None else until)
@@ -217,9 +215,9 @@ def _recovery(steps: np.ndarray, returns: np.ndarray, step: int, since: int) -> 
 
 
 def _bootstrap_interval(
-    samples: Sequence[np.ndarray], statistic: Callable[..., float], repetitions: int, seed: int, confidence: float
+    samples: Sequence[np.ndarray], statistic: Callable[..., float], repetitions: int, seed: int = 0
 ) -> tuple[float, float] | None:
-    """Percentile interval of `statistic(*samples)`, each sample [seed, ...] resampled for itself."""
+    """Return the 95 % percentile interval of `statistic(*samples)`, resampling each sample [seed, ...] on its own."""
     arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
     arrays = [array[~np.isnan(array).any(axis=tuple(range(1, array.ndim)))] for array in arrays]
     if min(map(len, arrays)) < FEWEST_FOR_BOOTSTRAP:
@@ -230,10 +228,10 @@ def _bootstrap_interval(
         return np.take_along_axis(array, generator.integers(len(array), size=array.shape), axis=0)
 
     values = [statistic(*map(resampled, arrays)) for _ in range(repetitions)]
-    low, high = np.quantile(values, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    low, high = np.quantile(values, [0.5 - 0.95 / 2, 0.5 + 0.95 / 2])
     return float(low), float(high)
 
 
 def _divide(numerator: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Quotient, NaN where the count is zero; a scalar for scalars."""
+    """Return the quotient, NaN where the count is zero; a scalar for scalars."""
     return np.where(count > 0, numerator / np.maximum(count, 1), np.nan)[()]

@@ -1,6 +1,6 @@
-"""Numbers over seeds, recoveries and cases of runs, as plain values: `report_tables` turns them into text.
+"""Summarise runs over seeds, their recoveries and cases, as plain values: `report_tables` turns them into text.
 
-Rows are those of evaluations.csv; a seed in `failed` is shown and left out of what is over seeds.
+Rows are those of evaluations.csv; seeds in `failed` are listed but left out of statistics over seeds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class OverSeeds(NamedTuple):
-    """A number over seeds. NaN where there are too few: `std` of one seed, the 95 % t-interval of two."""
+    """Statistics over seeds. NaN where there are too few: `std` of one seed, the 95 % t-interval of two."""
 
     seeds: int
     mean: float
@@ -40,14 +40,14 @@ class RecoverySummary(NamedTuple):
     seeds: dict[int, Recovery]
     failed: frozenset[int]
     metrics: dict[str, OverSeeds]
-    """By the fields of `Recovery`, over the seeds where it is known. No mean of steps where a seed never came back."""
+    """For each field of `Recovery`, over the seeds where it is known; no mean of steps if a seed never recovered."""
     regained: int
     known: int
-    """Of how many seeds the recovery is known, and how many of them came back."""
+    """Number of seeds whose recovery is known; `regained` of them recovered."""
 
 
 class CaseSummary(NamedTuple):
-    """How often something happened, as a share of the episodes; or, of what is a number, its mean per episode."""
+    """How often a case occurred, as a share of the episodes; or, for any other number, its mean per episode."""
 
     name: str
     is_case: bool
@@ -56,7 +56,7 @@ class CaseSummary(NamedTuple):
 
 
 def over_seeds(values: Iterable[float]) -> OverSeeds:
-    """Return mean, standard deviation and 95 % t-interval of one value for each seed, NaNs left out."""
+    """Return the mean, standard deviation and 95 % t-interval of one value per seed, NaNs left out."""
     known = np.array([value for value in values if not np.isnan(value)], dtype=np.float64)
     if not len(known):
         return OverSeeds(0, np.nan, np.nan, np.nan, np.nan)
@@ -74,13 +74,13 @@ def recoveries(
     since: int = -1,
     failed: Collection[int] = (),
 ) -> RecoverySummary:
-    """Return what a perturbation after `step` cost each seed and all together; `until` and `since` as in `recovery`."""
+    """Return the cost of a perturbation after `step`, by seed and over seeds; `until` and `since` as in `recovery`."""
     seeds = recovery(rows, step, until, since)
     sound = [one for seed, one in seeds.items() if seed not in failed and not np.isnan(one.drop)]
     columns = dict(zip(Recovery._fields, np.array(sound).reshape(len(sound), len(Recovery._fields)).T, strict=True))
     regained = sum(np.isfinite(one.steps_to_regain) for one in sound)
     if regained < len(sound):
-        columns["steps_to_regain"] = np.zeros(0)  # a mean of those that came back would flatter
+        columns["steps_to_regain"] = np.zeros(0)  # a mean of only those that recovered would flatter
     metrics = {name: over_seeds(column) for name, column in columns.items()}
     return RecoverySummary(label, seeds, frozenset(failed) & seeds.keys(), metrics, int(regained), len(sound))
 
@@ -88,9 +88,9 @@ def recoveries(
 def perturbation_recoveries(
     rows: np.ndarray, perturbed: Sequence[tuple[int, str]], failed: Collection[int] = ()
 ) -> list[RecoverySummary]:
-    """Return what each of the `(step, what changed)` of one run cost it, each as far as the next, labelled with both.
+    """Return what each perturbation `(step, what changed)` of one run cost until the next one, labelled with both.
 
-    Left out are those with no evaluation before them or none after.
+    Perturbations with no evaluation before or none after them are left out.
     """
     found = []
     for index, (step, text) in enumerate(perturbed):
@@ -104,9 +104,9 @@ def perturbation_recoveries(
 
 
 def case_names(runs: Sequence[np.ndarray]) -> dict[str, bool]:
-    """Return what these rows tell of beside returns, success and events, and whether each is a case in all of them.
+    """Return the names of success and of the events in these rows, and whether each is a case in all of them.
 
-    An event that no episode tells of is there, as a number that is not known; success is not.
+    An event that no episode reports is included, as a number that is not known; success is not.
     """
     names = dict.fromkeys(name for rows in runs for name in rows.dtype.names or () if name in _events(rows))
     values = {name: np.concatenate([rows[name] for rows in runs if name in _events(rows)]) for name in names}
@@ -114,9 +114,9 @@ def case_names(runs: Sequence[np.ndarray]) -> dict[str, bool]:
 
 
 def cases(rows: np.ndarray, names: Mapping[str, bool] | None = None) -> list[CaseSummary]:
-    """Return how often success and each event came in `rows`, all of their episodes, seed by seed.
+    """Return how often success and each event occurred in all episodes of `rows`, seed by seed.
 
-    `names` are those of `case_names`, given where several runs are to be treated alike.
+    `names` comes from `case_names` of several runs, to treat them alike.
     """
     found = []
     for name, happens in (case_names([rows]) if names is None else names).items():
@@ -129,7 +129,7 @@ def cases(rows: np.ndarray, names: Mapping[str, bool] | None = None) -> list[Cas
 
 
 def last_rows(rows: np.ndarray, points: int = 1) -> np.ndarray:
-    """Return the rows of each seed's own last evaluations, `points` of them."""
+    """Return the rows of each seed's last `points` evaluations."""
     wanted = np.zeros(len(rows), dtype=bool)
     for seed in np.unique(rows["seed"]):
         own = rows["seed"] == seed
@@ -138,5 +138,5 @@ def last_rows(rows: np.ndarray, points: int = 1) -> np.ndarray:
 
 
 def _events(rows: np.ndarray) -> set[str]:
-    """The columns that tell of what happened in an episode."""
+    """Return the columns that describe what happened in an episode."""
     return {name for name in rows.dtype.names or () if name == "success" or name not in COLUMNS["evaluations"]}

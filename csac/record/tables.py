@@ -1,4 +1,4 @@
-"""The CSV tables of a run: appended row by row, read back as structured arrays, equal byte for byte in equal runs."""
+"""Write and read the CSV tables of a run; equal runs give byte-identical tables."""
 
 from __future__ import annotations
 
@@ -29,33 +29,33 @@ INTEGER_COLUMNS = frozenset({"seed", "step", "episode", "length"})
 
 
 def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Add rows to the table at `path`: all of them or, on an error, none; flushed to the system on return.
+    """Append rows to the table at `path`: all of them or, on an error, none; flushed to the system on return.
 
-    The header is `columns`, then whatever else rows hold; the first that hold a new column have the table written anew
-    with it, empty in the rows before. A value is None (an empty cell), an integer, a boolean, or a float, written with
-    the fewest digits that give it back in its own precision. Raises RuntimeError for a value that is no number.
+    The header is `columns`, then the rows' other keys; a new key causes the table to be rewritten with a new column,
+    empty in earlier rows. A value is None (an empty cell), an integer, a boolean, or a float, written with the fewest
+    digits that restore it in its own precision. Raises RuntimeError for a value that is not a number.
     """
     if not rows:
         return
     with open(path, "ab+") as file:
         drop_torn_line(file)
         file.seek(0)
-        known = _header(path, file.readline())
-        header = list(dict.fromkeys([*(known or columns), *(column for row in rows for column in row)]))
+        old = _header(path, file.readline())
+        header = list(dict.fromkeys([*(old or columns), *(column for row in rows for column in row)]))
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        if header != known:
+        if header != old:
             writer.writerow(header)
-            text.writelines(line + "," * (len(header) - len(known)) + "\n" for line in file.read().decode().split())
+            text.writelines(line + "," * (len(header) - len(old)) + "\n" for line in file.read().decode().split())
         writer.writerows([_cell(path, column, row.get(column)) for column in header] for row in rows)
-        if not known or header == known:
+        if not old or header == old:
             file.write(text.getvalue().encode())
             return
     write_atomically(path, text.getvalue().encode())
 
 
 def continues(table: bytes, before: bytes) -> bool:
-    """Return whether a table begins with what it was before, where columns may have come since then."""
+    """Return whether a table begins with the rows of `before`; columns may have been added since."""
     if table.startswith(before):
         return True
     header, *rows = before.splitlines()
@@ -72,14 +72,14 @@ def _header(path: Path, line: bytes) -> list[str]:
 
 
 def check_new(path: Path) -> None:
-    """Raise InputError where there is a file already or none can be, before anything has been computed for it."""
+    """Raise InputError if no new table can be created at `path`, before anything has been computed for it."""
     if path.suffix.lower() != ".csv":
         better = path.with_suffix(".csv") if path.name else path / "table.csv"
         raise InputError(f"the table is a .csv file: name it {better}")
     try:
         with suppress(FileNotFoundError):
             name_aside(path).lstat()
-    except OSError as error:  # the name is too long, or a part of the path is no folder
+    except OSError as error:  # the name is too long, or a part of the path is not a folder
         raise InputError(f"cannot write {path}: {error.strerror}; choose another place or name") from None
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
@@ -89,14 +89,14 @@ def check_new(path: Path) -> None:
 
 
 def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a table as `append_rows` does; the file gets its name once it is whole. Raises InputError."""
+    """Write a table as `append_rows` does, and give the file its name once complete. Raises InputError."""
     aside = name_aside(path)
     try:
         with writing(path):
             append_rows(aside, columns, rows)
             aside.replace(path)
     finally:
-        with suppress(OSError):  # what was raised is told
+        with suppress(OSError):  # keep the first error
             aside.unlink()
 
 
@@ -104,8 +104,8 @@ def read_rows(path: str | Path) -> np.ndarray:
     """Read a table of a run as a structured array [row].
 
     `seed`, `step`, `episode` and `length` are int64, every other column is float64 with NaN for an empty cell. A last
-    line without its newline was cut off by a crash and is left out. Raises InputError where the file is missing or is
-    not such a table.
+    line without its newline was cut off by a crash and is left out. Raises InputError if the file is missing or is not
+    such a table.
     """
     path = Path(path)
     try:
@@ -113,7 +113,7 @@ def read_rows(path: str | Path) -> np.ndarray:
         header, *body = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))) or [[]]
         if not header and not body:
             return structured(COLUMNS.get(path.stem, ("seed", "step")), [])
-        is_plain = all(name.isprintable() for name in header)  # it moves no terminal
+        is_plain = all(name.isprintable() for name in header)  # no control characters
         if len(set(header)) < len(header) or not {"seed", "step"} <= set(header) or not is_plain:
             raise ValueError(f"its header is {','.join(header)[:100]!r}")
         for number, cells in enumerate(body, start=2):
@@ -125,7 +125,7 @@ def read_rows(path: str | Path) -> np.ndarray:
 
 
 def joined(name: str, tables: Iterable[np.ndarray]) -> np.ndarray:
-    """Return the rows of several tables of this name, with the columns that are in each that has rows."""
+    """Return the rows of several tables of this name, with the columns that all non-empty ones have."""
     tables = [table for table in tables if len(table)]
     if not tables:
         return structured(COLUMNS[name], [])
@@ -134,9 +134,9 @@ def joined(name: str, tables: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarray:
-    """Return cells as a structured array [row].
+    """Return cells of text as a structured array [row].
 
-    Raises ValueError or OverflowError where one is not the number that its column asks for, or a name is no column's.
+    Raises ValueError or OverflowError if a cell is not the number that its column needs, or a column name is invalid.
     """
     rows = np.empty(len(body), [(name, np.int64 if name in INTEGER_COLUMNS else np.float64) for name in header])
     for index, name in enumerate(header):
@@ -146,7 +146,7 @@ def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarr
 
 
 def _short(error: Exception) -> str:
-    """Return what an error says; a cell may be as long as the file."""
+    """Return an error's message, shortened: a cell may be as long as the file."""
     return textwrap.shorten(str(error), 150, placeholder=" ...") if len(str(error)) < 10_000 else "a huge cell"
 
 
@@ -168,7 +168,7 @@ def _cell(path: Path, column: str, value: Any) -> str:
 
 
 def drop_torn_line(file: BinaryIO) -> None:
-    """Cut off what follows the last newline: a line that a crash interrupted."""
+    """Remove what follows the last newline: a line that a crash interrupted."""
     end = file.seek(0, os.SEEK_END)
     if not end:
         return

@@ -1,4 +1,4 @@
-"""TensorBoard files of a run, from rows of its tables, with Stable-Baselines3's tags."""
+"""Write TensorBoard files from rows of a run's tables, with Stable-Baselines3's tags."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ if TYPE_CHECKING:
 
     Row = Mapping[str, Any]
 
-EPISODES_AVERAGED = 100  # as Stable-Baselines3's rollout/ep_rew_mean
+EPISODES_AVERAGED = 100  # as in Stable-Baselines3's rollout/ep_rew_mean
 FLUSH_SECONDS = 30
 
 
 class TensorBoardLog:
-    """Writes the curves of a run that goes on from step `begin`, after the training episodes `before`.
+    """Write the curves of a run that continues from step `begin`, after the training episodes `before`.
 
-    `cases` are the events that evaluations have told of: where one happens or does not, silence is a no.
+    `cases` are the events that were cases in earlier evaluations: an episode that does not report one counts as 0.
 
     `rollout/*` are means over the last 100 training episodes, `eval/*` over the episodes of one evaluation, `train/*`
-    the metrics, `time/fps` environment steps per second since the log was opened. Not tensorboardX's own writer: its
-    thread dies of a full disk, and whoever adds to its queue then waits for ever.
+    the metrics, `time/fps` environment steps per second since the log was opened. tensorboardX's own writer is not
+    used: on a full disk its thread dies, and adding to its queue then blocks forever.
     """
 
     def __init__(self, folder: Path, begin: int = 0, before: Sequence[Row] = (), cases: Iterable[str] = ()) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        earlier = len([*folder.glob("events.*")])  # which a file of the same second would overwrite
+        earlier = len([*folder.glob("events.*")])  # a file of the same second would overwrite one
         self._writer: EventsWriter | None = EventsWriter(str(folder / "events"), f".{earlier}")
         self._begin, self._began = begin, time.monotonic()
         self._flushed = self._began
         self._recent: deque[Row] = deque(before, maxlen=EPISODES_AVERAGED)
         self._cases = set(cases)
-        if begin or earlier:  # TensorBoard drops what was written after the step that the run goes on from
+        if begin or earlier:  # TensorBoard drops what was written after the step that the run continues from
             self._add(Event(step=begin + 1, session_log=SessionLog(status=SessionLog.START)))
 
     def write(self, table: Table, rows: Sequence[Row]) -> dict[int, dict[str, float]]:
-        """Write the values of these rows; return them by step and tag. Raises OSError."""
+        """Write the values of these rows, and return them by step and tag. Raises OSError."""
         steps: dict[int, list[Row]] = defaultdict(list)
         for row in rows:
             steps[row["step"]].append(row)
@@ -61,13 +61,13 @@ class TensorBoardLog:
         return points
 
     def flush(self) -> None:
-        """Have everything in the file. Raises OSError."""
+        """Write everything buffered to the file. Raises OSError."""
         if self._writer:
             self._writer.flush()
         self._flushed = time.monotonic()
 
     def close(self) -> None:
-        """Close the file; what cannot be written is left out, since nothing depends on it."""
+        """Close the file; a write error is ignored, since nothing depends on this file."""
         writer, self._writer = self._writer, None
         if writer:
             with suppress(OSError):
@@ -84,13 +84,13 @@ class TensorBoardLog:
         self._recent.extend(rows)
         tags = {"rollout/ep_rew_mean": "return", "rollout/ep_len_mean": "length"}
         tags |= {f"rollout/{name}": name for name in rows[-1] if name not in COLUMNS["episodes"]}
-        told = {tag: np.array([row.get(name) for row in self._recent], float) for tag, name in tags.items()}
-        return {tag: float(np.nanmean(values)) for tag, values in told.items() if not np.isnan(values).all()}
+        columns = {tag: np.array([row.get(name) for row in self._recent], float) for tag, name in tags.items()}
+        return {tag: float(np.nanmean(values)) for tag, values in columns.items() if not np.isnan(values).all()}
 
     def _metrics(self, rows: Sequence[Row]) -> dict[str, float]:
         row, elapsed = rows[-1], time.monotonic() - self._began
-        told = {name: value for name, value in row.items() if name not in COLUMNS["metrics"]}
-        values = {name if "/" in name else f"train/{name}": float(value) for name, value in told.items()}
+        metrics = {name: value for name, value in row.items() if name not in COLUMNS["metrics"]}
+        values = {name if "/" in name else f"train/{name}": float(value) for name, value in metrics.items()}
         return {**values, "time/fps": (row["step"] - self._begin) / max(elapsed, 1e-9)}
 
     def _evaluations(self, rows: Sequence[Row]) -> dict[str, float]:
@@ -99,12 +99,12 @@ class TensorBoardLog:
             "eval/mean_ep_length": float(np.mean([row["length"] for row in rows])),
         }
         for name in ("success", *(name for name in rows[0] if name not in COLUMNS["evaluations"])):
-            told = np.array([row.get(name) for row in rows], float)
-            if is_case(told):
+            column = np.array([row.get(name) for row in rows], float)
+            if is_case(column):
                 self._cases.add(name)
-            elif not np.isnan(told).all():
+            elif not np.isnan(column).all():
                 self._cases.discard(name)
-            mean = mean_over_episodes(told, name in self._cases)
+            mean = mean_over_episodes(column, name in self._cases)
             if not np.isnan(mean):
                 values["eval/success_rate" if name == "success" else f"eval/{name}"] = mean
         return values
