@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equations import CLOSED_FORM, LINEAR, batch_of, begin, gaussian, linear, transition, update
+from equations import CLOSED_FORM, LINEAR, batch_of, begin, gaussian, linear, transition
 
-from csac.algorithms import CSAC, SAC
+from csac.algorithms import CSAC
 from csac.algorithms.temperature import temperature_loss
-from csac.types import Spec, Transition
 
 
 def test_the_weight_rises_where_its_constraint_is_hurt():
@@ -52,25 +51,3 @@ def test_the_weight_falls_where_the_policy_stays_wide_by_itself():
     free, weights = entropies(-100.0)
     assert 1e-9 < weights[-1] < 1e-6
     assert -100.0 < free[-1] < -1.0
-
-
-@pytest.mark.parametrize(("algorithm", "name"), [(CSAC, "entropy_weight"), (SAC, "temperature")])
-def test_the_weight_is_told_as_it_was_used(algorithm, name):
-    options = {"target_entropy": 100.0, "weight_learning_rate": 0.1, "initial_entropy_weight": 0.5, **LINEAR}
-    learner = algorithm(entropy_weight="auto", **options)
-    state, metrics = update(learner, begin(learner), batch_of(transition()))
-    assert float(metrics[name]) == pytest.approx(0.5)
-    # Adam's first step is the learning rate: up, as the entropy is below 100.
-    assert float(state.temperature.log_weight) == pytest.approx(np.log(0.5) + 0.1, abs=1e-5)
-
-
-def test_the_target_grows_with_the_action_dimensions():
-    # Two dimensions: the entropy, about 2 (1.4189385 - 2.169) = -1.5, lies between -2 and -1: the weight falls, where
-    # the target of one dimension would raise it.
-    algorithm = CSAC(entropy_weight="auto", weight_learning_rate=0.1, **LINEAR)
-    state = begin(algorithm, Spec(1, 2))._replace(actor=linear([[0.0] * 4], [0.0, 0.0, -2.169, -2.169]))
-    nothing, observations = np.zeros(64, np.float32), np.ones((64, 1), np.float32)
-    batch = Transition(observations, np.zeros((64, 2), np.float32), nothing, observations, nothing, nothing)
-    state, metrics = update(algorithm, state, batch)
-    assert float(metrics["entropy"]) == pytest.approx(-1.5, abs=0.4)
-    assert float(state.temperature.log_weight) == pytest.approx(-0.1, abs=1e-5)
