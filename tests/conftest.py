@@ -9,6 +9,7 @@ import pytest
 
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 os.environ["JAX_PLATFORMS"] = "cpu"
+os.environ["NUMBA_DISABLE_JIT"] = "1"  # PyFlyt's few functions take 8 s to compile, and a moment in Python
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[threads] = "1"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 import re
 import runpy
@@ -115,11 +114,7 @@ def test_an_iteration_leaves_the_larger_of_alpha_and_the_discount(tau, expected)
 
 @pytest.mark.parametrize(
     ("choice", "lag"),
-    [
-        (LAG.Choice("average", rate=0.05), 20.0),
-        (LAG.Choice("average", rate=1.0), 1.0),
-        (LAG.Choice("periodic", period=1), 0.0),
-    ],
+    [(LAG.Choice("average", rate=0.05), 20.0), (LAG.Choice("periodic", period=1), 0.0)],
 )
 def test_a_reference_slows_down_by_its_lag(choice, lag):
     # 0.01·0.5 / 0.5² = 0.02 of the way back to the reference in each update: 1 + 0.02 x lag times as long.
@@ -128,45 +123,17 @@ def test_a_reference_slows_down_by_its_lag(choice, lag):
     assert measured == pytest.approx(1 + 0.02 * lag, rel=1e-3)
 
 
-@pytest.mark.parametrize(("tau", "lag"), [(0.25, 49.5), (50.0, 100.0)])
-def test_a_period_lags_by_half_of_it_and_by_all_of_it_where_it_holds_fast(tau, lag):
-    choice, resistance = LAG.Choice("periodic", period=100), 0.001 * tau / 0.5**2
-    expected = 1 + resistance * lag if tau < 1 else resistance * lag
-    assert LAG.predicted_slow_down(choice, resistance) == pytest.approx(expected, rel=1e-3)
-    measured = LAG.measured_slow_down(choice, tau, 0.5, optax.sgd(0.001), updates=800)
-    assert measured == pytest.approx(expected, rel=1e-3)
-
-
 NEAR_THE_END = [LAG.Choice("average", rate=1.0), LAG.Choice("average", rate=0.05), LAG.Choice("periodic", period=20)]
 
 
-@pytest.mark.parametrize("choice", [LAG.Choice("periodic", period=1), *NEAR_THE_END])
-@pytest.mark.parametrize("tau", [0.5, 5.0])
+@pytest.mark.parametrize(("choice", "tau"), zip(NEAR_THE_END, (0.5, 5.0, 5.0), strict=True))
 def test_half_of_the_distance_is_gone_when_theory_says_so(choice, tau):
     weights = LAG.Weights(0.2, tau)  # τ = 0.5 lengthens the way at a rate of 1 by 2 %, and with the others by more
     predicted = LAG.predicted_half_life(choice, weights, 0.5, 0.01)
     assert LAG.measured_half_life(choice, weights, 0.5, 0.01) == pytest.approx(predicted, rel=0.01)
 
 
-@pytest.mark.parametrize(("choice", "lag"), zip(NEAR_THE_END, (1.0, 20.0, 9.5), strict=True))
-def test_a_short_lag_adds_itself_times_tau_by_sigma(choice, lag):
-    # An update goes 1e-4·0.2 / 0.5² = 1 / 12,500 of the way by itself; τ / σ is 25.
-    by_itself = LAG.predicted_half_life(LAG.Choice("periodic", period=1), LAG.Weights(0.2, 0.0), 0.5, 1e-4)
-    longer = LAG.predicted_half_life(choice, LAG.Weights(0.2, 5.0), 0.5, 1e-4) - by_itself
-    assert longer == pytest.approx(math.log(2) * 25 * lag, rel=0.03)
-
-
-def test_a_long_lag_is_a_refresh():
-    # Where the policy is done long before its reference is renewed, each renewal leaves α = 0.5 / 0.7 of the distance.
-    weights, refreshes = LAG.Weights(0.2, 0.5), math.log(0.5) / math.log(0.5 / 0.7)
-    periodic = LAG.predicted_half_life(LAG.Choice("periodic", period=5000), weights, 0.5, 0.01)
-    assert periodic == pytest.approx(5000 * refreshes, rel=1e-6)
-    # A running average is renewed all the time: 1 - α of the way in every 1 / rate updates.
-    average = LAG.predicted_half_life(LAG.Choice("average", rate=1e-6), weights, 0.5, 0.01)
-    assert average == pytest.approx(1e6 * math.log(2) * 0.7 / 0.2, rel=1e-3)
-
-
-@pytest.mark.parametrize("choice", NEAR_THE_END)
+@pytest.mark.parametrize("choice", NEAR_THE_END[1:])
 def test_beyond_its_limit_a_step_back_is_larger_than_the_one_before(choice):
     def steps(share):
         tau = share * LAG.largest_stable_resistance(choice) * 0.5**2 / 0.01
@@ -176,55 +143,6 @@ def test_beyond_its_limit_a_step_back_is_larger_than_the_one_before(choice):
     stable, unstable = steps(0.9), steps(1.1)
     assert stable.max() < 2e-4  # of 1e-4 that Q alone moves it
     assert unstable[-1] > 3 * unstable[1] > 0
-
-
-@pytest.mark.parametrize(
-    ("choice", "lag"),
-    [
-        (LAG.Choice("average", rate=1.0), 1.0),
-        (LAG.Choice("average", rate=0.05), 20.0),
-        (LAG.Choice("periodic", period=50), 50.0),
-    ],
-)
-def test_adam_without_noise_goes_at_full_speed_until_the_reference_pulls_as_hard(choice, lag):
-    # The pull is 0.01, and a step of 3e-4 against 1 / 0.5² = 4: with τ L = 100 the way takes 3e-4·4·100 / 0.01 = 12
-    # times as long, and with τ L = 5 no longer than without.
-    for product, expected in ((100.0, 12.0), (5.0, 1.0)):
-        tau = product / lag
-        assert LAG.predicted_slow_down_with_adam(choice, tau, 0.5, 3e-4, 0.0) == pytest.approx(expected)
-        measured = LAG.measured_slow_down(choice, tau, 0.5, optax.adam(3e-4), 4_000)
-        assert measured == pytest.approx(expected, rel=0.07), product  # at a rate of 1 it goes to and fro as well
-
-
-@pytest.mark.parametrize(
-    ("choice", "tau", "expected"),
-    [
-        # 3e-4 / 0.1 x 5 / 0.5² = 0.06 of the way back in each update, and a lag of 20.
-        (LAG.Choice("average", rate=0.05), 5.0, 1 + 0.06 * 20),
-        # 0.015 of it, and a period leaves 0.985^200 = 0.0487. (Adam's mean of ten gradients reaches into the next one.)
-        (LAG.Choice("periodic", period=200), 1.25, 200 * 0.015 / (1 - 0.0487)),
-    ],
-)
-def test_adam_in_noise_is_descent_with_the_rate_over_the_noise(choice, tau, expected):
-    assert LAG.predicted_slow_down_with_adam(choice, tau, 0.5, 3e-4, 0.1) == pytest.approx(expected, rel=1e-3)
-    measured = LAG.measured_slow_down(choice, tau, 0.5, optax.adam(3e-4), 100_000, 0.1)
-    assert measured == pytest.approx(expected, rel=0.06)
-
-
-@pytest.mark.parametrize("std", [1.0, 0.1, 0.01])
-def test_only_noise_is_left_of_a_sampled_relative_entropy_towards_the_actor_itself(std):
-    exact, sampled = (
-        READING.gradients(
-            READING.CSAC(relative_entropy_estimator=estimator, reference_policy="periodic", reference_period=1), std
-        )
-        for estimator in ("closed_form", "sampled")
-    )
-    mean, deviation = READING.moments(sampled - exact)
-    # d/dμ of 0.5 log(π/π̃) at a = tanh(μ + std ξ) is that of the log-density in its first argument, 0.5 ξ / std.
-    assert mean == pytest.approx(0.0, abs=1e-3 / std)
-    assert deviation == pytest.approx(0.5 / std, rel=1e-3)
-    without = READING.gradients(READING.CSAC(relative_entropy_weight=0.0), std)
-    np.testing.assert_allclose(exact, without, atol=1e-6 / std)
 
 
 @pytest.mark.parametrize(

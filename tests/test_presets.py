@@ -49,10 +49,6 @@ def test_paper_csac_is_algorithm_1_with_the_sampled_log_ratio():
     assert given["relative_entropy_estimator"] == "sampled"
 
 
-def test_paper_sac_has_a_fixed_temperature():
-    assert presets.hyperparameters("paper", "sac", "HalfCheetah-v4")["entropy_weight"] == 0.2
-
-
 @pytest.mark.parametrize(
     ("task", "tau"),
     [

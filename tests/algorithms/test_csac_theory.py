@@ -20,7 +20,6 @@ from csac.types import Transition
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(80)
 WEIGHTS = WEIGHTS / WEIGHTS.sum()  # the mean over ξ ~ N(0, 1) of f(ξ) is WEIGHTS @ f(NODES)
 ONE_OBSERVATION = jnp.zeros(1)
-ESTIMATORS = ["sampled", "closed_form"]
 
 
 def q_value(action):
@@ -97,15 +96,13 @@ def assert_equals_sac(state, sac_state):
         assert_close(getattr(state, name), getattr(sac_state, name))
 
 
-@pytest.mark.parametrize(
-    ("reference", "estimator"), [("average", "closed_form"), *((reference, "sampled") for reference in REFERENCES)]
-)
+@pytest.mark.parametrize(("reference", "estimator"), [("average", "closed_form"), ("periodic", "sampled")])
 def test_without_relative_entropy_csac_is_sac(reference, estimator, sac_state):
     options = {**REFERENCES[reference], "relative_entropy_estimator": estimator}
     assert_equals_sac(after_updates(CSAC(relative_entropy_weight=0.0, **options, **SMALL)), sac_state)
 
 
-@pytest.mark.parametrize("reference", REFERENCES)
+@pytest.mark.parametrize("reference", ["the actor itself", "one update ago"])
 def test_with_the_closed_form_csac_is_sac_where_the_actor_is_its_own_reference_alone(reference, sac_state):
     state = after_updates(CSAC(relative_entropy_weight=0.5, **REFERENCES[reference], **CLOSED_FORM, **SMALL))
     if reference == "the actor itself":
@@ -144,8 +141,7 @@ def best_tanh_gaussian(sigma, tau, mean, log_std):
     return best.x, (best.fun - log_z) / beta  # J is the divergence over β, without the normaliser
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize(("sigma", "tau"), [(0.2, 0.5), (0.05, 1.0), (0.3, 0.0)])
+@pytest.mark.parametrize(("estimator", "sigma", "tau"), [("sampled", 0.2, 0.5), ("closed_form", 0.05, 1.0)])
 def test_descending_the_actor_loss_reaches_the_exact_improvement(estimator, sigma, tau):
     algorithm = CSAC(entropy_weight=sigma, relative_entropy_weight=tau, relative_entropy_estimator=estimator)
     mean, log_std = -0.4, -0.6
@@ -317,8 +313,16 @@ def soft_value_iteration(sigma):
 
 
 @pytest.mark.usefixtures("tables")
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize(("sigma", "tau"), [(0.2, 0.5), (0.5, 0.05), (0.2, 5.0), (0.0, 0.5), (0.2, 0.0)])
+@pytest.mark.parametrize(
+    ("estimator", "sigma", "tau"),
+    [
+        ("sampled", 0.2, 0.5),
+        ("sampled", 0.0, 0.5),
+        ("closed_form", 0.5, 0.05),
+        ("closed_form", 0.2, 5.0),
+        ("closed_form", 0.2, 0.0),
+    ],
+)
 def test_target_and_loss_are_conservative_value_iteration(sigma, tau, estimator):
     # CVI (Kozuno et al. 2019) knows only preferences P, with m P = (1/β) log Σ exp(βP):
     #   P_(k+1) = r + γ E[m P_k] + α (P_k - m P_k), from P_0 = τ log π_(-1) + Q_0,
@@ -335,20 +339,8 @@ def test_target_and_loss_are_conservative_value_iteration(sigma, tau, estimator)
 
 
 @pytest.mark.usefixtures("tables")
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("tau", [0.0, 0.05, 0.5, 5.0])
-def test_the_fixed_point_is_that_of_sac_whatever_the_relative_entropy_weighs(tau, estimator):
-    # At a fixed point π^(1-α) ∝ exp(βQ), and β / (1 - α) = 1/σ; the log-ratio is zero. α is 0.96 for τ = 5.
-    sigma = 0.2
-    *_, (q, log_policy, _) = iterate(sigma, tau, 1000, estimator)
-    expected = soft_value_iteration(sigma)
-    np.testing.assert_allclose(q, expected, atol=1e-8)
-    np.testing.assert_allclose(np.exp(log_policy), softmax(expected / sigma, axis=1), atol=1e-8)
-
-
-@pytest.mark.usefixtures("tables")
-@pytest.mark.parametrize("tau", [0.05, 0.5, 5.0])
-def test_in_the_actor_alone_the_relative_entropy_ends_there_too_by_another_way(tau):
+@pytest.mark.parametrize("tau", [0.05, 5.0])
+def test_actor_only_relative_entropy_has_the_fixed_point_of_sac(tau):
     # At the end the policy is its own reference, so that it makes no difference whether its KL is part of the value.
     sigma = 0.2
     restrained = iterate(sigma, tau, 1000, "closed_form", relative_entropy_form="actor_only")
@@ -357,23 +349,3 @@ def test_in_the_actor_alone_the_relative_entropy_ends_there_too_by_another_way(t
     np.testing.assert_allclose(np.exp(restrained[-1][1]), softmax(expected / sigma, axis=1), atol=1e-8)
     both = iterate(sigma, tau, 3, "closed_form")
     assert np.all(restrained[1][0] > both[1][0] + 1e-3), "the first value has no penalty"
-
-
-@pytest.mark.usefixtures("tables")
-def test_relative_entropy_slows_the_policy_down():
-    """With a larger weight the policy has moved less from its start after a few iterations."""
-
-    def moved(tau):
-        *_, (_, log_policy, _) = iterate(0.2, tau, 2)
-        return np.abs(np.exp(log_policy) - np.exp(FIRST_POLICY)).sum()
-
-    assert moved(50.0) < moved(5.0) < moved(0.5)
-
-
-@pytest.mark.usefixtures("tables")
-def test_dynamic_policy_programming_finds_the_optimal_policy():
-    q = np.zeros((STATES, ACTIONS))
-    for _ in range(500):
-        q = REWARD + DISCOUNT * DYNAMICS @ q.max(axis=1)
-    *_, (_, log_policy, _) = iterate(0.0, 0.5, 500)
-    assert np.exp(log_policy)[np.arange(STATES), q.argmax(axis=1)].min() > 0.999

@@ -1,4 +1,4 @@
-"""The tanh-Gaussian against autodiff, numerical integration and Monte Carlo."""
+"""The tanh-Gaussian against autodiff, numbers worked by hand and Monte Carlo."""
 
 from __future__ import annotations
 
@@ -12,14 +12,8 @@ from scipy.stats import norm
 
 from csac.algorithms.distributions import TanhGaussian, kl, log_ratio, log_tanh_derivative
 
-# Actions tanh(u) on an even grid of u: finer where the density of the action is steep.
-GRID = np.linspace(-12.0, 12.0, 24001)
-WIDTHS = (GRID[1] - GRID[0]) / np.cosh(GRID) ** 2  # da = (1 - tanh²u) du
-
 STANDARD = TanhGaussian(jnp.array([0.0]), jnp.array([0.0]))
 SHIFTED = TanhGaussian(jnp.array([1.0]), jnp.array([0.0]))
-NARROW = TanhGaussian(jnp.array([0.6]), jnp.array([-1.0]))
-WIDE = TanhGaussian(jnp.array([-0.4]), jnp.array([0.3]))
 POLICY = TanhGaussian(jnp.array([0.5, -1.0, 2.0]), jnp.array([-0.5, 0.2, -2.0]))
 REFERENCE = TanhGaussian(jnp.array([0.2, -0.5, 2.1]), jnp.array([0.1, 0.0, -1.8]))
 
@@ -29,30 +23,12 @@ def noise_of(policy: TanhGaussian, pre_tanh) -> jax.Array:
     return (jnp.asarray(pre_tanh, jnp.float32) - policy.mean) / jnp.exp(policy.log_std)
 
 
-def log_density(policy: TanhGaussian) -> np.ndarray:
-    """The log-density of the action at each point of the grid."""
-    return np.asarray(jax.vmap(lambda u: policy.log_prob(noise_of(policy, u)))(GRID[:, None]), np.float64)
-
-
 def test_log_prob_is_the_change_of_variables():
     pre_tanh = jnp.array([0.3, -1.2, 1.9])
     jacobian = jax.jacobian(jnp.tanh)(pre_tanh)
     expected = jax.scipy.stats.norm.logpdf(pre_tanh, POLICY.mean, jnp.exp(POLICY.log_std)).sum()
     expected -= jnp.log(jnp.abs(jnp.linalg.det(jacobian)))
     assert float(POLICY.log_prob(noise_of(POLICY, pre_tanh))) == pytest.approx(float(expected), abs=1e-5)
-
-
-@pytest.mark.parametrize("policy", [NARROW, WIDE])
-def test_the_density_of_the_action_integrates_to_one(policy):
-    assert np.exp(log_density(policy)) @ WIDTHS == pytest.approx(1.0, abs=1e-4)
-
-
-@pytest.mark.parametrize("policy", [NARROW, WIDE])
-def test_the_density_agrees_with_where_samples_fall(policy):
-    noise = jax.random.normal(jax.random.key(0), (100_000, 1))
-    share = np.mean(jax.vmap(policy.sample)(noise) < 0.3)
-    expected = np.exp(log_density(policy)) @ (WIDTHS * (np.tanh(GRID) < 0.3))
-    assert share == pytest.approx(expected, abs=0.006)  # four standard errors
 
 
 def test_log_tanh_derivative_where_tanh_is_flat():
@@ -100,28 +76,12 @@ def test_densities_of_a_sharp_policy_are_exact(log_std):
     assert float(log_ratio(policy, policy, jnp.array(noise))) == 0.0
 
 
-def test_log_ratio_by_hand():
-    # A reference half a standard deviation below and twice as wide: ξ̃ = (ξ + ½) / 2.
-    noise = np.array([0.7, -1.3])
-    reference = TanhGaussian(NARROW.mean - 0.5 * np.exp(-1.0), NARROW.log_std + math.log(2.0))
-    expected = norm.logpdf(noise) - norm.logpdf((noise + 0.5) / 2.0) + math.log(2.0)
-    for xi, ratio in zip(noise, expected, strict=True):
-        assert float(log_ratio(NARROW, reference, jnp.array([xi]))) == pytest.approx(ratio, abs=1e-6)
-
-
 def test_kl_is_the_mean_log_ratio():
     noise = jax.random.normal(jax.random.key(0), (200_000, 3))
     ratios = jax.vmap(lambda xi: log_ratio(POLICY, REFERENCE, xi))(noise)
     assert float(kl(POLICY, REFERENCE)) == pytest.approx(
         float(ratios.mean()), abs=4 * float(ratios.std()) / 200_000**0.5
     )
-
-
-@pytest.mark.parametrize(("policy", "reference"), [(NARROW, WIDE), (WIDE, NARROW)])
-def test_kl_beneath_the_tanh_is_the_kl_of_the_actions(policy, reference):
-    log_p, log_q = log_density(policy), log_density(reference)
-    expected = (np.exp(log_p) * (log_p - log_q)) @ WIDTHS
-    assert float(kl(policy, reference)) == pytest.approx(expected, rel=1e-3)
 
 
 def test_the_jacobian_cancels_in_the_log_ratio():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -19,19 +20,26 @@ from csac.types import Spec, Transition
 END, STOP = {"terminated": 1.0}, {"truncated": 1.0}
 
 
+add = jax.jit(lambda ring, rows, count: ring.add(rows, count))
+
+
+@partial(jax.jit, static_argnums=2)
+def all_of(ring: Replay, count: int, environments: int) -> Transition:
+    return ring.at(jnp.arange(len(ring.rows)), jnp.int32(count), Spec(1, 1, environments))
+
+
 def replay(steps: list[tuple[float, float, float, dict[str, float]]], n_steps: int, capacity: int = 0) -> Replay:
     """A ring to which steps (observation, reward, next observation, how it ended) were added, one after the other."""
     ring = Replay.create(capacity or len(steps), Spec(1, 1), n_steps=n_steps, discount=0.5)
     for count, (observation, reward, following, ended) in enumerate(steps):
         one = transition(observation, reward=reward, next_observation=following, **ended)
-        rows = pack(jax.tree.map(lambda leaf: leaf[None], one))
-        ring = ring.add(jnp.asarray(rows), jnp.int32(count))
+        ring = add(ring, pack(jax.tree.map(lambda leaf: leaf[None], one)), count)
     return ring
 
 
 def drawn(ring: Replay, count: int, environments: int = 1) -> dict[str, list[float]]:
     """What begins in each row of the ring."""
-    found = ring.at(jnp.arange(len(ring.rows)), jnp.int32(count), Spec(1, 1, environments))
+    found = all_of(ring, count, environments)
     names = ("reward", "steps", "terminated", "truncated")
     return {name: np.asarray(getattr(found, name)).tolist() for name in names} | {
         "next": np.asarray(found.next_observation)[:, 0].tolist(),
@@ -51,11 +59,6 @@ def test_rewards_are_summed_to_the_end_of_the_episode_or_the_newest_step():
         "next": [3, 3, 3, 11, 22, 22],
         "first": [0, 1, 2, 10, 20, 21],
     }
-
-
-def test_no_more_than_n_steps_are_summed():
-    steps: list[Any] = [(i, 1, i + 1, {}) for i in range(5)]
-    assert drawn(replay(steps, 2), 5)["reward"] == [1.5, 1.5, 1.5, 1.5, 1]
 
 
 def test_the_oldest_step_does_not_follow_the_newest():

@@ -14,7 +14,6 @@ import pytest
 import scipy.stats
 
 from csac.algorithms import PPO
-from csac.algorithms.distributions import Gaussian
 from csac.algorithms.ppo import Sample, State, policy_at
 from csac.algorithms.returns import advantages_of, discounted_returns, explained_variance
 from csac.algorithms.statistics import Statistics
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 SMALL = PPO(discount=0.5, rollout_steps=8, minibatches=2, epochs=2, hidden_sizes=(4,))
 SWITCHED_OFF = {"normalise_observations": False, "normalise_rewards": False, "normalise_advantages": False}
 PLAIN = replace(SMALL, minibatches=1, epochs=1, max_gradient_norm=0.0, adam_epsilon=1e-12, **SWITCHED_OFF)
-CLIPPED = replace(PLAIN, max_gradient_norm=1e-3)
 
 # Compiling takes longer than running: no optimisation.
 compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -67,25 +65,7 @@ def test_advantages():
         np.testing.assert_array_equal(advantages_of(EPISODES, VALUES, NEXT_VALUES, 0.5, trace), expected)
 
 
-# Losses.
-
-
-@pytest.mark.parametrize(
-    ("ratio", "advantage", "loss", "slope"),
-    [
-        (1.5, 2.0, -2.4, 0.0),  # -min(3, 1.2·2): nothing to gain by going on
-        (1.5, -2.0, 3.0, 2.0),  # -min(-3, -2.4): the way back is open
-        (0.5, 2.0, -1.0, -2.0),  # -min(1, 0.8·2)
-        (0.5, -2.0, 1.6, 0.0),  # -min(-1, -1.6)
-        (1.1, 2.0, -2.2, -2.0),
-        (0.9, -2.0, 1.8, 2.0),
-    ],
-)
-def test_policy_loss(ratio, advantage, loss, slope):
-    of_log_ratio = jax.value_and_grad(PPO(clip_range=0.2).policy_loss)
-    value, gradient = of_log_ratio(jnp.log(ratio), advantage)
-    assert float(value) == pytest.approx(loss)
-    assert float(gradient) == pytest.approx(slope * ratio)  # d/d(log ρ) = ρ d/dρ
+# Losses; those of the policy are compared with slow ones below.
 
 
 @pytest.mark.parametrize(
@@ -114,15 +94,6 @@ def test_the_loss_weighs_its_parts():
     log_ratio = float(policy_at(parameters, sample.observation).log_prob(sample.action)) + 2.0
     assert float(metrics["approximate_kl"]) == pytest.approx(math.exp(log_ratio) - 1 - log_ratio, rel=1e-5)
     assert bool(metrics["clip_fraction"]) == (abs(math.exp(log_ratio) - 1) > 0.2)
-
-
-def test_gaussian_agrees_with_scipy():
-    mean, log_std, value = np.array([0.5, -1.0]), np.array([-2.0, 0.7]), np.array([0.4, 3.0])
-    ours, std = Gaussian(jnp.array(mean), jnp.array(log_std)), np.exp(log_std)
-    log_prob, entropy = scipy.stats.norm.logpdf(value, mean, std), scipy.stats.norm.entropy(mean, std)
-    assert float(ours.log_prob(jnp.array(value))) == pytest.approx(log_prob.sum(), rel=1e-6)
-    assert float(ours.entropy()) == pytest.approx(entropy.sum(), rel=1e-6)
-    np.testing.assert_allclose(ours.sample(jnp.array([1.0, -2.0])), mean + std * [1.0, -2.0], rtol=1e-6)
 
 
 def test_explained_variance():
@@ -160,11 +131,6 @@ def test_what_never_varies_is_centred_and_stays_so():
     np.testing.assert_array_equal(PPO().normalise(statistics, values[0] + 1.0), 10.0)
 
 
-def test_before_anything_is_absorbed_nothing_is_changed():
-    observation = jnp.array([3.0, -0.2])
-    np.testing.assert_array_equal(PPO().normalise(Statistics.create((2,)), observation), observation)
-
-
 def test_observations_and_rewards_are_clipped_after_scaling():
     statistics = Statistics(jnp.ones(()), jnp.array([1.0, 1.0]), jnp.array([4.0, 4.0]), jnp.array([2.0, 2.0]))
     np.testing.assert_array_equal(PPO().normalise(statistics, jnp.array([4.0, -99.0])), [1.5, -10.0])
@@ -182,17 +148,6 @@ def test_discounted_returns_start_anew_after_an_end_and_go_on_after_a_rollout():
     assert float(last) == 3.0
     for ends in ({"terminated": [3]}, {"truncated": [3]}):
         assert float(discounted_returns(last, rollout([2, 1, 6, 0], **ends), 0.5)[1]) == 0.0
-
-
-def test_rewards_are_divided_by_the_spread_of_all_discounted_returns():
-    rewards, flags = np.array([1, 2, 3, 4, 2, 1, 6, 0]), {"terminated": [2], "truncated": [5]}
-    state, _ = update(SMALL, begin(SMALL), rollout(rewards, **flags))
-    state, _ = update(SMALL, state, rollout(rewards, **flags), 1)
-    assert float(state.discounted_return) == 3.0
-    seen = [1, 2.5, 4.25, 4, 4, 3, 6, 3, 1 + 3 / 2, 2 + 2.5 / 2, 3 + 3.25 / 2, 4, 4, 3, 6, 3]
-    assert float(state.returns.mean) == pytest.approx(np.mean(seen), rel=1e-6)
-    assert float(state.returns.variance) == pytest.approx(np.var(seen), rel=1e-5)
-    np.testing.assert_allclose(SMALL.scale(state.returns, jnp.array(rewards)), rewards / np.std(seen), rtol=1e-5)
 
 
 def test_statistics_move_once_in_an_update_and_the_policy_takes_them_along():
@@ -222,11 +177,8 @@ def test_linear_learning_rate():
     assert float(update(SMALL, state, rollout(range(8)), 5)[1]["learning_rate"]) == pytest.approx(1.5e-4)
     constant = replace(SMALL, learning_rate_schedule="constant")
     assert float(constant.learning_rate_at(jnp.int32(9), state.total_updates)) == pytest.approx(3e-4)
+    assert float(begin(SMALL, 3).total_updates) == 1.0  # a run shorter than a rollout
     assert (SMALL.cadence.has_schedule, constant.cadence.has_schedule) == (True, False)
-
-
-def test_a_run_shorter_than_a_rollout_begins():
-    assert float(begin(SMALL, 3).total_updates) == 1.0
 
 
 def test_the_first_minibatch_sees_the_policy_that_acted():
@@ -238,19 +190,6 @@ def test_the_first_minibatch_sees_the_policy_that_acted():
     assert float(metrics["actor_loss"]) == pytest.approx(-float(samples.advantage.mean()), rel=1e-5)
     # ½ (V - (A + V))²
     assert float(metrics["critic_loss"]) == pytest.approx(0.5 * float((samples.advantage**2).mean()), rel=1e-5)
-
-
-def test_densities_are_those_by_which_the_actions_were_drawn():
-    state, _ = update(SMALL, begin(SMALL), rollout(range(8)))
-    state = state._replace(parameters=state.parameters._replace(log_std=jnp.array([-0.7])))
-    batch = rollout(np.arange(8.0), truncated=[5])._replace(observation=rollout(range(8)).observation * 5 + 1)
-    absorbed = state._replace(observation_statistics=state.observation_statistics.absorb(batch.observation))
-    samples = compiled(SMALL.samples)(state, absorbed, batch)
-    mean = jax.vmap(SMALL.act, in_axes=(None, 0, None, None))(state, batch.observation, jax.random.key(0), False)
-    expected = scipy.stats.norm.logpdf(batch.action, np.asarray(mean), np.exp(-0.7))[:, 0]
-    np.testing.assert_allclose(samples.log_prob, expected, rtol=1e-5)
-    normalised = jax.vmap(SMALL.normalise, in_axes=(None, 0))(absorbed.observation_statistics, batch.observation)
-    np.testing.assert_allclose(samples.observation, normalised, rtol=1e-5)
 
 
 def test_shuffling_keeps_each_transition_once_and_whole():
@@ -266,22 +205,6 @@ def test_shuffling_keeps_each_transition_once_and_whole():
         shuffled.target,
     ):
         np.testing.assert_array_equal(field, shuffled.value)
-
-
-def test_the_gradient_is_clipped_by_the_norm_of_all_parameters_together():
-    # Adam's first moment after one step is 0.1 g, so it shows g.
-    clipped, free = (
-        first_moment(update(of, state, rollout(range(8)))[0])
-        for of, state in ((CLIPPED, begin(SMALL)), (PLAIN, begin(PLAIN)))
-    )
-    assert np.linalg.norm(free) > 1e-3
-    assert np.linalg.norm(clipped) == pytest.approx(1e-4, rel=1e-5)
-    np.testing.assert_allclose(clipped, free * np.linalg.norm(clipped) / np.linalg.norm(free), rtol=1e-4, atol=1e-10)
-
-
-def first_moment(state: State) -> np.ndarray:
-    size = sum(leaf.size for leaf in jax.tree.leaves(state.parameters))
-    return np.asarray(next(leaf for leaf in jax.tree.leaves(state.optimiser) if leaf.shape == (size,)))
 
 
 def test_actions_are_unclipped_samples_or_the_clipped_mean():
@@ -436,25 +359,3 @@ def test_an_update_agrees_with_a_slow_one():
         ours = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(state.parameters)])
         np.testing.assert_allclose(ours, slow.parameters, atol=1e-5)
     assert np.abs(state.parameters.actor.layers[0].weight - first).max() > 0.03
-
-
-def test_a_minibatch_of_one_has_no_spread_to_normalise_by():
-    alone = replace(PLAIN, minibatches=8)
-    state, _ = update(alone, begin(alone), rollout(range(8)))
-    moved = state.parameters.actor.layers[-1].weight - begin(alone).parameters.actor.layers[-1].weight
-    assert np.abs(moved).max() > 1e-5
-
-
-def test_seeds_learn_side_by_side_what_they_learn_alone():
-    states = [begin(SMALL), begin(SMALL)._replace(total_updates=jnp.float32(20))]
-    batches = [rollout(np.arange(8.0) * i, terminated=[i]) for i in (1, 2)]
-
-    def stacked(trees):
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
-
-    together = jax.vmap(update, in_axes=(None, 0, 0, None, 0))
-    both, metrics = together(SMALL, stacked(states), stacked(batches), 3, jnp.arange(2))
-    for i in range(2):
-        alone, alone_metrics = update(SMALL, states[i], batches[i], 3, i)
-        for ours, theirs in zip(jax.tree.leaves((both, metrics)), jax.tree.leaves((alone, alone_metrics)), strict=True):
-            np.testing.assert_allclose(ours[i], theirs, rtol=1e-4, atol=1e-5)

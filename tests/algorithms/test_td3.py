@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +11,9 @@ import numpy as np
 import pytest
 from equations import LINEAR, ONE, batch_of, linear, transition
 
-from csac.algorithms.critics import critic_loss
 from csac.algorithms.networks import MLP
 from csac.algorithms.td3 import TD3
-from csac.deploy.contract import Contract
-from csac.deploy.policy import Policy
-from csac.types import Spec, Transition
+from csac.types import Transition
 
 
 def always(action: float) -> MLP:
@@ -67,11 +63,8 @@ def test_the_critic_target(noise, terminated, truncated, expected):
     assert float(target) == pytest.approx(expected, abs=1e-5)
 
 
-def test_the_losses():
-    # Q₁(1, 0.5) = 2 and Q₂(1, 0.5) = 2.5 with target 3: 1² + 0.5². The actor gets Q₁ at 0.8 too, where Q₂ is smaller.
-    loss, metrics = critic_loss(TARGET_CRITICS, transition(), jnp.float32(3.0))
-    assert (float(loss), float(metrics["q_mean"])) == pytest.approx((1.25, 2.25))
-    for action, expected in ((0.3, -1.6), (0.8, -2.6)):
+def test_the_actor_loss_is_of_the_first_critic_alone():
+    for action, expected in ((0.3, -1.6), (0.8, -2.6)):  # at 0.8 the second critic is smaller
         loss, _ = TD3().actor_loss(always(action), jnp.ones(1), critics=TARGET_CRITICS)
         assert float(loss) == pytest.approx(expected)
 
@@ -105,17 +98,8 @@ def test_a_delayed_update_moves_the_actor_against_the_new_critics_and_the_target
         np.testing.assert_allclose(target.layers[0].bias, [-11.05], atol=1e-5)
 
 
-def test_the_actor_climbs_the_first_critic_alone():
-    # The critics' learning rate is too small to matter. Slopes in the action: 1 for the first, -5 for the second.
-    algorithm = TD3(**{**LINEAR, "critic_learning_rate": 1e-9})
-    critics = (linear([[0.0], [1.0]], [0.0]), linear([[0.0], [-5.0]], [-9.0]))
-    state = linear_state(algorithm)._replace(critics=critics)
-    state, _ = update(algorithm, state, batch_of(transition()), 1)
-    assert float(state.actor.layers[0].bias[0]) == pytest.approx(0.1, abs=1e-5)
-
-
-@pytest.mark.parametrize("delay", [1, 2, 3])
-def test_actor_and_targets_move_with_every_delay_th_update_alone(delay):
+def test_actor_and_targets_move_with_every_delay_th_update_alone():
+    delay = 3
     algorithm = TD3(policy_delay=delay, **LINEAR)
     state, batch, loss = linear_state(algorithm), batch_of(transition()), 0.0
     for step in range(6):
@@ -131,43 +115,17 @@ def test_actor_and_targets_move_with_every_delay_th_update_alone(delay):
         loss = float(metrics["actor_loss"])
 
 
-def equations(jaxpr) -> list[Any]:
-    """Every equation of a program, those of its sub-programs too."""
-    found = []
-    for equation in jaxpr.eqns:
-        found.append(equation)
-        for sub in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
-            found += equations(getattr(sub, "jaxpr", sub)) if hasattr(sub, "eqns") else []
-    return found
-
-
-def program_of_three_seeds(step_axis: int | None) -> tuple[Any, list[Any]]:
-    """Three seeds' states, and every equation of their update."""
-    algorithm = TD3(actor_hidden_sizes=(5,), critic_hidden_sizes=(6,))
-    keys = jax.random.split(jax.random.key(0), 3)
+def test_delayed_update_of_several_seeds_stays_a_conditional():
+    algorithm, keys = TD3(actor_hidden_sizes=(5,), critic_hidden_sizes=(6,)), jax.random.split(jax.random.key(0), 3)
     states = jax.eval_shape(jax.vmap(lambda key: algorithm.init(key, ONE, 1000)), keys)
     batches = batch_of(*[batch_of(*[transition()] * 4)] * 3)
-    step = jnp.int32(0) if step_axis is None else jnp.arange(3)
-    update = jax.vmap(algorithm.update, in_axes=(0, 0, 0, step_axis))
-    return states, equations(jax.make_jaxpr(update)(states, batches, keys, step).jaxpr)
 
+    def program(step, axis):
+        together = jax.vmap(algorithm.update, in_axes=(0, 0, 0, axis))
+        return str(jax.make_jaxpr(together)(states, batches, keys, step))
 
-def parameters_selected(states: Any, program: list[Any]) -> bool:
-    selected = {equation.outvars[0].aval.shape for equation in program if equation.primitive.name == "select_n"}
-    return bool(selected & {leaf.shape for leaf in jax.tree.leaves(states) if leaf.ndim > 2})
-
-
-def test_seeds_side_by_side_still_choose_one_of_two_programs():
-    states, program = program_of_three_seeds(None)
-    (choice,) = [equation for equation in program if equation.primitive.name == "cond"]
-    assert choice.invars[0].aval.shape == ()
-    stay, move = (equations(branch.jaxpr) for branch in choice.params["branches"])
-    assert not stay
-    assert any(equation.primitive.name == "dot_general" for equation in move)
-    assert not parameters_selected(states, program)
-
-    states, program = program_of_three_seeds(0)  # a step for each seed: both are computed, then one selected
-    assert parameters_selected(states, program)
+    assert "cond[" in program(jnp.int32(0), None)
+    assert "cond[" not in program(jnp.arange(3), 0)  # a step for each seed: both are computed, then one selected
 
 
 def test_actions_explore_with_noise_within_the_bounds():
@@ -183,19 +141,3 @@ def test_actions_explore_with_noise_within_the_bounds():
     at_the_edge = np.asarray(act(state._replace(actor=always(0.95)), jnp.ones(1), keys, True))
     assert at_the_edge.max() == 1.0
     assert np.mean(at_the_edge == 1.0) == pytest.approx(0.309, abs=0.03)
-
-
-def test_the_policy_that_leaves_acts_as_the_algorithm_does():
-    spec = Spec(3, 2)
-    algorithm = TD3(actor_hidden_sizes=(8, 8), critic_hidden_sizes=(4,))
-    state = algorithm.init(jax.random.key(3), spec, 1000)
-    network = jax.tree.map(
-        lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, algorithm.policy(state)
-    )
-    bound = np.ones(2, np.float32)
-    policy = Policy(
-        network, Contract("Task-v0", "td3", network.activation, network.head, ((None, (3,)),), (2,), -bound, bound)
-    )
-    observations = jax.random.normal(jax.random.key(0), (20, 3))
-    actions = jax.vmap(algorithm.act, in_axes=(None, 0, None, None))(state, observations, jax.random.key(0), False)
-    np.testing.assert_allclose(policy.act(np.asarray(observations)), actions, atol=1e-6)

@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from benchmarks import checkpoint, gpu, growth
+from benchmarks import checkpoint, gpu
 from benchmarks.__main__ import PARTS, SUITES, main, named
 from benchmarks.measuring import ROOT, Launch, ProcessFailure, answers, usable_cores
 from benchmarks.part import RESULTS, Options, Part
-from benchmarks.tables import formatted, read_rows, write_rows
 from csac.types import InputError
 
 
@@ -55,21 +54,6 @@ def test_pages_name_only_benchmarks_that_exist():
     assert names <= {*SUITES, *(part.name for part in PARTS), "render"}
 
 
-def test_rows_come_back_as_they_were_written(tmp_path):
-    rows = [{"task": "Ant-v4, whole", "steps": 1_000_000, "speed": 1234.5, "share": 0.25, "empty": ""}]
-    write_rows(tmp_path / "rows.csv", rows)
-    assert read_rows(tmp_path / "rows.csv") == rows
-
-
-def test_a_format_names_columns_of_the_row():
-    rows = [{"task": "Ant", "speed": 1234.5, "share": 0.256}]
-    assert formatted(rows, {"task": "{task}", "steps/s (share)": "{speed:,.1f} ({share:.0%})"}).splitlines() == [
-        "| task | steps/s (share) |",
-        "| --- | --- |",
-        "| Ant | 1,234.5 (26%) |",
-    ]
-
-
 def test_a_table_is_written_between_the_markers_of_its_page(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- it: begin -->\nold\n<!-- it: end -->\nafter\n")
@@ -98,20 +82,6 @@ def test_every_committed_file_belongs_to_a_benchmark_or_is_shown():
     pages = "".join(page.read_text() for page in (*ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")))
     names = {part.name for part in PARTS}
     assert [path.name for path in RESULTS.iterdir() if path.stem not in names and path.name not in pages] == []
-
-
-def test_growth_compares_each_point_with_the_one_before(tmp_path):
-    points = [(128, 200.0, 2.0), (256, 100.0, 8.0)]
-    rows = [
-        {"axis": "width", "value": value, "updates_per_second": speed, "peak_mib": 1500.0, "giga_operations": cost}
-        for value, speed, cost in points
-    ]
-    assert growth.render(rows).splitlines()[2:] == [
-        "| 128 | 200 | 5.00 | 400 |  | 1,500 |",
-        "| 256 | 100 | 10.00 | 800 | 2.00 (4.00) | 1,500 |",
-    ]
-    growth.draw(rows, tmp_path / "growth.png")
-    assert (tmp_path / "growth.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_checkpoint_costs_what_the_steps_around_it_take_longer(tmp_path):

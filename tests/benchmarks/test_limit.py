@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.limit import render_shares, share
+from benchmarks.limit import share
 from benchmarks.products import Network, Product, operations, update_products
 
 
@@ -40,13 +40,3 @@ def test_an_algorithm_whose_products_are_not_counted_is_refused():
 
 def test_the_share_is_of_all_cores():
     assert share(shared(200, 100)) == 50  # 200 updates of half a 10⁹ operations, on two cores of 100 each
-
-
-def test_the_table_has_medians_and_ranges():
-    lines = render_shares([shared(100, 100), shared(200, 100), shared(160, 100)]).splitlines()
-
-    assert lines[2:] == [
-        "| training, one seed, 2 cores | CSAC | 160 | 0.50 | 40 % (25 to 50) |",
-        "",
-        "One core multiplied 256 x 256 x 256 at 100 x 10⁹ operations/s (median of all repetitions).",
-    ]

@@ -11,7 +11,7 @@ import pytest
 from benchmarks import peers, stamps
 from benchmarks.measuring import Window, read_stamps, speed_of
 from benchmarks.part import Options
-from benchmarks.peers import CASES, Case, measure, ratios, render, window
+from benchmarks.peers import CASES, measure, ratios, render, window
 from csac.types import InputError
 
 
@@ -40,19 +40,6 @@ def test_each_contender_is_once_in_a_setting_and_the_first_is_ours():
     assert len(set(places)) == len(places)
     for setting in {case.setting for case in CASES}:
         assert next(case for case in CASES if case.setting == setting).library == "csac"
-
-
-@pytest.mark.parametrize(
-    ("case", "allowed"),
-    [
-        (Case("", "", "csac", seeds=5), "XLA, 2 cores"),
-        (Case("", "", "sbx", processes=2), "XLA, 1 core each"),
-        (Case("", "", "sb3", processes=2), "PyTorch, 1 thread each"),
-        (Case("", "", "sb3", threads=1), "PyTorch, 1 thread"),
-    ],
-)
-def test_allowed(case: Case, allowed: str):
-    assert case.allowed == allowed
 
 
 def test_without_the_peers_only_csac_is_measured(monkeypatch):

@@ -34,15 +34,6 @@ def test_results_are_of_training_cases_and_perturbations(tmp_path):
     assert recovery[0] == "friction x 1.5 after step 10"
 
 
-def test_failed_seeds_are_shown_and_in_no_mean(tmp_path):
-    runs = make_set(tmp_path, [[1.0, 1.0], [100.0], [3.0, 3.0]], failures=[1])
-    (results,) = map(text_of, result_tables(runs))
-    assert [line for line in results if line.startswith(("1", "mean"))] == [
-        "1 100.0 100.0 100.0 10 2",
-        "mean 2.0 2.0 2.0 10",
-    ]
-
-
 def test_evaluations_are_summed_up_by_seed():
     told = {0: [(1.0, 10, 1.0), (3.0, 20, None)], 5: [(6.0, 10, 1.0), (6.0, 10, 1.0)], 6: [(9.0, 5, 0.0)] * 2}
     episodes = {

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from artefacts import exported, leave, needs_compiler
-from policies import ALGORITHMS, algorithm_policy, contract, random_policy
+from policies import algorithm_policy, contract, random_policy
 
 from csac.deploy.artefact import FILES, open_artefact
 from csac.deploy.contract import sha256_of
@@ -82,9 +82,8 @@ def test_a_loader_that_is_not_csacs_is_not_run(tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_header_that_is_not_csacs_is_not_compiled(tmp_path, algorithm):
-    path = leave(tmp_path, algorithm_policy(algorithm), "c") / "policy.h"
+def test_a_header_that_is_not_csacs_is_not_compiled(tmp_path):
+    path = leave(tmp_path, algorithm_policy("csac"), "c") / "policy.h"
     path.write_text(
         path.read_text().replace("static inline void csac_reset", "int evil;\nstatic inline void csac_reset")
     )

@@ -37,9 +37,8 @@ def check_loop(command, policy):
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
-@pytest.mark.parametrize("algorithm", ["csac", "sd3", "ppo"])
-def test_the_loop_in_c(tmp_path, algorithm):
-    policy = algorithm_policy(algorithm)
+def test_the_loop_in_c(tmp_path):
+    policy = algorithm_policy("sd3")
     folder, program = left(tmp_path / "c", policy, "c"), tmp_path / "control_loop"
     strict = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
     subprocess.run(["cc", *strict, "-I", folder, EXAMPLES / "control_loop.c", "-o", program, "-lm"], check=True)

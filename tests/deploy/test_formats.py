@@ -41,7 +41,7 @@ def test_a_dict_is_flattened_before_and_an_action_gets_its_shape_after(tmp_path,
     np.testing.assert_allclose(artefact.act(np.array([0.1, 0.2, 0.3, 0.4, 0.5])), expected.reshape(-1), atol=1e-5)
 
 
-HIDDEN = [("relu", "tanh"), ("tanh", "elu"), ("elu", "silu"), ("silu", "gelu"), ("gelu", "relu")]
+HIDDEN = [("relu", "tanh"), ("elu", "silu"), ("gelu", "elu")]  # of the actors and of the critics
 
 
 @pytest.mark.parametrize("kinds", HIDDEN, ids="-".join)
@@ -157,7 +157,7 @@ def test_without_onnx_it_is_said_what_to_install(tmp_path, monkeypatch, package)
 
 
 @pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler here")
-@pytest.mark.parametrize("algorithm", ["csac", "sd3", "ppo"])
+@pytest.mark.parametrize("algorithm", ["sd3", "ppo"])
 def test_the_header_is_cpp_as_well(tmp_path, algorithm):
     policy = algorithm_policy(algorithm)
     leave(tmp_path, policy, "c", make_guards(policy.contract, "last", 0.02))

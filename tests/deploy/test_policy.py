@@ -56,13 +56,6 @@ def test_a_stochastic_action_moves_by_the_clipped_standard_deviation():
         np.testing.assert_allclose(action, [[math.tanh(0.1 * math.exp(log_std))]], rtol=1e-6)
 
 
-def test_without_noise_the_stochastic_action_is_the_deterministic_one():
-    policy = random_policy(contract())
-    observations = np.random.default_rng(1).normal(size=(5, 2)).astype(np.float32)
-    still = policy.act(observations, deterministic=False, noise=np.zeros((5, 1), np.float32))
-    np.testing.assert_array_equal(still, policy.act(observations))
-
-
 def test_stochastic_actions_follow_the_seed():
     network, agreement = random_network(Spec(2, 1)), contract()
     observation = np.zeros(2)

@@ -86,20 +86,6 @@ class Goal(gymnasium.Env):
         return {"goal": np.ones(2, np.float32), "at": float(self.steps)}
 
 
-def test_returns_and_lengths_are_known():
-    episodes = Evaluator(probes.Endless, {"length": 4, "constant_reward": 0.5}, episodes=12).run(
-        policy_for(probes.Endless)
-    )
-    assert episodes == [EvaluationEpisode(number, 2.0, 4, None) for number in range(12)]
-
-
-def test_deterministic_actions_earn_what_they_should():
-    # tanh(bias) = 0.25: each episode earns -(0.25 - 0.5)² = -0.0625.
-    policy = policy_for(probes.ActionReward, bias=float(np.arctanh(0.25)))
-    returns = [episode.episode_return for episode in Evaluator(probes.ActionReward).run(policy)]
-    np.testing.assert_allclose(returns, np.full(10, -0.0625), rtol=1e-5)
-
-
 def test_the_policy_sees_the_observation_of_its_own_episode():
     # tanh(large * x) = x: each episode earns -(x - x/2)² = -0.25; the observation of another would earn -2.25 at times.
     policy = policy_for(probes.ObservationActionReward, weight=100.0)
@@ -160,8 +146,8 @@ def test_an_episode_depends_on_no_other(deterministic):
     assert len({episode.episode_return for episode in many}) == len(many)
 
 
-@pytest.mark.parametrize("task", [Lottery, "Hopper-v4"])
-def test_an_evaluation_can_be_repeated(task):
+def test_an_evaluation_can_be_repeated():
+    task = "Hopper-v4"
     policy = policy_for(task, weight=0.1)
     evaluator = Evaluator(task)
     first = evaluator.run(policy)
@@ -180,28 +166,6 @@ def test_stochastic_actions_are_those_of_the_episode():
     # Actions 1 + 2 tanh(noise / e) in each of two dimensions.
     expected = sum(float(np.sum(1 + 2 * np.tanh(np.exp(-1.0) * part))) for part in noise)
     assert episode.episode_return == pytest.approx(expected, rel=1e-5)
-
-
-class Wind(gymnasium.Env):
-    """The reward is action times wind, which no observation shows: its mean is 0 whatever the policy."""
-
-    observation_space = spaces.Box(-9.0, 9.0, (1,), np.float32)
-    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.steps += 1
-        wind = self.np_random.standard_normal(dtype=np.float32)
-        return np.zeros(1, np.float32), float(action[0] * wind), False, self.steps == 10, {}
-
-
-def test_what_a_policy_draws_has_nothing_to_do_with_what_its_task_draws():
-    returns = evaluate(policy_for(Wind), Wind, episodes=200, deterministic=False)
-    assert abs(returns.mean()) < 3 * returns.std() / np.sqrt(200)
 
 
 @pytest.mark.parametrize("seed", [0, 7, EVALUATION_SEED])

@@ -81,13 +81,6 @@ def test_the_bootstrap_depends_on_its_seed_alone():
     assert first != stratified_bootstrap_interval(scores, interquartile_mean, repetitions=200, seed=1)
 
 
-def test_the_bootstrap_of_a_mean_has_the_width_of_its_normal_limit():
-    scores = np.random.default_rng(0).normal(5.0, 2.0, size=400)
-    low, high = stratified_bootstrap_interval(scores, np.mean) or (0.0, 0.0)
-    reach = 1.959964 * scores.std() / np.sqrt(400)
-    assert (low, high) == pytest.approx((scores.mean() - reach, scores.mean() + reach), abs=0.1 * reach)
-
-
 def test_the_bootstrap_resamples_within_a_task_and_each_task_for_itself():
     scores = np.stack([np.full(5, 10.0), np.arange(5.0), np.arange(5.0)], axis=1)
     seen = []

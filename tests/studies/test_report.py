@@ -29,12 +29,18 @@ from csac.types import InputError
 HEIGHTS = {"csac": 3_000.0, "sac": 2_000.0, "ppo": 1_000.0, "td3": 2_500.0, "sd3": 2_200.0}
 
 
-def arms_of(name, folder, heights=HEIGHTS, scale=1.0, **columns):
-    """The arms of a study, each seed of a method near its height."""
-    study = replace(find(name), scale=scale)
+def arms_of(name, folder, heights=HEIGHTS, scale=1.0, tasks=(), **columns):
+    """The arms of a study, by default on all of its tasks, each seed of a method near its height."""
+    study = replace(find(name), scale=scale).narrowed(tasks)
     for run in study.runs():
         write_run(folder / run.folder, run.config, heights[run.config.algorithm], **columns)
     return gather(study, folder)
+
+
+@pytest.fixture(scope="module")
+def mujoco(tmp_path_factory):
+    """The arms of the whole study `mujoco`."""
+    return arms_of("mujoco", tmp_path_factory.mktemp("mujoco"))
 
 
 def tables(parts):
@@ -108,33 +114,32 @@ def test_runs_without_evaluations_have_a_report_too(tmp_path):
     assert not [part for part in parts if isinstance(part, Picture)]
 
 
-def test_methods_are_compared_over_all_tasks_with_common_seeds(tmp_path):
-    arms = arms_of("mujoco", tmp_path)
-    arms = [arm for arm in arms if arm.label in ("CSAC (paper)", "SAC")]
+def test_methods_are_compared_over_all_tasks_with_common_seeds(mujoco, tmp_path):
+    arms = [arm for arm in mujoco if arm.label in ("CSAC (paper)", "SAC")]
     parts = list(over_tasks(arms))
     (table,) = tables(parts)
     csac, sac = cells(table)
     assert (csac[0], csac[1][:4], csac[2], csac[3]) == ("CSAC (paper)", "1.50", "1.00 (1.00 to 1.00)", "20")
     assert (sac[1][:4], sac[2]) == ("1.00", "")
     assert not list(over_tasks([arm for arm in arms if arm.task == "Ant-v4"]))
-    negative = arms_of("mujoco", tmp_path / "costs", dict.fromkeys(HEIGHTS, -100.0))
+    costs = dict.fromkeys(HEIGHTS, -100.0)
+    negative = arms_of("mujoco", tmp_path, costs, tasks=["Ant-v4", "Hopper-v4"])
     assert not list(over_tasks(negative))
 
 
-def test_the_papers_claims_have_verdicts(tmp_path):
-    arms = arms_of("mujoco", tmp_path)
-    claims = {(c.arm.label, c.text, c.other.label, c.arm.task): c for c in paper.claims(arms)}
+def test_the_papers_claims_have_verdicts(mujoco, tmp_path):
+    claims = {(c.arm.label, c.text, c.other.label, c.arm.task): c for c in paper.claims(mujoco)}
     higher = "a higher maximum average return"
     verdict, why = claims["CSAC (paper)", higher, "SAC", "Ant-v4"].verdict()
     assert (verdict, why) == ("reproduced", "better in 100% of the pairs of seeds, 95 % interval 100% to 100%")
     assert ("CSAC (paper)", higher, "SD3", "Hopper-v4") not in claims  # where the paper has SD3 higher
     assert claims["CSAC (periodic)", "fewer steps to the lower boundary", "SAC", "Ant-v4"].verdict()[0] == "reproduced"
-    worse = arms_of("mujoco", tmp_path / "worse", {**HEIGHTS, "csac": 500.0})
+    worse = arms_of("mujoco", tmp_path, {**HEIGHTS, "csac": 500.0}, tasks=["Ant-v4"])
     assert next(c for c in paper.claims(worse) if c.text == higher).verdict()[0] == "not reproduced"
 
 
 def test_shortened_runs_and_few_seeds_decide_nothing(tmp_path):
-    (claim, *_) = paper.claims(arms_of("mujoco", tmp_path, scale=0.1))
+    (claim, *_) = paper.claims(arms_of("mujoco", tmp_path, scale=0.1, tasks=["Ant-v4"]))
     assert claim.verdict()[0] == "not yet decidable"
     assert "shorter" in claim.verdict()[1]
     four = claim._replace(ours=claim.ours[:4])
@@ -153,9 +158,9 @@ def test_claims_of_weights_of_friction_and_of_robots(tmp_path):
     assert "success in 95% of the episodes sooner" in {claim.text for claim in reaches}
 
 
-def test_steps_to_the_lower_boundary(tmp_path):
+def test_steps_to_the_lower_boundary(mujoco):
     """SAC reaches PPO's best, about 1,000 of its 2,000, at half of its steps."""
-    arms = [arm for arm in arms_of("mujoco", tmp_path) if arm.task == "Ant-v4" and arm.label in ("SAC", "PPO")]
+    arms = [arm for arm in mujoco if arm.task == "Ant-v4" and arm.label in ("SAC", "PPO")]
     (table,) = tables(efficiency(arms))
     sac, ppo = cells(table)
     assert sac[1:] in (["500,000", "5 of 5", "300,000"], ["600,000", "5 of 5", "300,000"])
@@ -164,7 +169,7 @@ def test_steps_to_the_lower_boundary(tmp_path):
 
 def test_without_ppo_the_boundary_is_the_papers(tmp_path):
     """On HalfCheetah it is 4,181.89; shorter runs decide who is first there."""
-    arms = [arm for arm in arms_of("paper", tmp_path, {"csac": 6_000, "sac": 4_000}) if arm.task == "HalfCheetah-v4"]
+    arms = arms_of("paper", tmp_path, {"csac": 6_000, "sac": 4_000}, tasks=["HalfCheetah-v4"])
     (table,) = tables(efficiency(arms))
     assert table.title == "HalfCheetah-v4, return 4,181.9"
     assert [row[2] for row in cells(table)] == ["5 of 5", "0 of 5"]

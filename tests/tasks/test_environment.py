@@ -20,7 +20,7 @@ from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED, training_seed
 from csac.tasks.environment import Environment
 from csac.tasks.failures import EnvironmentFailure, one_line
 from csac.tasks.vector import SeedEnvironments
-from csac.types import InputError, Spec
+from csac.types import InputError
 
 UNIT = spaces.Box(-1.0, 1.0, (1,), np.float32)
 NUMBERED: Any = {"a": UNIT, 1: UNIT}
@@ -117,14 +117,6 @@ def test_a_render_mode_that_the_task_lacks_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("task", "spec"),
-    [("HalfCheetah-v4", (17, 6)), ("Walker2d-v4", (17, 6)), ("Ant-v4", (27, 8)), ("Hopper-v4", (11, 3))],
-)
-def test_the_paper_tasks_have_the_paper_sizes(task, spec):
-    assert Environment(task).spec == Spec(*spec)
-
-
-@pytest.mark.parametrize(
     ("space", "observation", "flat"),
     [
         (spaces.Box(-9, 9, (2,), np.float64), np.array([1.0, 2.0]), [1, 2]),
@@ -194,13 +186,6 @@ def test_rewards_become_floats_and_flags_bools(reward):
     assert (terminated, truncated) == (True, True)
     assert type(terminated) is type(truncated) is bool
     assert info == {"note": 1}
-
-
-@pytest.mark.parametrize(("task", "ends"), [("ConstantReward", (True, True)), ("DelayedReward", (False, True))])
-def test_a_time_limit_can_fall_on_the_terminal_step(task, ends):
-    environment = Environment(f"probes:{task}-v0", {"max_episode_steps": 1})
-    environment.reset(0)
-    assert environment.step(np.zeros(1, np.float32))[2:4] == ends
 
 
 # What fails

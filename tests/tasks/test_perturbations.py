@@ -34,8 +34,6 @@ from csac.tasks.snapshots import _mujoco_arrays
 from csac.tasks.vector import SeedEnvironments
 from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters, Snapshot
 
-PAPER_TASKS = ["HalfCheetah-v4", "Walker2d-v4", "Ant-v4", "Hopper-v4"]
-
 # What is written, and what is refused.
 
 
@@ -55,11 +53,6 @@ def test_what_is_written_is_what_is_meant(text, kind, value, step):
     perturbation = Perturbation.parse(text)
     assert perturbation == Perturbation(kind, value, step)
     assert Perturbation.parse(str(perturbation)) == perturbation
-
-
-def test_what_the_manifest_holds_is_short():
-    texts = [str(item) for item in perturbations_of(["friction=1.50@300_000", "mass=0.1", "gain=2@0"])]
-    assert texts == ["mass=0.1", "gain=2", "friction=1.5@300000"]
 
 
 @pytest.mark.parametrize(
@@ -165,9 +158,8 @@ def zero_action(environment: Environment) -> np.ndarray:
     return np.zeros(environment.spec.action_size, np.float32)
 
 
-@pytest.mark.parametrize("task", PAPER_TASKS)
-def test_friction_scales_every_column_of_every_geom_and_nothing_else(task):
-    environment = Environment(task)
+def test_friction_scales_every_column_of_every_geom_and_nothing_else():
+    environment = Environment("HalfCheetah-v4")
     before = numbers_of(model_of(environment))
     assert (before["geom_friction"] > 0).all()
     environment.perturb({"friction": 1.5})
@@ -184,9 +176,8 @@ def test_friction_scales_every_column_of_every_geom_and_nothing_else(task):
     assert different(before, numbers_of(model_of(environment))) == set()
 
 
-@pytest.mark.parametrize("task", ["Walker2d-v4", "Ant-v4"])
-def test_every_kind_alters_what_it_says_and_leaves_the_episode_as_it_was(task):
-    environment = Environment(task)
+def test_every_kind_alters_what_it_says_and_leaves_the_episode_as_it_was():
+    environment = Environment("Ant-v4")
     environment.reset(3)
     for _ in range(5):
         environment.step(zero_action(environment))
@@ -223,22 +214,6 @@ def test_a_doubled_mass_is_what_the_compiler_makes_of_a_doubled_mass():
     assert different(ours, theirs) == set()
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.0, 2.0])
-def test_a_body_in_the_air_falls_as_fast_as_gravity_says(factor):
-    environment = Environment("Ant-v4")
-    environment.perturb({"gravity": factor})
-    environment.reset(0)
-    inner: Any = environment.raw.unwrapped
-    position = inner.init_qpos.copy()
-    position[2] = 50.0
-    hinges = inner.model.jnt_qposadr[1:]
-    position[hinges] = inner.model.jnt_range[1:].mean(axis=1)  # at no joint's limit
-    inner.set_state(position, 0 * inner.init_qvel)
-    assert data_of(environment).qacc[2] == pytest.approx(-9.81 * factor, abs=1e-9)
-    environment.step(zero_action(environment))  # five steps of 0.01 s
-    assert data_of(environment).qvel[2] == pytest.approx(-9.81 * factor * 0.05, rel=1e-6, abs=1e-9)
-
-
 BLOCK = """
 <mujoco>
   <option timestep="0.002" cone="elliptic"/>
@@ -252,7 +227,6 @@ BLOCK = """
       <joint name="cart" type="slide" axis="1 0 0"/> <geom type="sphere" size="0.1" mass="2"/>
     </body>
   </worldbody>
-  {pairs}
   <actuator>{actuator}</actuator>
 </mujoco>
 """
@@ -277,27 +251,10 @@ class Block(MujocoEnv):
         return self.data.qvel.copy(), 0.0, False, False, {}
 
 
-def block(folder: Path, actuator: str = MOTOR, pairs: str = "") -> Environment:
+def block(folder: Path, actuator: str = MOTOR) -> Environment:
     path = folder / "block.xml"
-    path.write_text(BLOCK.format(actuator=actuator, pairs=pairs))
+    path.write_text(BLOCK.format(actuator=actuator))
     return Environment(Block, {"path": str(path)})
-
-
-@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
-def test_a_sliding_block_slows_down_as_coulomb_says(tmp_path, factor):
-    """The larger of 0.3 and 0.05 counts: friction takes 0.3 factor times the impulse of the floor, whatever the mass.
-
-    The floor gives what weight takes, plus what the block has gained upwards: it bounces a little.
-    """
-    environment = block(tmp_path)
-    environment.perturb({"friction": factor, "mass": 4.0})
-    environment.reset(0)
-    data_of(environment).qvel[0] = 5.0
-    for _ in range(100):
-        environment.step(zero_action(environment))
-    along, upwards, _ = data_of(environment).qvel
-    assert along > 1.0
-    assert (5.0 - along) / (9.81 * 100 * 0.002 + upwards) == pytest.approx(0.3 * factor, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -357,7 +314,7 @@ class Randomised(Block):
 
 def randomised(folder: Path, what: str) -> Environment:
     path = folder / "block.xml"
-    path.write_text(BLOCK.format(actuator=MOTOR, pairs=""))
+    path.write_text(BLOCK.format(actuator=MOTOR))
     return Environment(Randomised, {"path": str(path), "what": what})
 
 
@@ -387,7 +344,7 @@ def test_a_task_that_sets_other_physics_at_reset_or_is_not_perturbed_goes_on(tmp
 
 def test_an_evaluation_that_cannot_be_perturbed_fails_in_one_line(tmp_path):
     path = tmp_path / "block.xml"
-    path.write_text(BLOCK.format(actuator=MOTOR, pairs=""))
+    path.write_text(BLOCK.format(actuator=MOTOR))
     evaluator = Evaluator(Randomised, {"path": str(path), "what": "friction"}, 1, EVALUATION_SEED)
     evaluator.perturb({"friction": 2.0})
     with pytest.raises(EvaluationFailure, match=r"sets its own physics at reset.*cannot be perturbed") as failure:
@@ -498,7 +455,10 @@ def test_an_episode_with_noise_goes_on_bit_for_bit():
     for index in range(2):
         saved = first.save(index)
         second.restore(index, Snapshot(saved.arrays, json.loads(json.dumps(saved.values))))
-    assert steps_of(second, 100) == steps_of(first, 100)
+    np.testing.assert_array_equal(second.observations, first.observations)
+    after = steps_of(first, 120)
+    assert sum(len(episodes) for _, _, episodes in after) > 3
+    assert steps_of(second, 120) == after
 
 
 def test_noise_that_begins_after_a_snapshot_is_the_same_as_without_one():

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium
 import pytest
 from manifests import make_set
 from policies import contract, random_policy
+from typed import TINY
 
+from csac.cli import main
 from csac.tasks import trust
 from csac.types import InputError
 
@@ -67,78 +71,61 @@ def csac(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "csac", *arguments], cwd=folder, capture_output=True, text=True)
 
 
-@pytest.mark.parametrize(
-    ("task", "command"),
-    [
-        ("stranger:Stranger-v0", ["evaluate", "run"]),
-        ("stranger:Stranger-v0", ["play", "run", "--video", "a.mp4"]),
-        ("stranger:Stranger-v0", ["resume", "run"]),
-        ("package.stranger:Stranger-v0", ["evaluate", "run"]),
-    ],
-)
-def test_a_strangers_run_runs_none_of_its_code(stranger, task, command):
-    stranger.make_run(task)
-    done = csac(stranger.folder, *command)
-    module = task.partition(":")[0]
-    place = stranger.folder / ("package/__init__.py" if module.startswith("package") else "stranger.py")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert f"run wants to run the code of the module {module} in {place}" in done.stderr
-    assert "add --trust-task" in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert not stranger.marker.exists()
+def test_untrusted_task_module_is_not_imported(stranger, monkeypatch, capsys):
+    monkeypatch.chdir(stranger.folder)
+    for module, place, command in (
+        ("stranger", "stranger.py", ["evaluate", "run"]),
+        ("stranger", "stranger.py", ["play", "run", "--video", "a.mp4"]),
+        ("stranger", "stranger.py", ["resume", "run"]),
+        ("package.stranger", "package/__init__.py", ["evaluate", "run"]),
+    ):
+        shutil.rmtree("run", ignore_errors=True)
+        stranger.make_run(f"{module}:Stranger-v0")
+        assert main(command) == 2
+        output, told = capsys.readouterr()
+        assert f"run wants to run the code of the module {module} in {stranger.folder / place}" in told
+        assert "add --trust-task" in told
+        assert (output, told.count("\n")) == ("", 1)
+        assert not stranger.marker.exists()
 
 
-def test_a_task_that_was_trusted_once_is_trusted_where_it_was_found(stranger):
+def test_a_task_that_was_trusted_once_is_trusted_where_it_was_found(stranger, monkeypatch, capsys):
     stranger.make_run("stranger:Stranger-v0")
     trusting = csac(stranger.folder, "evaluate", "run", "--episodes", "1", "--trust-task")
     assert trusting.returncode == 0, trusting.stderr
     assert stranger.marker.exists()
     again = csac(stranger.folder, "evaluate", "run", "--episodes", "1")
     assert (again.returncode, again.stdout) == (0, trusting.stdout)
-    moved = stranger.folder.rename(stranger.folder.with_name("elsewhere"))
-    assert csac(moved, "evaluate", "run", "--episodes", "1").returncode == 2
+    monkeypatch.chdir(stranger.folder.rename(stranger.folder.with_name("elsewhere")))
+    assert main(["evaluate", "run", "--episodes", "1"]) == 2
+    assert "add --trust-task" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("module", ["nowhere", "nowhere.at.all"])
-def test_a_module_that_is_not_there_is_told(stranger, module):
-    stranger.make_run(f"{module}:Task-v0")
-    done = csac(stranger.folder, "evaluate", "run")
-    assert done.returncode == 2
-    assert f"needs the module {module}, which is not found here" in done.stderr
-
-
-def test_a_module_in_a_folder_without_init_is_asked_about_and_then_trusted(stranger):
+def test_a_module_in_a_folder_without_init_is_asked_about_and_then_trusted(stranger, monkeypatch, capsys):
     path = stranger.folder / "envs" / "robot" / "stranger.py"
     path.parent.mkdir(parents=True)
     path.write_text((stranger.folder / "stranger.py").read_text())
     stranger.make_run("envs.robot.stranger:Stranger-v0")
-    done = csac(stranger.folder, "evaluate", "run")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert f"the module envs.robot.stranger in {stranger.folder / 'envs'}" in done.stderr
-    assert not stranger.marker.exists()
-    for options in (["--trust-task"], []):
-        done = csac(stranger.folder, "evaluate", "run", "--episodes", "1", *options)
-        assert done.returncode == 0, done.stderr
-
-
-def test_who_trains_has_named_the_module(tmp_path, monkeypatch):
-    """One's own runs stay one command."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "support"))
-    tiny = [
-        "--batch-size",
-        "4",
-        "--actor-hidden-sizes",
-        "4",
-        "--critic-hidden-sizes",
-        "4",
-        "--evaluation-episodes",
-        "1",
-    ]
-    assert csac(tmp_path, "evaluate", "run").returncode == 2
-    assert csac(tmp_path, "train", "probes:Cases-v0", "--steps", "20", "--directory", "run", *tiny).returncode == 0
-    done = csac(tmp_path, "evaluate", "run", "--episodes", "1")
+    monkeypatch.chdir(stranger.folder)
+    assert main(["evaluate", "run"]) == 2
+    told = capsys.readouterr().err
+    assert f"the module envs.robot.stranger in {stranger.folder / 'envs'}" in told
+    assert (told.count("\n"), stranger.marker.exists()) == (1, False)
+    done = csac(stranger.folder, "evaluate", "run", "--episodes", "1", "--trust-task")
     assert done.returncode == 0, done.stderr
+    trust.refuse_untrusted("envs.robot.stranger:Stranger-v0", "run")
+
+
+def test_training_records_the_task_module_as_trusted(stranger, monkeypatch):
+    """One's own runs stay one command."""
+    monkeypatch.chdir(stranger.folder)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(stranger.folder)])
+    with pytest.raises(InputError, match="add --trust-task"):
+        trust.refuse_untrusted("stranger:Stranger-v0", "run")
+    line = f"train stranger:Stranger-v0 --steps 9 --evaluation-episodes 1 --directory own {TINY}"
+    assert main([*line.split(), "--algorithm", "td3"]) == 0
+    del sys.modules["stranger"], gymnasium.registry["Stranger-v0"]
+    trust.refuse_untrusted("stranger:Stranger-v0", "run")
 
 
 @pytest.mark.parametrize("task", ["Hopper-v4", "PyFlyt/QuadX-Hover-v1", "sys:Task-v0", len])
@@ -147,7 +134,7 @@ def test_what_imports_nothing_new_is_not_asked_about(task):
 
 
 @pytest.mark.parametrize(
-    "task", [":Task-v0:", "a..b:Task", ".a:Task", "a\0b:Task", "\ud800:Task", "nowhere.at.all:Task"]
+    "task", ["nowhere:Task", ":Task-v0:", "a..b:Task", ".a:Task", "a\0b:Task", "\ud800:Task", "nowhere.at.all:Task"]
 )
 def test_what_cannot_be_a_module_is_not_found(task):
     with pytest.raises(InputError, match="which is not found here"):
