@@ -1,7 +1,8 @@
-"""Small learners and short runs that crash where they are told to, and what such runs leave."""
+"""Small learners and short runs that are killed at a given step, and what such runs leave."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -74,3 +75,16 @@ def crash_at(step: int):
             raise Crash
 
     return on_evaluation
+
+
+def run_with_copies(directory: Path, *steps: int, **settings: Any):
+    """Run to the end; after the evaluation at each of `steps`, copy what is on disk to `<directory>-<step>`.
+
+    A copy is what a process that is killed at that moment leaves.
+    """
+
+    def on_evaluation(evaluated: int, _: Any) -> None:
+        if evaluated in steps:
+            shutil.copytree(directory, f"{directory}-{evaluated}")
+
+    return run(directory, on_evaluation=on_evaluation, **settings)

@@ -10,22 +10,26 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from resuming import ROLLOUT, SMALL, Crash, contents, crash_at
+from resuming import ROLLOUT, SMALL, Crash, contents, crash_at, run_with_copies
 from resuming import run as train
 from test_memory import RolloutWatcher, Watcher
 from trainer import run
 
-from csac import InputError
+from csac import InputError, resume
 from csac.algorithms import PPO, SAC
 from csac.algorithms.memory import unpack
-from csac.algorithms.ppo import value_at
-from csac.record.run import RunDirectory
 from csac.seeds import training_seed
 from csac.tasks import workers
 from csac.tasks.vector import SeedEnvironments
 from csac.types import Cadence, Spec
 
 SEEDS = (4, 9)
+FOUR: dict[str, Any] = {
+    "algorithm": SAC(**SMALL),
+    "environments": 4,
+    "perturbations": ("friction=1.5@150", "observation_noise=0.01@330"),
+    "keep_checkpoints": 0,
+}
 
 
 def check_story(rows: np.ndarray, seed: int, environment: int) -> None:
@@ -79,61 +83,37 @@ def test_the_ratio_of_updates_to_steps_is_kept_whatever_the_number_of_environmen
     cadence = SAC(updates_per_step=updates_per_step).cadence.side_by_side(environments)
     assert (cadence.update_interval, cadence.updates_per_interval) == expected
     assert cadence.first_update == -(-10_000 // expected[0]) * expected[0]
+    assert Cadence(0, 10, 5, 8).side_by_side(4)[1:3] == (12, 6)  # rounded up to whole turns
 
 
-def test_an_interval_is_rounded_up_to_whole_turns():
-    assert Cadence(0, 10, 5, 8).side_by_side(4)[1:3] == (12, 6)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run of SAC that was never stopped."""
+    return train(tmp_path_factory.mktemp("whole") / "run", **FOUR)
 
 
-class Onward(probes.Endless):
-    """Observation 0, then 1 for ever, the reward of the next step; truncated after two steps: value 10 at 1, 9 at 0."""
-
-    def __init__(self) -> None:
-        super().__init__(length=2)
-
-    def step(self, action: np.ndarray) -> probes.Result:
-        reward = float(self.observation[0])
-        self.observation = np.ones(1, np.float32)
-        return self.observation, reward, *super().step(action)[2:]
-
-
-def test_ppo_learns_known_values_over_truncation_in_four_environments():
-    algorithm = PPO(
-        discount=0.9,
-        learning_rate=3e-3,
-        learning_rate_schedule="constant",
-        clip_value_loss=False,
-        rollout_steps=128,
-        minibatches=4,
-        hidden_sizes=(32, 32),
-        normalise_rewards=False,
-    )
-    state = run(algorithm, Onward, 6144, environments=4).states[0]
-    for observation, value in {0.0: 9.0, 1.0: 10.0}.items():
-        seen = algorithm.normalise(state.observation_statistics, jnp.array([observation]))
-        assert float(value_at(state.parameters, seen)) == pytest.approx(value, rel=0.02)
-
-
-@pytest.mark.parametrize("algorithm", [SAC(**SMALL), ROLLOUT], ids=lambda algorithm: algorithm.name)
-def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path, algorithm):
-    settings: dict[str, Any] = {"environments": 4, "perturbations": ("friction=1.5@150", "observation_noise=0.01@330")}
-    whole = train(tmp_path / "whole", algorithm, **settings)
-    with pytest.raises(Crash):
-        train(tmp_path / "again", algorithm, on_evaluation=crash_at(300), **settings)
-    again = train(tmp_path / "again", algorithm, resume=True, **settings)
+def test_a_resumed_ppo_run_equals_one_that_was_never_stopped(tmp_path):
+    whole = run_with_copies(tmp_path / "whole", 300, **{**FOUR, "algorithm": ROLLOUT})
+    again = resume(tmp_path / "whole-300")
     assert contents(again.runs[0]) == contents(whole.runs[0])
     assert again.runs[0].manifest.history[-1].step == 240
     assert again.runs[0].manifest.history[-1].exact
 
 
-def test_processes_change_no_number_and_their_episodes_are_resumed(tmp_path):
-    settings: dict[str, Any] = {"algorithm": SAC(**SMALL), "environments": 4, "perturbations": ("friction=1.5@150",)}
-    here = train(tmp_path / "here", **settings)
+def test_processes_change_no_number_and_their_episodes_are_resumed(tmp_path, whole):
     with pytest.raises(Crash):
-        train(tmp_path / "there", on_evaluation=crash_at(300), environment_processes=2, **settings)
-    there = train(tmp_path / "there", resume=True, environment_processes=2, **settings)
-    assert contents(there.runs[0]) == contents(here.runs[0])
+        train(tmp_path / "there", on_evaluation=crash_at(300), environment_processes=2, **FOUR)
+    there = train(tmp_path / "there", resume=True, environment_processes=2, **FOUR)
+    assert contents(there.runs[0]) == contents(whole.runs[0])
+    assert there.runs[0].manifest.history[-1].step == 240
     assert there.runs[0].manifest.history[-1].exact
+
+
+def test_a_fork_has_as_many_environments_as_the_run(tmp_path, whole):
+    with pytest.raises(InputError, match="environments=4"):
+        train(tmp_path / "fork", SAC(**SMALL), start_from=f"{whole.path}@360")
+    fork = train(tmp_path / "fork", SAC(**SMALL), start_from=f"{whole.path}@360", environments=4)
+    assert contents(fork.runs[0]) == contents(whole.runs[0])
 
 
 @pytest.mark.parametrize("processes", [0, 2])
@@ -189,13 +169,3 @@ def test_numbers_that_do_not_go_together_are_refused(tmp_path, changes, words):
     with pytest.raises(InputError, match=words):
         train(tmp_path / "run", **{"algorithm": SAC(**SMALL), "environments": 4, **changes})
     assert not (tmp_path / "run").exists()
-
-
-def test_a_fork_has_as_many_environments_as_the_run(tmp_path):
-    made = train(tmp_path / "run", SAC(**SMALL), steps=120, environments=4)
-    with pytest.raises(InputError, match="environments=4"):
-        train(tmp_path / "fork", SAC(**SMALL), steps=240, start_from=made.path)
-    fork = train(tmp_path / "fork", SAC(**SMALL), steps=240, start_from=made.path, environments=4)
-    whole = train(tmp_path / "whole", SAC(**SMALL), steps=240, environments=4)
-    rows = RunDirectory.open(fork.runs[0].path).evaluations
-    np.testing.assert_array_equal(rows["return"][-2:], whole.runs[0].evaluations["return"][-2:])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import probes
 import pytest
-from resuming import LEARNERS, Crash, contents, crash_at, run
+from resuming import LEARNERS, contents, run, run_with_copies
 
 from csac.deploy.choosing import load
 from csac.evaluation.evaluator import Evaluator
@@ -65,10 +66,8 @@ def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
         one.advance(30)
     assert perturbed.run.table("evaluations").read_bytes() == plain.run.table("evaluations").read_bytes()
     assert len(plain.run.evaluations) == 1
-    training, evaluation = (
-        perturbed.loop.environments.environments[0],
-        perturbed.loop.evaluations._evaluator._environments[0],
-    )
+    training = perturbed.loop.environments.environments[0]
+    evaluation = perturbed.loop.evaluations._evaluator._environments[0]
     for environment in (training, evaluation):
         np.testing.assert_array_equal(model_of(environment).geom_friction, own)
     perturbed.advance(31)
@@ -80,12 +79,14 @@ def test_what_changes_at_a_step_is_what_comes_after_it(tmp_path):
 
 
 def test_the_replay_holds_what_the_policy_saw_and_what_it_chose(tmp_path):
-    """Endless observes 0: what is not 0 in the replay is noise. Its actions are as without any."""
+    """Endless observes 0: what is not 0 in the replay is noise. The policy's choices are as without action noise."""
     given = ["observation_noise=0.5@12", "action_noise=0.5@15"]
-    both = [Paused(tmp_path / name, p, probes.Endless) for name, p in (("noisy", given), ("plain", ()))]
-    for one in both:
+    from_the_beginning = Paused(tmp_path / "beginning", "observation_noise=0.5", probes.Endless)
+    assert from_the_beginning.loop._observations[0, 0] != 0  # already the first observation
+    noisy = Paused(tmp_path / "noisy", given, probes.Endless)
+    for one in (noisy, from_the_beginning):
         one.advance(39)  # the warm-up: actions are drawn, whatever is observed
-    rows, others = (one.loop.learner.memory(0, 39).rows[:39] for one in both)
+    rows, others = (one.loop.learner.memory(0, 39).rows[:39] for one in (noisy, from_the_beginning))
     observation, action, next_observation = rows[:, 0], rows[:, 1], rows[:, 3]
     np.testing.assert_array_equal(np.flatnonzero(next_observation), np.arange(12, 39))  # the step that makes 13
     np.testing.assert_array_equal(np.flatnonzero(observation), np.arange(13, 39))
@@ -93,10 +94,6 @@ def test_the_replay_holds_what_the_policy_saw_and_what_it_chose(tmp_path):
     same = observation[13:] == next_observation[12:-1]
     np.testing.assert_array_equal(np.flatnonzero(~same) + 13, [20, 30])
     np.testing.assert_array_equal(action, others[:, 1])
-
-
-def test_the_beginning_is_perturbed_from_the_first_observation(tmp_path):
-    assert Paused(tmp_path / "noisy", "observation_noise=0.5", probes.Endless).loop._observations[0, 0] != 0
 
 
 # Whole runs. Evaluations every 100 steps, checkpoints every 100.
@@ -113,8 +110,8 @@ def plain(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def perturbed(tmp_path_factory):
-    """The same with them, uninterrupted."""
-    return run(tmp_path_factory.mktemp("perturbed") / "run", perturbations=GIVEN, **LONG)
+    """The same with them, and copies of what a kill at steps 250 and 500 would have left."""
+    return run_with_copies(tmp_path_factory.mktemp("perturbed") / "run", 250, 500, perturbations=GIVEN, **LONG)
 
 
 def test_a_run_is_the_same_until_it_is_perturbed(plain, perturbed):
@@ -126,17 +123,9 @@ def test_a_run_is_the_same_until_it_is_perturbed(plain, perturbed):
 
 
 def test_a_run_says_what_it_was_perturbed_by(perturbed):
-    assert list(perturbed.config.perturbations) == [
-        "friction=2@200",
-        "observation_noise=0.05@200",
-        "mass=1.5@250",
-        "action_noise=0.1@250",
-        "friction=1@430",
-    ]
-    written = (perturbed.runs[0].path / "log.txt").read_text()
-    log = [line.partition(" ")[2] for line in written.splitlines()]
-    told = [line for line in log if line.startswith("perturbed")]
-    assert told == [
+    assert perturbed.config.perturbations == GIVEN
+    log = [line.partition(" ")[2] for line in (perturbed.runs[0].path / "log.txt").read_text().splitlines()]
+    assert [line for line in log if line.startswith("perturbed")] == [
         "perturbed from step 201 on: friction x 2, observation noise 0.05",
         "perturbed from step 251 on: mass x 1.5, action noise 0.1",
         "perturbed from step 431 on: friction x 1",
@@ -151,38 +140,30 @@ def test_evaluations_meet_the_perturbed_task(perturbed):
     assert [episode.episode_return for episode in episodes] == rows["return"][rows["step"] == 500].tolist()
 
 
-@pytest.mark.parametrize("crash", [150, 200, 450])
-def test_a_perturbed_run_that_crashed_goes_on_and_leaves_the_same_files(tmp_path, perturbed, crash):
-    """From checkpoints before the first perturbation, at its very step, between two and after the last."""
-    with pytest.raises(Crash):
-        run(tmp_path / "run", perturbations=GIVEN, on_evaluation=crash_at(crash + 50), **LONG)
+@pytest.mark.parametrize(("killed", "checkpoint"), [(250, 200), (500, 400)])
+def test_a_perturbed_run_that_was_killed_resumes_and_leaves_the_same_files(tmp_path, perturbed, killed, checkpoint):
+    """From checkpoints at the very step of a perturbation, and between two."""
+    shutil.copytree(f"{perturbed.path}-{killed}", tmp_path / "run")
     finished = resume(tmp_path / "run")
-    assert finished.runs[0].manifest.history[0].step == crash // 100 * 100
+    assert finished.runs[0].manifest.history[0].step == checkpoint
     assert contents(finished.runs[0]) == contents(perturbed.runs[0])
-    curves = [(path / "curve.png").read_bytes() for path in (tmp_path / "run", perturbed.path)]
-    assert curves[0] == curves[1]
+    assert (tmp_path / "run" / "curve.png").read_bytes() == (perturbed.path / "curve.png").read_bytes()
 
 
-@pytest.mark.parametrize("step", [100, 200])
-def test_a_fork_that_is_perturbed_equals_a_run_that_was_from_the_start(tmp_path, plain, perturbed, step):
-    forked = run(tmp_path / "run", start_from=f"{plain.path}@{step}", perturbations=GIVEN, **LONG)
+def test_a_fork_that_is_perturbed_equals_a_run_that_was_from_the_start(tmp_path, plain, perturbed):
+    forked = run(tmp_path / "run", start_from=f"{plain.path}@200", perturbations=GIVEN, **LONG)
     assert contents(forked.runs[0]) == contents(perturbed.runs[0])
-    assert forked.config.perturbations == perturbed.config.perturbations
-    changes = (f"perturbations is [], not {list(perturbed.config.perturbations)!r}",)
-    assert forked.runs[0].manifest.forked_from == Origin(str(plain.runs[0].path), step, changes)
-
-
-def test_a_fork_that_is_not_perturbed_equals_going_on(tmp_path, plain):
-    forked = run(tmp_path / "run", start_from=f"{plain.path}@200", **LONG)
-    assert contents(forked.runs[0]) == contents(plain.runs[0])
+    assert forked.config.perturbations == GIVEN
+    changes = (f"perturbations is [], not {list(GIVEN)!r}",)
+    assert forked.runs[0].manifest.forked_from == Origin(str(plain.runs[0].path), 200, changes)
 
 
 def test_a_fork_of_a_perturbed_run_keeps_what_had_happened(tmp_path, perturbed):
-    """The last one, at 430, is still to come at 300: without a word of it, it is the same run."""
+    """The last one, at 430, is still to come at 300, and comes unless the fork is given others."""
     whole = run(tmp_path / "same", start_from=f"{perturbed.path}@300", **LONG)
     assert contents(whole.runs[0]) == contents(perturbed.runs[0])
     other = run(tmp_path / "other", start_from=f"{perturbed.path}@300", perturbations=(), **LONG)
-    assert other.config.perturbations == perturbed.config.perturbations[:4]
+    assert other.config.perturbations == GIVEN[:4]
     rows, before = other.evaluations, perturbed.evaluations
     np.testing.assert_array_equal(rows["return"][rows["step"] <= 400], before["return"][before["step"] <= 400])
     assert contents(other.runs[0])["evaluations.csv"] != contents(perturbed.runs[0])["evaluations.csv"]

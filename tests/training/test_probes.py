@@ -33,25 +33,21 @@ SETTINGS: dict[str, Any] = {**COMMON, "entropy_weight": 1e-3}
 NOISY: dict[str, Any] = {**COMMON, "exploration_std": 0.5}
 
 
-@pytest.fixture(params=["sac", "csac-periodic", "csac-average", "td3", "sd3"])
+RELATIVE: dict[str, Any] = {**SETTINGS, "relative_entropy_weight": 0.01}
+ALGORITHMS = {
+    "sac": SAC(**SETTINGS),
+    "csac-periodic": CSAC(
+        reference_policy="periodic", reference_period=100, relative_entropy_estimator="closed_form", **RELATIVE
+    ),
+    "csac-average": CSAC(reference_policy="average", relative_entropy_estimator="sampled", **RELATIVE),
+    "td3": TD3(**NOISY),
+    "sd3": SD3(noise_samples=4, **NOISY),
+}
+
+
+@pytest.fixture(params=ALGORITHMS)
 def algorithm(request):
-    if request.param == "sac":
-        return SAC(**SETTINGS)
-    if request.param == "td3":
-        return TD3(**NOISY)
-    if request.param == "sd3":
-        return SD3(noise_samples=4, **NOISY)
-    if request.param == "csac-average":
-        return CSAC(
-            relative_entropy_weight=0.01, reference_policy="average", relative_entropy_estimator="sampled", **SETTINGS
-        )
-    return CSAC(
-        relative_entropy_weight=0.01,
-        reference_policy="periodic",
-        reference_period=100,
-        relative_entropy_estimator="closed_form",
-        **SETTINGS,
-    )
+    return ALGORITHMS[request.param]
 
 
 def values(state, observation: float, actions=(-0.8, 0.0, 0.8)) -> np.ndarray:
@@ -72,41 +68,20 @@ def entropy(policy: TanhGaussian) -> float:
     return -float(weights @ np.asarray(log_prob) / weights.sum())
 
 
-def test_constant_reward(algorithm):
-    state = run(algorithm, probes.ConstantReward, 700).states[0]
-    np.testing.assert_allclose(values(state, 0.0), 1.0, atol=0.05)
+class TerminalReward(probes.ObservationActionReward):
+    """Observation x = -1 or 1, reward 1 - (action - x/2)², then the end. Were the end no end, values would be 10."""
+
+    def reward(self, action: float) -> float:
+        return 1.0 + super().reward(action)
 
 
-def test_the_reward_is_the_observation(algorithm):
-    state = run(algorithm, probes.ObservationReward, 1000).states[0]
-    np.testing.assert_allclose(values(state, -1.0), -1.0, atol=0.1)
-    np.testing.assert_allclose(values(state, 1.0), 1.0, atol=0.1)
-
-
-def test_a_reward_one_step_later_is_discounted(algorithm):
-    state = run(algorithm, probes.DelayedReward, 1000).states[0]
-    np.testing.assert_allclose(values(state, 1.0), 1.0, atol=0.04)
-    np.testing.assert_allclose(values(state, 0.0), DISCOUNT, atol=0.04)
-
-
-def test_the_best_action_is_found(algorithm):
-    state = run(algorithm, probes.ActionReward, 1500).states[0]
-    assert best_action(algorithm, state, 0.0) == pytest.approx(0.5, abs=0.1)
-    # -(a - 0.5)² = -0.25, -0.01, 0, -0.09
-    np.testing.assert_allclose(values(state, 0.0, (0.0, 0.4, 0.5, 0.8)), [[-0.25, -0.01, 0.0, -0.09]] * 2, atol=0.05)
-
-
-def test_the_best_action_depends_on_the_observation(algorithm):
-    state = run(algorithm, probes.ObservationActionReward, 2500).states[0]
+def test_the_best_action_depends_on_the_observation_and_termination_ends_the_value(algorithm):
+    state = run(algorithm, TerminalReward, 2500).states[0]
     for observation in (-1.0, 1.0):
-        assert best_action(algorithm, state, observation) == pytest.approx(observation / 2, abs=0.15)
-        np.testing.assert_allclose(values(state, observation, (observation / 2,)), 0.0, atol=0.06)
-
-
-def test_a_truncated_episode_goes_on_in_its_value(algorithm):
-    # Q = r / (1 - γ) = 10. If a truncation, every 5 steps, ended the episode: Q = 1 + 0.8·0.9 Q, which is 3.57.
-    state = run(algorithm, probes.Endless, 2000, length=5).states[0]
-    np.testing.assert_allclose(values(state, 0.0), 10.0, atol=0.4)
+        best = observation / 2
+        assert best_action(algorithm, state, observation) == pytest.approx(best, abs=0.15)
+        np.testing.assert_allclose(values(state, observation, (best,)), 1.0, atol=0.06)
+        np.testing.assert_allclose(values(state, observation, (best - 0.4, best + 0.3)), [[0.84, 0.91]] * 2, atol=0.06)
 
 
 @pytest.mark.parametrize("algorithm", [CSAC, SAC], ids=lambda algorithm: algorithm.name)
@@ -120,14 +95,11 @@ def test_entropy_has_its_weight_in_the_value(algorithm):
 
 
 class Onward(probes.Endless):
-    """Observation 0, then 1 for ever, which is the reward of the next step; truncated after two steps, at 1 again.
+    """Observation 0, then 1 until the truncation, which is the reward of the next step; at the end it is 1 as well.
 
-    With a discount γ the value at 1 is 1 / (1 - γ) and at 0 it is γ / (1 - γ). It would be 1 / (1 - γ²) at 1, did the
-    first observation of the next episode stand for the last of this one, and 1 if nothing followed.
+    With a discount γ the value at 1 is 1 / (1 - γ) and at 0 it is γ / (1 - γ): 10 and 9. It would be less if nothing
+    followed, or if the first observation of the next episode stood for the last of this one.
     """
-
-    def __init__(self) -> None:
-        super().__init__(length=2)
 
     def step(self, action: np.ndarray) -> probes.Result:
         reward = float(self.observation[0])
@@ -136,7 +108,7 @@ class Onward(probes.Endless):
 
 
 def test_a_truncated_episode_goes_on_from_its_last_observation(algorithm):
-    state = run(algorithm, Onward, 2000).states[0]
+    state = run(algorithm, Onward, 2000, length=2).states[0]
     np.testing.assert_allclose(values(state, 1.0), 10.0, atol=0.4)
     np.testing.assert_allclose(values(state, 0.0), 9.0, atol=0.4)
 
@@ -153,21 +125,11 @@ PPO_SETTINGS: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("probe", "steps", "expected"),
-    [
-        (probes.ConstantReward, 1024, {0.0: 1.0}),
-        (probes.ObservationReward, 1024, {-1.0: -1.0, 1.0: 1.0}),
-        (probes.DelayedReward, 1536, {0.0: DISCOUNT, 1.0: 1.0}),
-        # As above: 10, not 3.57. Rollouts of 128 steps end within an episode of 10 as well.
-        (probes.Endless, 3072, {0.0: 10.0}),
-        (Onward, 6144, {0.0: 9.0, 1.0: 10.0}),
-    ],
-)
-def test_ppo_learns_known_values(probe, steps, expected):
+def test_ppo_learns_known_values_over_truncation_in_four_environments():
     algorithm = PPO(**PPO_SETTINGS)
-    state = run(algorithm, probe, steps).states[0]
-    for observation, value in expected.items():
+    # In each environment, rollouts of 32 steps end within an episode of 3 as well.
+    state = run(algorithm, Onward, 6144, environments=4, length=3).states[0]
+    for observation, value in {0.0: 9.0, 1.0: 10.0}.items():
         assert state_value(algorithm, state, observation) == pytest.approx(value, rel=0.02)
 
 
@@ -180,23 +142,19 @@ def test_ppo_learns_values_in_units_of_the_spread_of_returns():
     assert state_value(algorithm, state, 1.0) == pytest.approx(1.0 / 0.5, rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("probe", "steps", "best_actions"),
-    [(probes.ActionReward, 2048, {0.0: 0.5}), (probes.ObservationActionReward, 3072, {-1.0: -0.5, 1.0: 0.5})],
-)
-def test_ppo_finds_the_best_action_and_values_its_own_noise(probe, steps, best_actions):
+def test_ppo_finds_the_best_action_and_values_its_own_noise():
     algorithm = PPO(**PPO_SETTINGS)
-    state = run(algorithm, probe, steps).states[0]
+    state = run(algorithm, TerminalReward, 3072).states[0]
     std = float(np.exp(state.parameters.log_std[0]))
     assert std < 0.25
-    for observation, best in best_actions.items():
-        mean = float(algorithm.act(state, jnp.array([observation]), jax.random.key(0), explore=False)[0])
-        assert mean == pytest.approx(best, abs=0.1)
-        # E -(a - best)² of a Gaussian action
-        assert state_value(algorithm, state, observation) == pytest.approx(-(std**2) - (mean - best) ** 2, abs=0.02)
+    for observation in (-1.0, 1.0):
+        mean = best_action(algorithm, state, observation)
+        assert mean == pytest.approx(observation / 2, abs=0.1)
+        # E 1 - (a - best)² of a Gaussian action
+        expected = 1 - std**2 - (mean - observation / 2) ** 2
+        assert state_value(algorithm, state, observation) == pytest.approx(expected, abs=0.02)
 
 
 def state_value(algorithm: PPO, state, observation: float) -> float:
-    return float(
-        value_at(state.parameters, algorithm.normalise(state.observation_statistics, jnp.array([observation])))
-    )
+    seen = algorithm.normalise(state.observation_statistics, jnp.array([observation]))
+    return float(value_at(state.parameters, seen))
