@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac.algorithms.networks import make_mlp
 from csac.training.packing import Packing, Parcel, SeedAxis, by_name
 
 
@@ -32,20 +31,13 @@ def test_only_small_floats_are_in_the_row():
     np.testing.assert_array_equal(hidden, tree().hidden)
 
 
-def test_what_was_packed_is_unpacked():
-    packing = Packing(tree(), 100)
-    for given, again in zip(tree(), packing.unpack(packing.pack(tree())), strict=True):
-        assert given.shape == again.shape
-        assert given.dtype == again.dtype
-        np.testing.assert_array_equal(again, given)
-
-
 def test_seeds_side_by_side_are_unpacked_by_seed():
     packing, seeds = Packing(tree(), 100), [tree(), tree(10.0)]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *seeds)
     packed = jax.vmap(packing.pack)(stacked)
     assert packed[0].shape == (2, 7)
     for given, again in zip(stacked, packing.unpack(packed), strict=True):
+        assert given.dtype == again.dtype
         np.testing.assert_array_equal(again, given)
 
 
@@ -65,11 +57,6 @@ def test_leaves_are_named_by_fields_keys_and_places():
     }
     assert named["moments.1.0"] is given["moments"][1][0]
     assert list(named.values()) == jax.tree.leaves(given)
-
-
-def test_a_module_is_named_by_its_fields():
-    network = make_mlp(jax.random.key(0), 3, (4,), 2)
-    assert list(by_name(network)) == [f"layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
 
 
 @pytest.mark.parametrize(("seeds", "inside"), [(1, ()), (3, (3,))])
@@ -92,14 +79,10 @@ def test_a_parcel_arrives_to_the_last_bit():
     rows = np.array([[1.5, -0.0, 1e-45], [np.inf, np.nan, -3e38]], np.float32)
     observation = np.array([2.0, 1e-40], np.float32)
     parcel = Parcel((2, 3), (2,))
-    row = parcel.pack(7, rows, observation)
+    row = parcel.pack(2**24 + 1, rows, observation)
     assert row.shape == (9,)
     again, observed, number = jax.jit(parcel.unpack)(row)
     np.testing.assert_array_equal(np.asarray(again).view(np.int32), rows.view(np.int32))
     np.testing.assert_array_equal(np.asarray(observed).view(np.int32), observation.view(np.int32))
     assert number.dtype == jnp.int32
-    assert int(number) == 7
-
-
-def test_a_parcel_s_number_is_exact_where_a_float_would_not_be():
-    assert int(Parcel((1,)).unpack(jnp.asarray(Parcel((1,)).pack(2**24 + 1, np.zeros(1))))[-1]) == 2**24 + 1
+    assert int(number) == 2**24 + 1  # which no float32 is
