@@ -139,27 +139,35 @@ class RunDirectory:
     def rows(self, name: Table) -> np.ndarray:
         """Return all rows of a table as a structured array, empty if nothing was written yet.
 
-        If the file was altered or truncated since the newest checkpoint, return the checkpoint's rows, with a warning.
+        If the file is damaged, or was altered since the newest checkpoint, return the checkpoint's rows, with a warning.
         """
-        path = self._intact_file(name)
-        rows = read_rows(path) if path.exists() else structured(COLUMNS[name], [])
+        path, copy = self.table(name), self._saved_copy(name)
+        try:
+            if copy and not self._continues_copy(path, copy):
+                raise InputError(f"{path} does not continue its copy in the newest checkpoint")
+            rows = read_rows(path) if path.exists() else structured(COLUMNS[name], [])
+        except InputError:
+            if not copy:
+                raise
+            warnings.warn(f"{path} has changed since the newest checkpoint: its copy there is read", stacklevel=3)
+            rows = read_rows(copy)
         if missing := set(COLUMNS[name]) - set(rows.dtype.names or ()):
             raise InputError(f"{path} is damaged: it has no column {min(missing)}; restore it")
         return rows
 
-    def _intact_file(self, name: Table) -> Path:
-        """Return the path of a table, or of its copy in the newest checkpoint if the table does not continue it."""
-        path = self.table(name)
+    def _saved_copy(self, name: Table) -> Path | None:
+        """Return the path of a table's intact copy in the newest checkpoint, or None."""
         for manifest in _manifest_copies(self.path)[:1]:
-            copy = manifest.with_name(path.name)
-            saved = copy.read_bytes() if copy.is_file() else b""
-            current = path.read_bytes() if path.is_file() else b""
-            is_saved = self.manifest.state == "finished" and self.manifest.steps_done == self.manifest.last_checkpoint
-            is_more = is_saved and current.count(b"\n") > saved.count(b"\n")
-            if (is_more or not continues(current, saved)) and _matches_checksum(copy, saved):
-                warnings.warn(f"{path} has changed since the newest checkpoint: its copy there is read", stacklevel=4)
+            copy = manifest.with_name(f"{name}.csv")
+            if copy.is_file() and _matches_checksum(copy, copy.read_bytes()):
                 return copy
-        return path
+        return None
+
+    def _continues_copy(self, path: Path, copy: Path) -> bool:
+        current, saved = path.read_bytes() if path.is_file() else b"", copy.read_bytes()
+        is_saved = self.manifest.state == "finished" and self.manifest.steps_done == self.manifest.last_checkpoint
+        is_more = is_saved and current.count(b"\n") > saved.count(b"\n")
+        return continues(current, saved) and not is_more
 
     @property
     def evaluations(self) -> np.ndarray:

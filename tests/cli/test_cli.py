@@ -165,10 +165,11 @@ def test_what_ends_training_has_an_exit_code_and_a_line(monkeypatch, capsys, rai
     assert output.count("\n") == 1
 
 
-def test_sigint_saves_checkpoints_of_all_seeds(tmp_path):
+@pytest.mark.parametrize(("number", "seeds"), [(signal.SIGTERM, 1), (signal.SIGINT, 2)])
+def test_a_signal_saves_checkpoints_of_all_seeds(tmp_path, number, seeds):
     """A terminal sends Ctrl-C to all processes; only the first may act on it."""
     line = "train probes:Endless-v0 --directory runs --steps 1e8 --warmup-steps 1e8 --replay-size 1e3 "
-    line += f"--seeds 2 --evaluation-interval 250 {TINY}"
+    line += f"--seeds {seeds} --evaluation-interval 250 {TINY}"
     process = subprocess.Popen(
         [sys.executable, "-m", "csac", *shlex.split(line)],
         cwd=tmp_path,
@@ -181,11 +182,11 @@ def test_sigint_saves_checkpoints_of_all_seeds(tmp_path):
     assert process.stdout is not None
     for line in process.stdout:
         if line.startswith("step 250 of 100,000,000: mean return 10.00"):
-            os.killpg(process.pid, signal.SIGINT)
+            os.killpg(process.pid, number)
             break
     output, errors = process.communicate()
-    assert process.returncode == 128 + signal.SIGINT
-    assert errors.startswith("csac: stopped by SIGINT; saved in ")
+    assert process.returncode == 128 + number
+    assert errors.startswith(f"csac: stopped by {number.name}; saved in ")
     assert errors.count("\n") == 1
     assert "stopped at step" in output
     assert "failed" not in output

@@ -193,14 +193,21 @@ def damage(path, kind: str) -> None:
         ("checkpoint/step_360/state.safetensors", "missing"),
         ("checkpoint/step_360/state.safetensors", "changed"),
         ("checkpoint/step_360/checkpoint.json", "cut"),
-        ("evaluations.csv", "missing"),
-        ("evaluations.csv", "changed"),
     ],
 )
 def test_a_damaged_file_costs_at_most_the_work_since_the_checkpoint_before(tmp_path, stopped, whole, name, kind):
     damage(stopped.path / name, kind)
-    again = csac.resume(tmp_path / "run", progress=False).runs[0]
-    assert again.manifest.history[-1].step == (240 if "step_360" in name else 360)
+    again = csac.resume(tmp_path / "run").runs[0]
+    assert again.manifest.history[-1].step == 240
+    assert contents(again) == whole
+
+
+@pytest.mark.parametrize("kind", ["missing", "changed"])
+def test_a_damaged_table_is_shown_and_restored_from_the_checkpoint(tmp_path, stopped, whole, kind):
+    damage(stopped.table("evaluations"), kind)
+    with pytest.warns(UserWarning, match=r"evaluations\.csv has changed"):
+        again = csac.resume(tmp_path / "run").runs[0]
+    assert again.manifest.history[-1].step == 360
     assert contents(again) == whole
 
 
