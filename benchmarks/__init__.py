@@ -1,1 +1,1 @@
-"""How fast csac is, beside its peers and beside what the machine can do: `python -m benchmarks --help`."""
+"""The speed of csac, compared with its peers and with the limit of the machine: `python -m benchmarks --help`."""

@@ -1,4 +1,4 @@
-"""The entry point: `python -m benchmarks NAME` measures, prints a table and, with --write, puts it into its page."""
+"""Entry point: `python -m benchmarks NAME` measures, prints a table and, with --write, inserts it into its page."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ PARTS: list[Part] = [part for suite in SUITES.values() for part in suite.PARTS]
 
 
 def named(name: str) -> list[Part]:
-    """Return the parts of a suite, or the one part of that name.
+    """Return the parts of a suite, or the one part with this name.
 
     Raises:
-        InputError: there is none.
+        InputError: no suite or part has this name.
     """
     parts = SUITES[name].PARTS if name in SUITES else [part for part in PARTS if part.name == name]
     if not parts:
@@ -44,7 +44,7 @@ def named(name: str) -> list[Part]:
 
 
 def measure(part: Part, options: Options, write: bool) -> bool:
-    """Measure one part, print its table and, if asked for, write it; return whether anything was measured."""
+    """Measure one part, print its table and optionally write it; return whether anything was measured."""
     began = time.monotonic()
     rows = part.run(options)
     if not rows:
@@ -60,7 +60,7 @@ def measure(part: Part, options: Options, write: bool) -> bool:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Read the command line and do what it says; return the exit code."""
+    """Run the command line; return the exit code."""
     given = _parser().parse_args(arguments)
     options = Options(given.only, given.repetitions, given.quick, given.device)
     try:

@@ -1,4 +1,4 @@
-"""One measurement in a process of its own: `python -m benchmarks.call module:function JSON` prints a line of JSON."""
+"""Run one measurement in a separate process: `python -m benchmarks.call module:function JSON` prints a line of JSON."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib import import_module
 
 
 def main() -> None:
-    """Call the function with the arguments, and print what it returns."""
+    """Call the function with the arguments and print its result."""
     _, function, arguments = sys.argv
     module, _, name = function.partition(":")
     print(json.dumps(getattr(import_module(module), name)(**json.loads(arguments))), flush=True)

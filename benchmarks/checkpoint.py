@@ -1,7 +1,7 @@
-"""What a checkpoint costs beside a replay of any size: for how long training pauses, and what is written.
+"""The cost of a checkpoint for different replay sizes: how long training pauses, and how much is written.
 
-One seed of CSAC on HalfCheetah-v4 that acts at random and never updates, so that its replay fills soon; networks and
-optimisers are saved as always.
+One seed of CSAC on HalfCheetah-v4 acts randomly and never updates, so that its replay fills quickly; networks and
+optimisers are saved as usual.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from benchmarks.tables import Row, formatted
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-EVERY = 250  # steps between two looks at the clock
-HELD = [1, 2, 10, 20, 30]  # checkpoints that make a row: the replay is full at the 20th
+EVERY = 250  # steps between two time stamps
+HELD = [1, 2, 10, 20, 30]  # checkpoints that get a row in the table; the replay is full at the 20th
 
-Files: TypeAlias = dict[Path, int]  # the bytes of each
+Files: TypeAlias = dict[Path, int]  # bytes by file
 
 
 def measure(_: str, options: Options) -> list[Row]:
-    """Train until the last of these checkpoints is written, and return a row for each."""
+    """Train until the last checkpoint in HELD is written, and return a row for each of them."""
     interval, held = (2_000, HELD[:2]) if options.quick else (50_000, HELD)
     words = f"--warmup-steps 10000000 --steps 10000001 --checkpoint-interval {interval}".split()
     launch, seen = Launch([*csac_command("csac"), *words], usable_cores()), {}
@@ -39,19 +39,19 @@ def measure(_: str, options: Options) -> list[Row]:
             while (at := steps_in(found := read_stamps(Path(written))) / interval) < held[-1] + 0.8:
                 if process.poll() is not None:
                     raise failure(folder, process)
-                if 0.2 < at % 1 < 0.8:  # far from where one is written
+                if 0.2 < at % 1 < 0.8:  # not close to a checkpoint being written
                     seen[int(at)] = _files(folder)
                 time.sleep(0.1)
     return [row(count, interval, found[0], seen) for count in held]
 
 
 def steps_in(found: list[np.ndarray]) -> int:
-    """Return the steps that the one environment has made."""
+    """Return the number of steps of the single environment."""
     return int(found[0][-1, 0]) if found else 0
 
 
 def row(count: int, interval: int, stamp: np.ndarray, seen: Mapping[int, Files]) -> Row:
-    """Return what checkpoint number `count` cost: by how much longer the steps around it took than others do."""
+    """Return the cost of checkpoint number `count`: the extra time of the steps around it, and the bytes written."""
     at = int(np.searchsorted(stamp[:, 0], count * interval))
     seconds = float(stamp[at + 1, 1] - stamp[at - 1, 1] - 2 * np.median(np.diff(stamp[:, 1])))
     before, after = seen.get(count - 1, {}), seen.get(count, {})
@@ -62,7 +62,7 @@ def row(count: int, interval: int, stamp: np.ndarray, seen: Mapping[int, Files])
 def _files(folder: Path) -> Files:
     files = {}
     for path in folder.rglob("checkpoint/**/*"):
-        with suppress(FileNotFoundError):  # it has just been replaced
+        with suppress(FileNotFoundError):  # replaced in the meantime
             if path.is_file():
                 files[path] = path.stat().st_size
     return files

@@ -1,6 +1,6 @@
-"""Training on a GPU: seed-steps per second against seeds, and whether its numbers are those of the CPU.
+"""Training on a GPU: seed-steps per second by number of seeds, and agreement with the CPU.
 
-CSAC at the settings of the presets `paper` and `strong`, its seeds in as many processes as csac chooses.
+CSAC with the presets `paper` and `strong`; csac chooses the number of processes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PAGE = "benchmarks/README.md"
 
 
 class Case(NamedTuple):
-    """So many seeds at the settings of a preset, with so many updates in one dispatch."""
+    """A number of seeds, a preset, and the number of updates per dispatch."""
 
     seeds: int
     preset: str = "paper"
@@ -28,7 +28,7 @@ class Case(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What --only looks in."""
+        """The text that --only searches."""
         return f"{self.seeds} seeds, preset {self.preset}, {self.interval} in one dispatch"
 
 
@@ -36,7 +36,7 @@ CASES = [*map(Case, (1, 2, 5, 10, 25, 50)), Case(25, interval=10), Case(5, "stro
 
 
 def measure_speed(case: Case, options: Options) -> list[Row]:
-    """Train so many seeds for a while."""
+    """Measure the speed of training this many seeds."""
     device = "CPU" if options.device == "cpu" else gpu_name()
     several = ["--update-interval", str(case.interval)] * (case.interval > 1)
     command = csac_command("csac", *several, preset=case.preset, seeds=case.seeds, device=options.device)
@@ -48,13 +48,13 @@ def measure_speed(case: Case, options: Options) -> list[Row]:
 
 
 def measure_agreement(preset: str, options: Options) -> list[Row]:
-    """Make the same updates on GPU and CPU; nothing where the CPU is measured."""
+    """Make the same updates on GPU and CPU; return nothing if the CPU is measured."""
     return [] if options.device == "cpu" else [_on_gpu(updates=50, preset=preset)]
 
 
 @functools.cache
 def gpu_name() -> str:
-    """Return what the GPU is, which takes a process with JAX to find out. Raises InputError where there is none."""
+    """Return the name of the GPU, as JAX reports it in a separate process. Raises InputError if there is none."""
     return _on_gpu(updates=0, preset="paper")["device"]
 
 
@@ -69,9 +69,9 @@ def _on_gpu(updates: int, preset: str) -> Row:
 
 
 def compare(updates: int, preset: str) -> dict[str, Any]:
-    """Return which GPU there is, and how far CSAC is there from the CPU after so many updates from the same beginning.
+    """Return the GPU's name, and how far CSAC's numbers differ between GPU and CPU after the same updates.
 
-    Where JAX can use no GPU, `device` is "".
+    If JAX cannot use a GPU, `device` is "".
     """
     import jax
 
@@ -91,7 +91,7 @@ def compare(updates: int, preset: str) -> dict[str, Any]:
 
 
 def learnt(device: Any, updates: int, preset: str) -> dict[str, np.ndarray]:
-    """Return all that two seeds have learnt after so many updates on this device, with the optimisers' moments."""
+    """Return the learnt arrays of two seeds, including optimiser moments, after `updates` updates on this device."""
     import jax
 
     from benchmarks.updates import HALF_CHEETAH, Driver, make_learner
@@ -100,7 +100,7 @@ def learnt(device: Any, updates: int, preset: str) -> dict[str, np.ndarray]:
         driver = Driver(make_learner("csac", seeds=2, preset=preset, replay_size=1_000), seeds=2)
         generator = np.random.default_rng(1)
         for _ in range(updates):
-            # Transitions that differ: a batch of equal ones is nothing but its rounding errors once it is normalised.
+            # Different transitions: if all were equal, a normalised batch would contain only rounding errors.
             before, after = generator.standard_normal((2, 2, HALF_CHEETAH.observation_size), np.float32)
             driver.actions = generator.uniform(-1.0, 1.0, (2, HALF_CHEETAH.action_size)).astype(np.float32)
             driver.make_step(before, generator.standard_normal(2, np.float32), after)
@@ -109,7 +109,7 @@ def learnt(device: Any, updates: int, preset: str) -> dict[str, np.ndarray]:
 
 
 def largest_difference(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> float:
-    """Return the largest difference of any number, relative to the largest number in its array of ours."""
+    """Return the largest absolute difference, relative to the largest absolute value in the same array of `ours`."""
     pairs = [(np.asarray(ours[name], np.float64), np.asarray(theirs[name], np.float64)) for name in ours]
     return float(np.max([np.abs(a - b).max(initial=0.0) / (np.abs(a).max(initial=0.0) + 1e-6) for a, b in pairs]))
 

@@ -1,6 +1,6 @@
-"""What an update costs as the run grows: with seeds, width, batch, observation, replay.
+"""The cost of an update as seeds, network width, batch, observation or replay grow.
 
-Seeds are trained by one command on two cores. Everything else is one learner on all cores, without an environment.
+Seeds are trained by one command on two cores. The other axes use one learner on all cores, without an environment.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ AXES: dict[str, list[int]] = {
 
 
 class Size(NamedTuple):
-    """A place on one axis; everything else is at the paper's settings."""
+    """A value on one axis; all other settings are the paper's."""
 
     axis: str
     value: int
 
     @property
     def name(self) -> str:
-        """What --only looks in."""
+        """The text that --only searches."""
         return f"{self.axis} {self.value:,}"
 
 
 def measure(size: Size, options: Options) -> list[Row]:
-    """Measure one point of an axis: updates per second, and the peak of the memory of all processes together."""
+    """Measure one point of an axis: updates per second, and the total peak memory of all processes."""
     if size.axis == "seeds":
         launch = Launch(csac_command(ALGORITHM, seeds=size.value), usable_cores()[:2])
         found = time_training([launch], options.window(20.0), seeds=size.value)
@@ -52,17 +52,17 @@ def measure(size: Size, options: Options) -> list[Row]:
 
 
 def giga_operations(width: int = 256, batch: int = 256, observation: int = 17, replay: int = 0) -> float:
-    """Return 10⁹ operations of one update; those of a larger replay are the same."""
+    """Return the operations of one update, in 10⁹; the replay size does not change them."""
     return operations(update_products(ALGORITHM, (width, width), batch, observation)) / 1e9
 
 
 def milliseconds(row: Row) -> float:
-    """Return what one update took."""
+    """Return the time of one update."""
     return 1000 / row["updates_per_second"]
 
 
 def render(rows: list[Row]) -> str:
-    """Return a table for each axis; its last but one column is what the time and the operations grow by."""
+    """Return a table for each axis; the second-last column is the growth of time and operations from row to row."""
     parts = []
     for (axis,), mine in grouped(rows, "axis").items():
         lines = []
@@ -80,7 +80,7 @@ def render(rows: list[Row]) -> str:
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Draw the time of one update against each axis, both logarithmic, beside what the operations alone would take."""
+    """Draw log-log plots of the time of one update against each axis, with a line in proportion to the operations."""
     from matplotlib.figure import Figure
 
     axes = grouped(rows, "axis")

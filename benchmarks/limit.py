@@ -1,8 +1,8 @@
-"""How near training comes to what this machine can multiply.
+"""How close training comes to the arithmetic limit of this machine.
 
-The limit is the float32 rate of one core at the product that dominates (256 x 256 x 256), times the cores. It is
-measured before and after every other measurement, since a shared machine's clock wanders; the better of the two is the
-limit.
+The limit is the float32 rate of one core for the dominant matrix product (256 x 256 x 256), times the number of cores.
+It is measured before and after every other measurement, because the clock of a shared machine varies; the higher of the
+two rates counts.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PRODUCTS = {
 
 
 class Setting(NamedTuple):
-    """What is measured."""
+    """What to measure."""
 
     kind: str  # "update alone" or "training"
     algorithm: str
@@ -36,14 +36,14 @@ class Setting(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What the table calls it."""
+        """The name in the table."""
         parts = [self.kind, "one seed" if self.seeds == 1 else f"{self.seeds} seeds"]
         parts.append("1 core" if self.cores == 1 else f"{self.cores} cores")
         return ", ".join(parts + [f"{self.interval} updates in one dispatch"] * (self.interval > 1))
 
     @property
     def name(self) -> str:
-        """What --only looks in."""
+        """The text that --only searches."""
         return f"{self.title} {self.algorithm}"
 
 
@@ -59,7 +59,7 @@ SETTINGS = [
 
 
 def measure_share(setting: Setting, options: Options) -> list[Row]:
-    """Measure one setting, and the rate of one core before and after."""
+    """Measure one setting, and the rate of one core before and after it."""
     before = one_core_rate(options.lasting(1.0))
     speed = updates_per_second(setting, options)
     row = {
@@ -74,7 +74,7 @@ def measure_share(setting: Setting, options: Options) -> list[Row]:
 
 
 def updates_per_second(setting: Setting, options: Options) -> float:
-    """Measure one setting."""
+    """Measure the updates per second of one setting."""
     if setting.kind == "update alone":
         settings = {"algorithm": setting.algorithm, "interval": setting.interval}
         found = call("benchmarks.updates:measure", setting.cores, seconds=options.lasting(5.0), **settings)
@@ -92,7 +92,7 @@ def share(row: Row) -> float:
 
 
 def render_shares(rows: list[Row]) -> str:
-    """Return a row for each setting, and the rate that the limit is made of."""
+    """Return a row for each setting, and the measured rate of one core."""
     lines = [
         [
             *(setting, algorithm.upper()),
@@ -109,7 +109,7 @@ def render_shares(rows: list[Row]) -> str:
 
 
 def measure_rate(name: str, options: Options) -> list[Row]:
-    """Measure one of the products that occur, in 10⁹ operations per second."""
+    """Measure the rate of one matrix product, in 10⁹ operations per second."""
     first, second = usable_cores()[:2]
     groups = {"one_core": [[first]], "two_cores": [[first, second]], "a_process_on_each": [[first], [second]]}
     rates = {

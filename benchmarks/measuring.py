@@ -1,4 +1,4 @@
-"""How everything here is measured: in processes of their own, which are bound to their cores before they start."""
+"""Measurements in separate processes, which are bound to their cores before they start."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parents[1]
 TASK = stamps.BASE
-NEVER = 1_000_000  # steps of a training that is stopped long before; they size the replay
-ROLLOUT_STEPS = 2048  # of PPO, whose first update is at this step
+NEVER = 1_000_000  # steps of a run that is stopped long before its end; they determine the replay size
+ROLLOUT_STEPS = 2048  # of PPO; its first update is at this step
 
 
 class Launch(NamedTuple):
-    """A command, and the cores that it may use."""
+    """A command and the cores it may use."""
 
     command: Sequence[str]
     cores: Sequence[int]
 
 
 class Window(NamedTuple):
-    """When steps are counted. Steps are environment steps of one seed."""
+    """When steps are counted. All steps are environment steps of one seed."""
 
-    seconds: float = 5.0  # it lasts at least so long
+    seconds: float = 5.0  # minimum length of the window
     warmup: int = 250  # the first update is at this step
-    settled: int = 500  # it begins when every seed has made so many
-    every: int = 50  # steps between two looks at the clock
+    settled: int = 500  # the window begins when every seed has made this many steps
+    every: int = 50  # steps between two time stamps
 
 
 def usable_cores() -> list[int]:
@@ -58,18 +58,18 @@ def surroundings(device: str = "cpu", **variables: str) -> dict[str, str]:
 
 
 class ProcessFailure(RuntimeError):
-    """A measured process ended without an answer; the message is what it printed."""
+    """A measured process ended without an answer; the message contains its output."""
 
 
 @contextmanager
 def started(launches: Sequence[Launch], environment: dict[str, str]) -> Iterator[tuple[Path, list[subprocess.Popen]]]:
-    """Start commands side by side in a temporary folder; at the end each is killed with all that it has started."""
+    """Start commands in parallel in a temporary folder; at the end kill each with all its child processes."""
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder, processes = Path(name), []
         errors = stack.enter_context((folder / "errors").open("w"))
         for number, (command, cores) in enumerate(launches):
             output = stack.enter_context((folder / f"output-{number}").open("w"))
-            bound = ["taskset", "--cpu-list", ",".join(map(str, cores)), *command]  # first: XLA looks for cores once
+            bound = ["taskset", "--cpu-list", ",".join(map(str, cores)), *command]  # first: XLA detects cores once
             options: dict[str, Any] = {"cwd": folder, "env": environment, "process_group": 0}
             processes.append(subprocess.Popen(bound, stdout=output, stderr=errors, **options))
             stack.callback(_kill, processes[-1])
@@ -83,7 +83,7 @@ def _kill(process: subprocess.Popen) -> None:
 
 
 def failure(folder: Path, process: subprocess.Popen) -> ProcessFailure:
-    """Return the error that says what a process of `started` has printed."""
+    """Return an error with the output of a process of `started`."""
     return ProcessFailure(f"{process.args} failed\n{(folder / 'errors').read_text()[-3000:]}")
 
 
@@ -91,10 +91,10 @@ def failure(folder: Path, process: subprocess.Popen) -> ProcessFailure:
 
 
 def answers(launches: Sequence[Launch], device: str = "cpu") -> list[dict[str, Any]]:
-    """Run commands side by side, and return the last line that each prints, which is JSON.
+    """Run commands in parallel, and return the last line that each prints, parsed as JSON.
 
     Raises:
-        ProcessFailure: one of them failed.
+        ProcessFailure: a command failed.
     """
     with started(launches, surroundings(device)) as (folder, processes):
         for process in processes:
@@ -105,17 +105,17 @@ def answers(launches: Sequence[Launch], device: str = "cpu") -> list[dict[str, A
 
 
 def call(function: str, cores: int | None = None, device: str = "cpu", **arguments: Any) -> dict[str, Any]:
-    """Call a `module:function` of this package in a process of its own, by default on all cores."""
+    """Call a `module:function` of this package in a separate process, by default on all cores."""
     return answers([Launch(call_command(function, **arguments), usable_cores()[:cores])], device)[0]
 
 
 def call_command(function: str, **arguments: Any) -> list[str]:
-    """Return the command that calls a `module:function` of this package and prints what it returns."""
+    """Return the command that calls a `module:function` of this package and prints its result."""
     return [sys.executable, "-m", "benchmarks.call", function, json.dumps(arguments)]
 
 
 def time_command(command: Sequence[str], cores: int | None = None, **variables: str) -> float:
-    """Return the seconds from launch to exit. Raises ProcessFailure as `answers`."""
+    """Return the seconds from launch to exit. Raises ProcessFailure like `answers`."""
     began = time.monotonic()
     with started([Launch(command, usable_cores()[:cores])], surroundings(**variables)) as (folder, (process,)):
         if process.wait():
@@ -123,7 +123,7 @@ def time_command(command: Sequence[str], cores: int | None = None, **variables: 
         return time.monotonic() - began
 
 
-# Training, timed by its task.
+# Training, timed by the stamps of its task.
 
 
 def csac_command(
@@ -134,7 +134,7 @@ def csac_command(
     device: str = "cpu",
     task: str = stamps.TASK,
 ) -> list[str]:
-    """Return `csac train` at a preset's settings, without evaluation, and with a short warm-up."""
+    """Return a `csac train` command with a preset, without evaluation and with a short warm-up."""
     given = {"algorithm": algorithm, "preset": preset, "seeds": seeds, "device": device, "directory": "run"}
     given |= {"steps": NEVER, "evaluation-interval": NEVER} | ({} if algorithm == "ppo" else {"warmup-steps": 250})
     words = [word for name, value in given.items() for word in (f"--{name}", str(value))]
@@ -144,25 +144,25 @@ def csac_command(
 def time_training(
     launches: Sequence[Launch], window: Window, seeds: int = 1, device: str = "cpu", **variables: str
 ) -> dict[str, float]:
-    """Train with these commands side by side until the window is over, and return what was measured.
+    """Run these training commands in parallel until the window is over, and return the measurements.
 
-    Its `steps_per_second` are of all seeds together, and the `steps` counted took `cpu_seconds` of all processes;
-    `start_seconds` go from launch to the first update of every seed; `peak_mib` is the resident memory of all
-    processes, where what they share counts for each; `other_load` is how many cores the rest of the machine, its
-    hypervisor included, kept busy meanwhile.
+    `steps_per_second`, `steps` and `cpu_seconds` are totals over all seeds and processes in the window; `start_seconds`
+    is the time from launch to the first update of every seed; `peak_mib` is the resident memory of all processes, with
+    shared memory counted for each; `other_load` is the number of cores kept busy by other programs, including the
+    hypervisor.
 
     Raises:
-        ProcessFailure: a command ended before its window did.
+        ProcessFailure: a command ended before the window.
     """
     with tempfile.TemporaryDirectory() as written:
         told = {stamps.FOLDER: written, stamps.EVERY: str(window.every), "XDG_STATE_HOME": written, **variables}
         launched, busy = time.monotonic(), busy_seconds()
         with started(launches, surroundings(device, **told)) as (folder, processes):
-            used = [(launched, 0.0)]  # when, and the CPU seconds by then
+            used = [(launched, 0.0)]  # time, and CPU seconds until then
             while (speed := speed_of(read_stamps(Path(written)), window, seeds, launched)) is None:
                 if ended := [process for process in processes if process.poll() is not None]:
                     raise failure(folder, ended[0])
-                if time.monotonic() - used[-1][0] > 1.0:  # not often: it takes a hundredth of a second
+                if time.monotonic() - used[-1][0] > 1.0:  # rarely: this takes a hundredth of a second
                     used.append((time.monotonic(), sum(map(_cpu_seconds, _families(processes)))))
                 time.sleep(0.2)
             family = _families(processes)
@@ -178,14 +178,14 @@ def time_training(
 
 
 def read_stamps(folder: Path) -> list[np.ndarray]:
-    """Return the [stamp, (steps, seconds)] of each environment that has written any."""
+    """Return the time stamps [stamp, (steps, seconds)] of each environment that has written any."""
     texts = (path.read_text() for path in sorted(folder.glob("*-*")))
-    whole = (text[: text.rfind("\n") + 1] for text in texts)  # a line may be half written
+    whole = (text[: text.rfind("\n") + 1] for text in texts)  # the last line may be incomplete
     return [np.loadtxt(text.splitlines(), ndmin=2) for text in whole if text]
 
 
 def speed_of(written: list[np.ndarray], window: Window, seeds: int, launched: float) -> dict[str, float] | None:
-    """Return the speed in the window, or None where it is not over yet; between two stamps progress is even."""
+    """Return the speed in the window, or None if it is not over; steps between two stamps are interpolated."""
     own = [stamp for stamp in written if stamp[-1, 0] > window.settled]
     if len(own) < seeds:
         return None
@@ -200,7 +200,7 @@ def speed_of(written: list[np.ndarray], window: Window, seeds: int, launched: fl
 
 
 def busy_seconds() -> float:
-    """Return the seconds that all cores of the machine were busy, or taken by its hypervisor."""
+    """Return the busy seconds of all cores of the machine, including time stolen by the hypervisor."""
     times = psutil.cpu_times()
     return times.user + times.nice + times.system + times.irq + times.softirq + times.steal
 
@@ -227,7 +227,7 @@ def _peak_mib(process: psutil.Process) -> float:
 
 
 def product_rates(product: Product, groups: Sequence[Sequence[int]], seconds: float) -> list[float]:
-    """Return operations per second of a product in several processes, side by side on these cores."""
+    """Return operations per second of a product in parallel processes, one for each group of cores."""
     command = call_command("benchmarks.products:measure", size=product, seconds=seconds)
     return [answer["rate"] for answer in answers([Launch(command, cores) for cores in groups])]
 
@@ -238,7 +238,7 @@ def one_core_rate(seconds: float) -> float:
 
 
 def machine(seconds: float) -> list[str]:
-    """Return what all numbers depend on, a line each: the machine, how fast it multiplies, and the versions."""
+    """Return what all results depend on, one line each: the machine with its arithmetic rate, and the versions."""
     with open("/proc/cpuinfo") as file:
         models = [line.partition(":")[2].strip() for line in file if line.startswith("model name")]
     packages = ", ".join(f"{name} {version(name)}" for name in ("jax", "gymnasium", "mujoco", "numpy"))

@@ -1,4 +1,4 @@
-"""What all benchmarks have in common: options, turns, a CSV of rows with its notes, and a table in a page."""
+"""What all benchmarks share: options, repetitions, a CSV of rows with notes, and a table on a page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 
 class Options(NamedTuple):
-    """What the command line says; `python -m benchmarks --help` tells what each means."""
+    """The options of the command line; `python -m benchmarks --help` explains them."""
 
     only: str = ""
     repetitions: int | None = None
@@ -24,7 +24,7 @@ class Options(NamedTuple):
     device: str = "gpu"
 
     def lasting(self, usual: float) -> float:
-        """Return for how long to measure what usually takes so many seconds."""
+        """Return how many seconds to measure: `usual`, or less with --quick."""
         return 0.3 if self.quick else usual
 
     def window(self, usual: float = 5.0) -> Window:
@@ -34,9 +34,9 @@ class Options(NamedTuple):
 
 @dataclass(frozen=True)
 class Part:
-    """A benchmark with one table: `results/NAME.csv` has its rows, NAME.txt what they depend on.
+    """A benchmark with one table: `results/NAME.csv` holds its rows, NAME.txt its notes.
 
-    `measure` returns the rows of a case. A case is its name, or has one.
+    `measure` returns the rows of a case. A case is a name or an object with an attribute `name`.
     """
 
     name: str
@@ -44,13 +44,13 @@ class Part:
     about: str
     cases: Sequence[Any]
     measure: Callable[[Any, Options], list[Row]]
-    render: Callable[[list[Row]], str] | Mapping[str, str]  # or its columns, by their headings
+    render: Callable[[list[Row]], str] | Mapping[str, str]  # a function, or formats of the columns by heading
     repetitions: int = 1
     notes: Callable[[list[Row]], list[str]] = lambda rows: []
     draw: Callable[[list[Row], Path], None] | None = None
 
     def run(self, options: Options) -> list[Row]:
-        """Measure the cases in turns, A B C A B C; `--quick` measures the first alone."""
+        """Measure the cases in the order A B C A B C; `--quick` measures only the first case, once."""
         chosen = [case for case in self.cases if options.only in getattr(case, "name", case)]
         repetitions = options.repetitions or self.repetitions
         if options.quick:
@@ -66,29 +66,29 @@ class Part:
         return rows
 
     def table(self, rows: list[Row]) -> str:
-        """Return the table, or tables, of these rows in Markdown."""
+        """Return the table or tables of these rows in Markdown."""
         return self.render(rows) if callable(self.render) else formatted(rows, self.render)
 
     def all_notes(self, rows: list[Row], options: Options) -> list[str]:
-        """Return what the numbers depend on, a line each."""
+        """Return what the results depend on, one line each."""
         return [*machine(options.lasting(1.0)), *self.notes(rows)]
 
     def write(self, rows: list[Row], notes: Sequence[str], folder: Path = RESULTS) -> None:
-        """Write the rows, the notes and, where there is one, the picture."""
+        """Write the rows, the notes and the picture, if there is one."""
         write_rows(folder / f"{self.name}.csv", rows)
         (folder / f"{self.name}.txt").write_text("".join(f"{note}\n" for note in notes))
         if self.draw:
             self.draw(rows, folder / f"{self.name}.png")
 
     def block(self, folder: Path = RESULTS) -> str:
-        """Return what stands in the page: the table of the rows that were written, and below it the notes."""
+        """Return the text for the page: the table of the saved rows, and the notes below it."""
         if not (folder / f"{self.name}.csv").exists():
             return f"Not measured yet: `python -m benchmarks {self.name} --write` puts the table here.\n"
         notes = (folder / f"{self.name}.txt").read_text().splitlines()
         return shown(self.table(read_rows(folder / f"{self.name}.csv")), notes)
 
     def publish(self, folder: Path = RESULTS, root: Path = ROOT) -> None:
-        """Put the table into its page."""
+        """Insert the table into its page."""
         page = root / self.page
         page.write_text(between_markers(page.read_text(), self.name, self.block(folder)))
 

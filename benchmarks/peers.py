@@ -1,4 +1,4 @@
-"""Speed of training beside Stable-Baselines3 and SBX: environment steps, each with its update, per second."""
+"""Training speed compared with Stable-Baselines3 and SBX: environment steps, each with its update, per second."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PYTHON = os.environ.get("PEERS_PYTHON") or str(ROOT / ".venv-peers" / "bin" / "python")
-ENGINES = {"csac": "XLA", "sbx": "XLA", "sb3": "PyTorch"}  # XLA takes the cores that it is bound to
+ENGINES = {"csac": "XLA", "sbx": "XLA", "sb3": "PyTorch"}  # XLA uses the cores it is bound to
 PACKAGES = ("stable_baselines3", "torch", "sbx-rl", "jax", "gymnasium", "mujoco", "numpy")
-QUIET = 0.2  # cores that other programs may keep busy
+QUIET = 0.2  # cores that other programs may keep busy on a quiet machine
 
 SINGLE, SINGLE_ONE_CORE, FIVE = "one seed, 2 cores", "one seed, 1 core", "five seeds, 2 cores"
 TD3, PPO = "TD3, one seed, 2 cores", "PPO, one seed, 2 cores"
 
 
 class Case(NamedTuple):
-    """One contender in one setting. The first of a setting is what the others are compared with."""
+    """One contender in one setting; the others are compared with the first of the setting."""
 
     setting: str
     contender: str
@@ -34,29 +34,29 @@ class Case(NamedTuple):
     algorithm: str = "sac"
     seeds: int = 1
     cores: int = 2
-    processes: int = 1  # side by side, the cores divided among them
-    threads: int = 0  # of PyTorch; 0 for one on each core
+    processes: int = 1  # in parallel, sharing the cores
+    threads: int = 0  # of PyTorch; 0: one per core
 
     @property
     def name(self) -> str:
-        """What --only looks in."""
+        """The text that --only searches."""
         return f"{self.setting}: {self.contender}"
 
     @property
     def threads_each(self) -> int:
-        """Threads, or cores, of each process."""
+        """Threads or cores per process."""
         return self.threads or self.cores // self.processes
 
     @property
     def allowed(self) -> str:
-        """What does its arithmetic, and on how much of the machine."""
+        """The arithmetic backend, and its threads or cores."""
         unit = "thread" if ENGINES[self.library] == "PyTorch" else "core"
         plural, each = "s" * (self.threads_each > 1), " each" * (self.processes > 1)
         return f"{ENGINES[self.library]}, {self.threads_each} {unit}{plural}{each}"
 
     @property
     def command(self) -> list[str]:
-        """How one of its processes is started."""
+        """The command that starts one process."""
         if self.library == "csac":
             return csac_command(self.algorithm, seeds=self.seeds)
         words = f"--library {self.library} --algorithm {self.algorithm} --threads {self.threads_each}".split()
@@ -80,12 +80,12 @@ CASES = [
     Case(PPO, "csac PPO", "csac", "ppo"),
     Case(PPO, "SBX PPO", "sbx", "ppo"),
     Case(PPO, "SB3 PPO", "sb3", "ppo"),
-    Case(PPO, "SB3 PPO, 1 thread", "sb3", "ppo", threads=1),  # its networks are so small that one may do better
+    Case(PPO, "SB3 PPO, 1 thread", "sb3", "ppo", threads=1),  # with such small networks one thread may be faster
 ]
 
 
 def measure(case: Case, options: Options) -> list[Row]:
-    """Train one contender for a while.
+    """Measure the training speed of one contender.
 
     Raises:
         InputError: the peers are not installed.
@@ -99,7 +99,7 @@ def measure(case: Case, options: Options) -> list[Row]:
 
 
 def window(case: Case, options: Options) -> Window:
-    """Return when steps are counted: five seeds take turns, and PPO's windows are whole rollouts with their updates."""
+    """Return when steps are counted: longer for five seeds, in whole rollouts with their updates for PPO."""
     counted = options.window(20.0 if case.seeds > 1 else 5.0)
     if case.algorithm == "ppo":
         return counted._replace(warmup=ROLLOUT_STEPS, settled=ROLLOUT_STEPS, every=ROLLOUT_STEPS)
@@ -107,7 +107,7 @@ def window(case: Case, options: Options) -> Window:
 
 
 def notes(rows: list[Row]) -> list[str]:
-    """Return what the numbers depend on beside the machine."""
+    """Return what the results depend on besides the machine."""
     loads = [row["other_load"] for row in rows]
     quiet = "" if max(loads) <= QUIET else ": **not a quiet machine**"
     return [
@@ -124,7 +124,7 @@ def _versions() -> str:
 def ratios(
     rows: Sequence[Row], setting: str, contender: str, peer: str, column: str = "steps_per_second"
 ) -> list[float]:
-    """Return the ratio of their speeds, one for each repetition that has both."""
+    """Return the speed ratio of contender and peer for each repetition that has both."""
     ours, theirs = (
         {row["repetition"]: row[column] for row in rows if (row["setting"], row["contender"]) == key}
         for key in ((setting, contender), (setting, peer))
@@ -133,7 +133,7 @@ def ratios(
 
 
 def render(rows: Sequence[Row]) -> str:
-    """Return a row for each contender of each setting."""
+    """Return a table with a row for each contender of each setting."""
     lines = []
     for (setting, contender), mine in grouped(rows, "setting", "contender").items():
         first = next(row["contender"] for row in rows if row["setting"] == setting)

@@ -1,4 +1,4 @@
-"""What a trained policy costs beside SB3's, on one core: one action of an exported policy, and an evaluation."""
+"""Inference cost compared with SB3, on one core: one action of an exported policy, and an evaluation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EPISODES = 10  # of 1,000 steps each
 
 
 class Case(NamedTuple):
-    """A way to ask a policy: a format of csac's, or one of SB3's ways."""
+    """A way to run a policy: one of csac's export formats, or one of SB3's ways."""
 
     name: str
     format: str = ""
@@ -35,7 +35,7 @@ EVALUATIONS = [Case("`csac.evaluate`"), Case("SB3's `evaluate_policy`", way="eva
 
 
 def ask_sb3(way: str, count: int) -> list[Row]:
-    """Return what SB3's script says; nothing where there are no peers."""
+    """Return the answer of SB3's script; nothing if the peers are not installed."""
     if not Path(PYTHON).exists():
         print(f"SB3, {way}: there is no {PYTHON} (make peers)")
         return []
@@ -44,7 +44,7 @@ def ask_sb3(way: str, count: int) -> list[Row]:
 
 
 def measure_latency(case: Case, options: Options) -> list[Row]:
-    """Return the percentiles of one process, in microseconds."""
+    """Return latency percentiles of one process, in microseconds."""
     calls = 2_000 if options.quick else 100_000
     if case.way:
         return [{"policy": case.name, **found} for found in ask_sb3(case.way, calls)]
@@ -52,7 +52,7 @@ def measure_latency(case: Case, options: Options) -> list[Row]:
 
 
 def latency(format: str, calls: int) -> dict[str, float]:
-    """Export a policy of SAC's size that has learnt nothing, and return percentiles of single calls."""
+    """Export an untrained policy of SAC's size, and return percentiles of single calls in microseconds."""
     import numpy as np
 
     from csac.cli import main
@@ -83,7 +83,7 @@ def measure_evaluation(case: Case, options: Options) -> list[Row]:
 
 
 def evaluation(episodes: int) -> dict[str, float]:
-    """Return the seconds of so many episodes, the environments made before."""
+    """Return the seconds for the episodes, without creating the environments."""
     import csac
 
     train_briefly()
@@ -95,7 +95,7 @@ def evaluation(episodes: int) -> dict[str, float]:
 
 
 def render_latencies(rows: list[Row]) -> str:
-    """Return the medians over repetitions, and how many times csac's artefact in C is faster."""
+    """Return the medians over repetitions, and each p50 as a multiple of the first policy's."""
     policies = {name: mine for (name,), mine in grouped(rows, "policy").items()}
     first = statistics.median(row["p50"] for row in next(iter(policies.values())))
     lines = []
@@ -106,7 +106,7 @@ def render_latencies(rows: list[Row]) -> str:
 
 
 def render_evaluations(rows: list[Row]) -> str:
-    """Return the medians and ranges."""
+    """Return the median seconds and their range."""
     lines = [
         [name, str(mine[0]["episodes"]), with_range([row["seconds"] for row in mine], ".2f")]
         for (name,), mine in grouped(rows, "evaluation").items()

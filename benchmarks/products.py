@@ -1,8 +1,8 @@
 """The matrix products that one update needs, counted from the equations, and how fast this machine multiplies.
 
-Forward passes, gradients of weights, and gradients of inputs where something learns from them are counted, and not what
-a compiled program happens to do: that would reward waste. Activations, Adam, noise and the draw from the replay count
-as nothing.
+Counted are forward passes, gradients of weights, and gradients of inputs that something learns from. Counting the
+operations of the compiled program instead would reward waste. Activations, Adam, noise and sampling from the replay are
+not counted.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 OBSERVATION, ACTION = 17, 6  # of HalfCheetah-v4
 BATCH = 256
-TOGETHER = 20  # products in one dispatch: a single one would be over before the clock can tell
+TOGETHER = 20  # products in one dispatch: a single one is too short to time
 WINDOWS = 10
 
 
@@ -39,25 +39,25 @@ DOMINANT = Product(256, 256, 256)
 
 
 class Network(NamedTuple):
-    """A multilayer perceptron by the widths of its layers, inputs and outputs included."""
+    """A multilayer perceptron, given by its layer widths including inputs and outputs."""
 
     widths: tuple[int, ...]
 
     def forward(self, rows: int) -> Counter[Product]:
-        """Count the outputs of so many examples."""
+        """Count the products of a forward pass for `rows` examples."""
         return Counter(Product(rows, n_in, n_out) for n_in, n_out in self._layers())
 
     def weight_gradient(self, rows: int) -> Counter[Product]:
-        """Count the gradients of all weights, given those of the layers' outputs."""
+        """Count the products for the gradients of all weights, given the gradients of the layers' outputs."""
         return Counter(Product(n_in, rows, n_out) for n_in, n_out in self._layers())
 
     def input_gradient(self, rows: int, inputs: int = 0) -> Counter[Product]:
-        """Count the gradients of every layer's inputs; of the network's own, the first `inputs` of them."""
+        """Count the products for the gradients of hidden layers' inputs and of the network's first `inputs` inputs."""
         wanted = [(inputs, self.widths[1]), *list(self._layers())[1:]]
         return Counter(Product(rows, n_out, n_in) for n_in, n_out in wanted if n_in)
 
     def learning(self, rows: int) -> Counter[Product]:
-        """Count a forward pass and all that its gradient by the weights needs."""
+        """Count a forward pass and the full gradient with respect to the weights."""
         return self.forward(rows) + self.weight_gradient(rows) + self.input_gradient(rows)
 
     def _layers(self) -> Iterator[tuple[int, int]]:
@@ -71,9 +71,9 @@ def update_products(
     observation: int = OBSERVATION,
     action: int = ACTION,
 ) -> dict[Product, float]:
-    """Return how often one update needs each product: TD3's the mean over its delay, SD3's that of both its pairs.
+    """Return how often one update needs each product: for TD3 the mean over its policy delay, for SD3 both pairs.
 
-    CSAC's are those of the paper's Algorithm 1, whose reference is the actor itself: it needs what SAC needs.
+    CSAC is counted as the paper's Algorithm 1, whose reference is the actor itself, so it needs the same as SAC.
     """
     stochastic = Network((observation, *hidden, 2 * action))
     deterministic = Network((observation, *hidden, action))
@@ -106,8 +106,8 @@ def _times(number: int, counts: Counter[Product]) -> Counter[Product]:
 def measure(size: Sequence[int], seconds: float) -> dict[str, float]:
     """Return operations per second of a product of this size in this process: the best of ten windows.
 
-    It is a limit, so everything is in its favour: the operands stay in the caches, and what a window loses to other
-    programs does not count.
+    As a limit it is measured under the best conditions: the operands stay in the caches, and windows slowed by other
+    programs do not count.
     """
     product = Product(*size)
     multiply, rates = _multiplying(product), []
@@ -132,7 +132,7 @@ def _multiplying(size: Product) -> Callable[[], jax.Array]:
     def multiply(left: jax.Array, right: jax.Array) -> jax.Array:
         def again(_: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             operand, product = carry
-            operand = operand.at[0, 0].set(product[0, 0])  # so that each has to wait for the one before it
+            operand = operand.at[0, 0].set(product[0, 0])  # each product depends on the previous one
             return operand, operand @ right
 
         return jax.lax.fori_loop(0, TOGETHER, again, (left, jnp.zeros((len(left), right.shape[1]))))[1]

@@ -1,9 +1,9 @@
-"""Tasks with a clock: every library trains on them, and is timed from outside by what they write.
+"""Tasks that write time stamps, so that every library can be timed from outside.
 
-`csac train benchmarks.stamps:Stamped/HalfCheetah-v4` and the peers' script write a line "steps seconds" for every
-`STAMP_EVERY` steps of an environment into a file of its own in the folder `STAMPS`. A step is over, and the update that
-belongs to it, when the next one begins. The peers have no csac: only Gymnasium is imported here, and with the slow task
-PyFlyt and a file of csac's that needs nothing else.
+`csac train benchmarks.stamps:Stamped/HalfCheetah-v4` and the peers' script write a line "steps seconds" every
+`STAMP_EVERY` steps, into one file per environment in the folder `STAMPS`. A step, including its update, ends when the
+next one begins. csac is not installed for the peers, so this module imports only Gymnasium, and for the slow task
+PyFlyt and a csac file that needs nothing else.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _numbers = itertools.count()
 
 
 class Stamped(gymnasium.Wrapper):
-    """Write when each `STAMP_EVERY` steps were over."""
+    """Write a time stamp every `STAMP_EVERY` steps."""
 
     def __init__(self, environment: gymnasium.Env) -> None:
         super().__init__(environment)
@@ -42,12 +42,12 @@ class Stamped(gymnasium.Wrapper):
 
 
 def make(**arguments: Any) -> gymnasium.Env:
-    """Return a new environment with a clock."""
+    """Return a new environment that writes time stamps."""
     return Stamped(gymnasium.make(BASE, **arguments))
 
 
 def make_waypoints(**arguments: Any) -> gymnasium.Env:
-    """Return a new slow environment with a clock, its observation flat."""
+    """Return a new slow environment with flat observations that writes time stamps."""
     import PyFlyt.gym_envs  # noqa: F401
 
     from csac.tasks.pybullet import FlatWaypoints

@@ -1,4 +1,4 @@
-"""How long `csac` takes to start: to its help, and from launch to the first update of every seed."""
+"""Start-up time of `csac`: of its help, and from launch to the first update of every seed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from benchmarks.tables import Row, grouped, table, with_range
 
 
 class Start(NamedTuple):
-    """A command that trains nothing, or training with so many seeds."""
+    """A command without training, or training with this many seeds."""
 
     name: str
     arguments: tuple[str, ...] = ()
@@ -38,7 +38,7 @@ STARTS = [
 
 
 def measure(start: Start, options: Options) -> list[Row]:
-    """Return the seconds of a command, or those to the first update with nothing kept and with the programs kept."""
+    """Return the seconds of a command, or the seconds to the first update without and with cached programs."""
     with tempfile.TemporaryDirectory() as cache:
         if start.arguments:
             command = [sys.executable, "-m", "csac", *start.arguments]
@@ -56,7 +56,7 @@ def first_update(seeds: int, cache: str) -> float:
 
 
 def render(rows: list[Row]) -> str:
-    """Return medians, and the smallest and largest."""
+    """Return medians and ranges."""
     starts = grouped(rows, "what").items()
     lines = [[what, with_range([row["seconds"] for row in mine], ".2f")] for (what,), mine in starts]
     return table(["", "seconds"], lines)

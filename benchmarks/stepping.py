@@ -1,4 +1,4 @@
-"""Steps per second of each task alone, with random actions: what is left for learning is less."""
+"""Steps per second of each task with random actions, without learning."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def measure(task: str, options: Options) -> list[Row]:
 
 
 def speed(task: str, seconds: float) -> dict[str, float]:
-    """Return the speed over at least so many seconds and one episode, and the mean length of those that ended."""
+    """Return the speed over at least `seconds` and one episode, and the mean length of finished episodes."""
     from csac.tasks.environment import Environment
 
     environment = Environment(task)
     environment.reset(0)
     generator = np.random.default_rng(0)
     actions = generator.uniform(-1, 1, (1_000, environment.spec.action_size)).astype(np.float32)
-    environment.step(actions[0])  # PyFlyt compiles in its first steps
+    environment.step(actions[0])  # PyFlyt compiles during its first steps
     environment.reset(0)
     steps, in_episodes, episodes, began = 0, 0, 0, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds or not episodes:

@@ -1,6 +1,6 @@
-"""From measurements to files: rows in CSV, and tables in Markdown between the markers of a page.
+"""Writing measurements to files: rows in CSV, and tables in Markdown between the markers of a page.
 
-A row is a dictionary from column to number or text; all rows of a table have the same columns.
+A row maps column names to numbers or text; all rows of a table have the same columns.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Row: TypeAlias = dict[str, Any]
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows in the order in which they were measured, numbers with six digits."""
+    """Write rows in the given order, with six significant digits."""
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
@@ -26,7 +26,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Return what `write_rows` wrote."""
+    """Return the rows that `write_rows` wrote."""
     with path.open(newline="") as file:
         return [{key: _value(text) for key, text in line.items()} for line in csv.DictReader(file)]
 
@@ -47,12 +47,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def formatted(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """Return a Markdown table whose columns have a heading and a format that names columns of the row."""
+    """Return a Markdown table; `columns` maps each heading to a format string over the columns of a row."""
     return table(list(columns), [[form.format_map(row) for form in columns.values()] for row in rows])
 
 
 def grouped(rows: Sequence[Row], *columns: str) -> dict[tuple, list[Row]]:
-    """Return the rows by what they have in these columns, in the order of their first rows."""
+    """Group the rows by their values in these columns, in the order of first occurrence."""
     groups: dict[tuple, list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[column] for column in columns), []).append(row)
@@ -60,16 +60,16 @@ def grouped(rows: Sequence[Row], *columns: str) -> dict[tuple, list[Row]]:
 
 
 def with_range(values: Sequence[float], form: str, unit: str = "") -> str:
-    """Return the median, and in brackets the smallest and the largest where there are several."""
+    """Return the median and, if there are several values, their range in brackets."""
     median = f"{statistics.median(values):{form}}{unit}"
     return f"{median} ({min(values):{form}} to {max(values):{form}})" if len(values) > 1 else median
 
 
 def between_markers(page: str, name: str, text: str) -> str:
-    """Return a page with a text between its lines `<!-- name: begin -->` and `<!-- name: end -->`.
+    """Return the page with the text between its lines `<!-- name: begin -->` and `<!-- name: end -->` replaced.
 
     Raises:
-        ValueError: it lacks them.
+        ValueError: the page lacks these lines.
     """
     begin, end = (f"<!-- {name}: {edge} -->" for edge in ("begin", "end"))
     before, found, rest = page.partition(f"{begin}\n")

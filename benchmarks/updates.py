@@ -1,4 +1,4 @@
-"""Updates of one learner without an environment: the same transition again and again."""
+"""Updates of one learner without an environment, on the same transition repeatedly."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ HALF_CHEETAH = Spec(17, 6)
 def make_learner(
     algorithm: str, spec: Spec = HALF_CHEETAH, seeds: int = 1, preset: str = "paper", **changes: Any
 ) -> Learner:
-    """Return a learner at a preset's settings but for `changes`, whose warm-up is over at once."""
+    """Return a learner without warm-up, with the settings of a preset and `changes`."""
     settings: dict[str, Any] = {**hyperparameters(preset, algorithm, TASK), "warmup_steps": 0, **changes}
     return Learner(ALGORITHMS[algorithm](**settings), spec, range(seeds), settings["replay_size"])
 
 
 class Driver:
-    """Give a learner transitions: of the environment, without one."""
+    """Feed transitions to a learner in place of an environment."""
 
     def __init__(self, learner: Learner, seeds: int = 1) -> None:
         self.learner, self.step = learner, 0
@@ -49,7 +49,7 @@ class Driver:
         self.actions = self.learner.step(observation, self.actions, outcome, self.step)
 
     def run(self, seconds: float, interval: int = 1) -> float:
-        """Make whole intervals for at least so long, and return environment steps per second."""
+        """Make whole intervals of steps for at least `seconds`, and return environment steps per second."""
         first, began = self.step, time.perf_counter()
         while (elapsed := time.perf_counter() - began) < seconds or self.step == first:
             for _ in range(interval):
@@ -66,7 +66,7 @@ def measure(
     batch: int = 256,
     replay: int = 1_000_000,
 ) -> dict[str, float]:
-    """Return updates per second, `interval` of them in one dispatch, and the peak of the memory in MiB."""
+    """Return updates per second, with `interval` updates per dispatch, and the peak memory in MiB."""
     changes: dict[str, Any] = {"actor_hidden_sizes": (width,) * 2, "critic_hidden_sizes": (width,) * 2}
     changes |= {"batch_size": batch, "replay_size": replay, "update_interval": interval}
     driver = Driver(make_learner(algorithm, Spec(observation, 6), **changes))

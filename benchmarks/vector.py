@@ -1,4 +1,4 @@
-"""Several environments for each seed, beside one and beside Stable-Baselines3: environment steps of all per second."""
+"""Several environments per seed, compared with one and with Stable-Baselines3: total environment steps per second."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TASKS = {FAST: stamps.TASK, SLOW: stamps.WAYPOINTS, SAC: stamps.TASK}
 
 
 class Case(NamedTuple):
-    """One contender in one setting. The first of a setting is what the others are compared with."""
+    """One contender in one setting; the others are compared with the first of the setting."""
 
     setting: str
     library: str
@@ -27,19 +27,19 @@ class Case(NamedTuple):
 
     @property
     def contender(self) -> str:
-        """What the table calls it."""
+        """The name in the table."""
         how = f", in {self.processes} processes" if self.processes else ""
         plural = "s" if self.environments > 1 else ""
         return f"{self.library}, {self.environments} environment{plural}{how}"
 
     @property
     def name(self) -> str:
-        """What --only looks in."""
+        """The text that --only searches."""
         return f"{self.setting}: {self.contender}"
 
     @property
     def command(self) -> list[str]:
-        """How it is started."""
+        """The command that starts it."""
         algorithm, numbers = self.setting.split(",")[0].lower(), (str(self.environments), str(self.processes))
         if self.library == "csac":
             words = "--environments", numbers[0], "--environment-processes", numbers[1]
@@ -64,7 +64,7 @@ CASES = [
 
 
 def measure(case: Case, options: Options) -> list[Row]:
-    """Train one contender on two cores for a while. Raises ProcessFailure."""
+    """Measure the training speed of one contender on two cores. Raises ProcessFailure."""
     found = time_training([Launch(case.command, usable_cores()[:2])], window(case, options), case.environments)
     per_cpu_second = found["steps"] / found["cpu_seconds"]
     row = {"setting": case.setting, "contender": case.contender, **found}
@@ -72,7 +72,7 @@ def measure(case: Case, options: Options) -> list[Row]:
 
 
 def window(case: Case, options: Options) -> Window:
-    """Return when steps are counted, those of each environment: PPO's windows are whole rollouts with their updates."""
+    """Return when the steps of each environment are counted: for PPO in whole rollouts with their updates."""
     if case.setting == SAC:
         warmup, settled = (-(-steps // case.environments) for steps in (250, 500))
         return Window(options.lasting(5.0), warmup, settled, every=20)
@@ -81,7 +81,7 @@ def window(case: Case, options: Options) -> Window:
 
 
 def render(rows: Sequence[Row]) -> str:
-    """Return a row for each contender of each setting."""
+    """Return a table with a row for each contender of each setting."""
     lines = []
     for (setting, contender), mine in grouped(rows, "setting", "contender").items():
         first = next(row["contender"] for row in rows if row["setting"] == setting)

@@ -1,4 +1,4 @@
-"""Begin with demonstrations: a controller of one line shows SAC that there is a flag, which it hardly finds by itself.
+"""Start with demonstrations: a one-line controller shows SAC the flag, which it rarely finds by itself.
 
 python examples/demonstrations.py
 """
@@ -14,12 +14,12 @@ TASK = "MountainCarContinuous-v0"
 
 
 def controller(observation):
-    """Return the push: where the car is moving, so that it gains energy."""
+    """Push in the direction of motion, so that the car gains energy."""
     return np.sign(observation[1:])
 
 
 def demonstrate(episodes):
-    """Return the controller's transitions, which np.savez would make a file of, and its mean return."""
+    """Return the controller's transitions, in the format of a file from np.savez, and its mean return."""
     steps, environment = [], gymnasium.make(TASK)
     for episode in range(episodes):
         observation, _ = environment.reset(seed=episode)
@@ -40,7 +40,7 @@ def main(directory, steps, episodes):
     print(f"the controller: {mean_return:.0f}")
     settings = {"steps": steps, "evaluation_interval": max(steps // 5, 1)}
     for name, given in (("without", None), ("with", demonstrations)):
-        # With demonstrations there is something to learn from at once.
+        # Demonstrations make random warm-up steps unnecessary.
         algorithm = SAC(warmup_steps=0 if given else 500)
         run = train(algorithm, TASK, directory=f"{directory}/{name}", demonstrations=given, **settings)
         rows = run.evaluations

@@ -1,6 +1,6 @@
-"""Film trained policies side by side, as an animated GIF, without a display.
+"""Film trained policies side by side as an animated GIF, without a display.
 
-The one in README is of these runs:
+These runs give the film in README:
 
 csac train Walker2d-v4 --algorithm sac --preset strong --first-seed 300 --steps 300000 --directory runs/film/walker
 csac train HalfCheetah-v4 --algorithm sac --preset strong --first-seed 300 --steps 300000 --directory runs/film/cheetah
@@ -19,11 +19,11 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from csac.evaluation.play import play
 from csac.record.sets import RunSet
 
-SIZE, FRAMES_PER_SECOND = 260, 20  # pixels, of each run's square
+SIZE, FRAMES_PER_SECOND = 260, 20  # SIZE: pixels of each run's square
 
 
 def film(runs: Sequence[Path], out: Path, begin: float = 1.0, seconds: float = 4.0) -> None:
-    """Write what each run's policy does, from `begin` seconds on, into one GIF."""
+    """Film each run's policy from `begin` seconds on, in one GIF."""
     with tempfile.TemporaryDirectory() as folder:
         inputs: list[str] = []
         for index, run in enumerate(runs):
@@ -47,7 +47,7 @@ def film(runs: Sequence[Path], out: Path, begin: float = 1.0, seconds: float = 4
 
 
 def beside(count: int) -> str:
-    """Return ffmpeg's filter that makes squares of videos and sets them side by side, in colours of their own."""
+    """Return the ffmpeg filter that crops videos to squares, joins them in a row and computes a palette."""
     square = f"fps={FRAMES_PER_SECOND},crop='min(iw,ih)':'min(iw,ih)',scale={SIZE}:{SIZE}:flags=lanczos"
     squares = ";".join(f"[{index}:v]{square}[square{index}]" for index in range(count))
     row = "".join(f"[square{index}]" for index in range(count)) + f"hstack=inputs={count}"

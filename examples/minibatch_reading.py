@@ -1,9 +1,9 @@
-"""What Algorithm 1's relative entropy leaves over when it is read with mini-batches.
+"""What remains of the relative entropy if Algorithm 1 is read with mini-batches.
 
-The reference is then the actor itself at the moment both gradients are taken. This prints, for policies that get
-sharper and sharper, the mean and the standard deviation over the action noise of the actor loss's gradient with respect
-to the mean of the Gaussian: with `sampled`, with `closed_form`, and for SAC (weight 0). Expectations are exact up to
-rounding (Gauss-Hermite quadrature).
+The reference is then the actor itself when both gradients are taken. For ever narrower policies, this prints the
+gradient of the actor loss with respect to the mean of the Gaussian, as mean and standard deviation over the action
+noise: with `sampled`, with `closed_form`, and for SAC (weight 0). Expectations are exact up to rounding (Gauss-Hermite
+quadrature).
 
     python examples/minibatch_reading.py
 """
@@ -21,12 +21,12 @@ NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(64)
 
 
 def constant_policy(mean: float, std: float) -> MLP:
-    """Return an actor that gives the same one-dimensional Gaussian everywhere."""
+    """Return an actor with the same one-dimensional Gaussian for every observation."""
     return MLP((Layer(jnp.zeros((1, 2)), jnp.array([mean, np.log(std)])),))
 
 
 def flat_critics() -> tuple[MLP, MLP]:
-    """Return critics that say nothing, so that only the regularisers are left."""
+    """Return critics that are 0 everywhere, so that only the regularisers act."""
     critic = MLP((Layer(jnp.zeros((2, 1)), jnp.zeros(1)),))
     return critic, critic
 

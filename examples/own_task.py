@@ -1,4 +1,4 @@
-"""A task of one's own: a cart is pushed to a place on a rail. With success, events, and snapshots for exact resume.
+"""A custom task: push a cart to a goal on a rail. With success, events, and snapshots for exact resume.
 
 python examples/own_task.py
 """
@@ -13,16 +13,16 @@ from csac import SAC, evaluate, load, train
 
 
 class Rail(gymnasium.Env):
-    """Push a cart to `goal`, both in [-1, 1]; it succeeds when it is there, and fails at the ends of the rail."""
+    """Push a cart to `goal`, both in [-1, 1]; success at the goal, failure beyond the ends of the rail."""
 
     observation_space = Dict(
-        cart=Box(-np.inf, np.inf, (2,), np.float32),  # place, speed
+        cart=Box(-np.inf, np.inf, (2,), np.float32),  # position, speed
         goal=Box(-1.0, 1.0, (1,), np.float32),
     )
     action_space = Box(-1.0, 1.0, (1,), np.float32)
 
     def reset(self, *, seed=None, options=None):
-        """Start in the middle, with a goal that the seed decides."""
+        """Start in the middle, with a goal drawn from the seed."""
         super().reset(seed=seed)
         self.cart = np.zeros(2)
         self.goal = self.np_random.uniform(-0.8, 0.8, 1)
@@ -39,35 +39,35 @@ class Rail(gymnasium.Env):
         distance = abs(self.cart[0] - self.goal[0])
         arrived = distance < 0.05 and abs(self.cart[1]) < 0.1
         off = abs(self.cart[0]) > 1.0
-        # `is_success` is known to csac; the others are events, by name.
+        # csac recognises `is_success`; the others are events, selected by name.
         info = {"is_success": arrived, "off_the_rail": off, "reversals": self.reversals}
         return self.observe(), -distance - 10.0 * off, arrived or off, False, info
 
     def observe(self):
-        """Return the parts by name; csac puts them side by side in the order of their names."""
+        """Return the parts by name; csac concatenates them in alphabetical order."""
         return {"cart": self.cart.astype(np.float32), "goal": self.goal.astype(np.float32)}
 
     def get_snapshot(self):
-        """Return what an episode in progress needs: arrays by name, and what JSON can hold."""
+        """Return the state of the current episode: arrays by name, and JSON values."""
         return {"cart": self.cart, "goal": self.goal}, {"reversals": self.reversals, "last_push": self.last_push}
 
     def set_snapshot(self, arrays, values):
-        """Go on where `get_snapshot` was called, after a reset with the episode's seed."""
+        """Restore this state, after a reset with the episode's seed."""
         self.cart, self.goal = arrays["cart"].copy(), arrays["goal"].copy()
         self.reversals, self.last_push = values["reversals"], values["last_push"]
 
 
-# From now on `csac train own_task:Rail-v0 --events off_the_rail,reversals` works too, in this folder.
+# This also enables `csac train own_task:Rail-v0 --events off_the_rail,reversals` in this folder.
 gymnasium.register("Rail-v0", entry_point=lambda **options: Rail(**options), max_episode_steps=100)
 
 
 def make_task():
-    """Make the task as `train` is to see it: any wrapper can go around it here."""
+    """Create the task for `train`; add any wrappers here."""
     return gymnasium.make("Rail-v0")
 
 
 def main(directory, steps):
-    """Train, and say how often the cart arrives in fresh episodes."""
+    """Train, print success and events, and evaluate on fresh episodes."""
     algorithm = SAC(warmup_steps=500, actor_hidden_sizes=(64, 64), critic_hidden_sizes=(64, 64), batch_size=64)
     events = ("off_the_rail", "reversals")
     run = train(algorithm, make_task, steps=steps, directory=directory, evaluation_interval=1_000, events=events)

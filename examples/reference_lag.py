@@ -1,12 +1,12 @@
-"""How much each reference policy slows improvement down: what theory predicts beside what is measured.
+"""How much each reference policy slows improvement: theory compared with measurement.
 
     python examples/reference_lag.py
 
-The first table is in refreshes: iterations of conservative value iteration, each with its exact improvement, in a small
-random task (tests/algorithms/test_csac_theory.py shows that CSAC's equations are those). The others are in updates:
-descent on CSAC's actor loss with its reference policies. In the second Q always pulls one way, in the third the bracket
-has a best policy, exp(Q/sigma), and the distance to it is halved; both are plain gradient descent. The fourth is the
-second with Adam.
+The first table counts refreshes: iterations of conservative value iteration with exact improvement, in a small random
+task (tests/algorithms/test_csac_theory.py shows that CSAC's equations are the same). The other tables count updates:
+descent on CSAC's actor loss with its reference policies. In the second table the gradient of Q is constant; in the
+third there is a best policy, exp(Q/sigma), and the distance to it is halved; both use plain gradient descent. The
+fourth is the second with Adam.
 """
 
 from collections.abc import Callable
@@ -22,8 +22,8 @@ from csac.algorithms.networks import MLP
 from csac.types import Layer
 
 STATES, ACTIONS = 10, 5
-PULL = 0.01  # slope of the Q that rises evenly with the mean
-NOISE = 0.05  # standard deviation of the noise in the gradient that Adam is given
+PULL = 0.01  # slope of the Q that is linear in the mean
+NOISE = 0.05  # standard deviation of the gradient noise with Adam
 
 
 class Weights(NamedTuple):
@@ -34,7 +34,7 @@ class Weights(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A reference policy and the number that belongs to it."""
+    """A reference policy and its period or rate."""
 
     policy: Literal["periodic", "average"]
     period: int = 1000
@@ -52,7 +52,7 @@ CHOICES = (
 
 
 def conservative_value_iteration(alpha: float, beta: float, discount: float, iterations: int) -> np.ndarray:
-    """Return each P [iteration, state, action] of P ← r + γ E[m P] + α (P - m P), with m P = log Σ exp(βP) / β."""
+    """Return all P [iteration, state, action] of P ← r + γ E[m P] + α (P - m P), with m P = log Σ exp(βP) / β."""
     generator = np.random.default_rng(0)
     reward = generator.normal(size=(STATES, ACTIONS))
     dynamics = generator.dirichlet(np.ones(STATES), size=(STATES, ACTIONS))
@@ -66,7 +66,7 @@ def conservative_value_iteration(alpha: float, beta: float, discount: float, ite
 
 
 def contraction(sigma: float, tau: float, discount: float) -> float:
-    """Return the factor by which an iteration shrinks the distance to the end, once the first ones are over."""
+    """Return the factor by which an iteration shrinks the distance to the limit, after a transient."""
     alpha, beta = tau / (tau + sigma), 1.0 / (tau + sigma)
     iterations = int(12 / -np.log(max(alpha, discount)))  # until e⁻¹² of it is left
     preferences = conservative_value_iteration(alpha, beta, discount, 3 * iterations)
@@ -76,17 +76,17 @@ def contraction(sigma: float, tau: float, discount: float) -> float:
 
 
 def longest_lag(choice: Choice) -> float:
-    """Return how many updates ago the policy was where its reference is; of a period, when that is over."""
+    """Return how many updates the reference lags behind the policy; for a period, at its end."""
     if choice.policy == "average":
         return 1.0 / choice.rate
     return choice.period if choice.period > 1 else 0.0
 
 
 def predicted_slow_down(choice: Choice, resistance: float) -> float:
-    """Return how many times longer the same way takes; resistance = learning rate x τ / std².
+    """Return how many times longer the same distance takes; resistance = learning rate x τ / std².
 
-    With the effective lag L of the reference, in updates, it is 1 + L x resistance: L is 1 / rate or, for periods of
-    N, (N - 1) / 2 where the resistance of a period is small, and N where it is large.
+    With the effective lag L of the reference in updates this is 1 + L x resistance. L is 1 / rate or, for periods of N,
+    from (N - 1) / 2, if the resistance over a period is small, to N, if it is large.
     """
     if choice.policy == "periodic":
         return choice.period * resistance / (1.0 - (1.0 - resistance) ** choice.period)
@@ -94,11 +94,11 @@ def predicted_slow_down(choice: Choice, resistance: float) -> float:
 
 
 def predicted_slow_down_with_adam(choice: Choice, tau: float, std: float, learning_rate: float, noise: float) -> float:
-    """Return how many times longer the same way takes with Adam, where its gradient has noise or none at all.
+    """Return how many times longer the same distance takes with Adam, with or without gradient noise.
 
-    Adam divides by the root of the second moment. Where noise dominates that, it is plain descent with the learning
-    rate over the noise. Without noise every step is one learning rate long, until the reference is so far behind that
-    it pulls as hard as Q: by then the pace is that of the reference, pull / (τ L / std²), whatever the learning rate.
+    Adam divides by the root of the second moment. If noise dominates, this is plain descent with the learning rate over
+    the noise. Without noise every step is one learning rate long, until the reference lags so far that it pulls as hard
+    as Q. From then on the speed is pull / (τ L / std²), independent of the learning rate.
     """
     if noise:
         return predicted_slow_down(choice, learning_rate / noise * tau / std**2)
@@ -113,7 +113,7 @@ def measured_slow_down(
     updates: int = 6000,
     noise: float = 0.0,
 ) -> float:
-    """Return how many times longer the mean of a Gaussian takes than without relative entropy, after a transient."""
+    """Return how many times slower the mean of a Gaussian moves than without relative entropy, after a transient."""
 
     def speed(weight: float) -> float:
         way = means(choice, Weights(0.0, weight), std, optimiser, updates, even_pull, noise)
@@ -123,13 +123,14 @@ def measured_slow_down(
 
 
 def predicted_half_life(choice: Choice, weights: Weights, std: float, learning_rate: float) -> float:
-    """Return in how many updates half of the distance to exp(Q/σ) is gone, once the first ones are over.
+    """Return how many updates halve the distance to exp(Q/σ), after a transient.
 
-    An update takes the mean by `pull` of the distance to the end and by `resistance` of that to the reference. What is
-    left is an eigenvalue of the two together; after a whole period of `periodic` it is α + (1 - α) (1 - pull -
-    resistance)^N with α = τ / (τ + σ). A lag L that is short beside 1 / pull makes it ln 2 x (1 / pull + τ / σ x L);
-    where it is long, the policy waits for its reference: every L updates are a refresh, which leaves α with
-    `periodic` and takes 1 - α of the way with `average`.
+    An update moves the mean by `pull` times its distance to the limit and by `resistance` times its distance to the
+    reference. With `average` the remaining share per update is an eigenvalue of mean and reference together; with
+    `periodic` a whole period leaves α + (1 - α) (1 - pull - resistance)^N, α = τ / (τ + σ). If the lag L is short
+    compared with 1 / pull, the half-life is ln 2 x (1 / pull + τ / σ x L). If it is long, the policy waits for its
+    reference: every L updates are a refresh, which leaves α with `periodic` and covers 1 - α of the distance with
+    `average`.
     """
     pull, resistance = (float(learning_rate * weight / std**2) for weight in weights)
     if choice.policy == "periodic":
@@ -137,15 +138,15 @@ def predicted_half_life(choice: Choice, weights: Weights, std: float, learning_r
         left = alpha + (1.0 - alpha) * (1.0 - pull - resistance) ** choice.period
         return float(choice.period * np.log(0.5) / np.log(left))
     kept = [choice.rate, 1.0 - choice.rate]
-    together = np.array([[1.0 - pull - resistance, resistance], kept])  # of the mean, and of the kept one
+    together = np.array([[1.0 - pull - resistance, resistance], kept])  # rows: mean, reference
     return float(np.log(0.5) / np.log(np.abs(np.linalg.eigvals(together)).max()))
 
 
 def measured_half_life(choice: Choice, weights: Weights, std: float, learning_rate: float) -> float:
-    """Return in how many updates half of the distance to exp(Q/σ) is gone, measured well after the start."""
+    """Return how many updates halve the distance to exp(Q/σ), measured after a transient."""
     period = choice.period if choice.policy == "periodic" else 1
     periods = int(np.ceil(3 * predicted_half_life(choice, weights, std, learning_rate) / period))
-    updates = 2 * period * periods  # both halves end with a period
+    updates = 2 * period * periods  # both halves end at the end of a period
     way = means(choice, weights, std, optax.sgd(learning_rate), updates, _pull_to_one(weights, std))
     distance = 1.0 - np.asarray(way)
     left = distance[-1] / distance[updates // 2 - 1]
@@ -153,7 +154,7 @@ def measured_half_life(choice: Choice, weights: Weights, std: float, learning_ra
 
 
 def largest_stable_resistance(choice: Choice) -> float:
-    """Return the learning rate x τ / std² from which on plain descent goes to and fro in growing steps."""
+    """Return the learning rate x τ / std² above which plain descent oscillates with growing amplitude."""
     if choice.policy == "average":
         return 2.0 - choice.rate
     return 2.0 if choice.period > 1 else np.inf
@@ -168,9 +169,9 @@ def means(
     critic: Callable,
     noise: float = 0.0,
 ) -> jax.Array:
-    """Return the mean of a Gaussian policy after each update [update] on CSAC's actor loss, from 0.
+    """Return the mean of a Gaussian policy after each update [update] on CSAC's actor loss, starting at 0.
 
-    `noise` is the standard deviation of what is added to the gradient.
+    `noise` is the standard deviation of the noise added to the gradient.
     """
     algorithm = CSAC(
         reference_policy=choice.policy,
@@ -198,12 +199,12 @@ def means(
 
 
 def even_pull(inputs: jax.Array) -> jax.Array:
-    """A Q that rises evenly with the mean."""
+    """A Q that is linear in the mean."""
     return PULL * jnp.arctanh(inputs[1:])
 
 
 def _pull_to_one(weights: Weights, std: float) -> Callable:
-    """Return a Q whose best policy of this entropy has the mean 1 before the tanh, whose volume it takes back."""
+    """Return a Q whose best policy has this std and mean 1 before the tanh; it cancels the tanh's log-determinant."""
 
     def critic(inputs: jax.Array) -> jax.Array:
         action = inputs[1:]
@@ -249,7 +250,7 @@ def main() -> None:
     print(f"reference        | no noise: predicted measured | noise {NOISE}: predicted measured")
     for choice in CHOICES:
         cells = []
-        # Without noise every step goes the same way, and the mean must stay where tanh can be undone.
+        # Without noise all steps have one direction, and the mean must stay where tanh is invertible.
         for noise, updates in ((0.0, 8_000), (NOISE, 40_000)):
             predicted = predicted_slow_down_with_adam(choice, tau, std, learning_rate, noise)
             measured = measured_slow_down(choice, tau, std, optax.adam(learning_rate), updates, noise)
@@ -262,7 +263,7 @@ def _name(choice: Choice) -> str:
 
 
 def _print_by_reference(values: Callable[[Choice, float], tuple[float, float]], decimals: int) -> None:
-    """Print a row for each reference, and for each weight what is predicted beside what is measured."""
+    """Print a row for each reference, with predicted and measured values for each weight."""
     print("reference        | tau = 0.05: predicted measured |  0.5: predicted measured |    5: predicted measured")
     for choice in CHOICES:
         pairs = [values(choice, tau) for tau in (0.05, 0.5, 5.0)]

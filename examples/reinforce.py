@@ -1,4 +1,4 @@
-"""An algorithm of one's own, from the protocol: REINFORCE with normalised returns (Williams 1992)."""
+"""A custom algorithm, written against the protocol: REINFORCE with normalised returns (Williams 1992)."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from csac.types import Cadence, PolicyNetwork, PolicyParameters
 
 
 class State(NamedTuple):
-    """Everything that one seed learns."""
+    """The learnt state of one seed."""
 
     actor: MLP
     optimiser: Any
@@ -30,7 +30,7 @@ class Reinforce:
 
     @property
     def cadence(self):
-        """Steps without learning, steps between updates, updates then, transitions for each."""
+        """Return warm-up steps, steps between updates, updates made then, and transitions per update."""
         return Cadence(0, self.rollout_steps, 1, self.rollout_steps)
 
     def memory(self, spec, steps):
@@ -38,17 +38,17 @@ class Reinforce:
         return Rollout.create(self.rollout_steps, spec)
 
     def init(self, key, spec, steps):
-        """Return what one seed begins with; no two leaves may share a buffer."""
+        """Return the initial state of one seed; no two leaves may share a buffer."""
         actor = make_mlp(key, spec.observation_size, (32, 32), spec.action_size)
         return State(actor, init_optimiser(optax.adam(self.learning_rate), actor))
 
     def act(self, state, observation, key, explore):
-        """Return an action [action], in [-1, 1] where it is legal, for one observation [observation]."""
+        """Return an action [action] for one observation [observation]; legal actions are in [-1, 1]."""
         mean = jnp.tanh(state.actor(observation))
         return mean + self.std * jax.random.normal(key, mean.shape) if explore else mean
 
     def update(self, state, batch, key, step):
-        """Return the state after one update, before which `step` others came, and scalars to log."""
+        """Return the state after update number `step`, counted from 0, and scalars to log."""
 
         def add(later, transition):
             reward, ended = transition
@@ -63,10 +63,10 @@ class Reinforce:
         return State(actor, optimiser), metrics
 
     def loss(self, actor, observation, action, advantage):
-        """Return -A log π(a|s) of one example, but for what is constant."""
+        """Return -A log π(a|s) of one example, without constants."""
         loss = advantage * jnp.sum((action - jnp.tanh(actor(observation))) ** 2) / (2 * self.std**2)
         return loss, {"loss": loss}
 
     def policy(self, state):
-        """Return the deterministic policy as plain layers, which leave without JAX."""
+        """Return the deterministic policy as plain layers, which can be exported without JAX."""
         return PolicyNetwork(PolicyParameters((state.actor.layers,)), state.actor.activation, "tanh")

@@ -1,4 +1,4 @@
-"""A critic of one's own: csac train TASK --algorithm residual:ResidualSAC, in this folder."""
+"""A custom critic: run csac train TASK --algorithm residual:ResidualSAC in this folder."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from csac import SAC
 
 
 class ResidualCritic(eqx.Module):
-    """Q(s, a) of one example, [observation + action] -> [1]."""
+    """Q(s, a) for one example, [observation + action] -> [1]."""
 
     first: eqx.nn.Linear
     block: eqx.nn.Linear
@@ -22,7 +22,7 @@ class ResidualCritic(eqx.Module):
         self.last = eqx.nn.Linear(width, 1, key=keys[2])
 
     def __call__(self, inputs):
-        """Return [Q] of one pair, [observation + action]."""
+        """Return [Q] for one pair [observation + action]."""
         hidden = self.first(inputs)
         return self.last(hidden + self.block(jax.nn.relu(hidden)))
 
@@ -32,5 +32,5 @@ class ResidualSAC(SAC):
     """SAC whose critics have a residual block."""
 
     def make_critic(self, key, spec):
-        """Return a random critic."""
+        """Return a randomly initialised critic."""
         return ResidualCritic(key, spec.observation_size + spec.action_size, self.critic_hidden_sizes[0])

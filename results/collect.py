@@ -1,6 +1,6 @@
 """Add finished runs to a folder of results: `python results/collect.py RUNS results/paper --arm "CSAC (paper)"`.
 
-A run that the folder has already, by arm, task, perturbation and seed, is left as it is.
+Runs whose arm, task, perturbation and seed are already in the folder are skipped.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ DIGITS = {"return": 3, "length": 1, "success": 3}
 
 
 def add(folder: Path, rows: Mapping[str, Any], config: Mapping[str, Any], evaluations: np.ndarray) -> bool:
-    """Append one run: the columns of runs.csv but `run` and `config`, its settings, its evaluations by episode.
+    """Append one run; return whether it was new.
 
-    Return whether it was new.
+    `rows` has the columns of runs.csv except `run` and `config`, `evaluations` a row per episode.
     """
     with (folder / "runs.csv").open(newline="", encoding="utf-8") as file:
         known = list(csv.DictReader(file))
@@ -58,7 +58,7 @@ def add_run(folder: Path, arm: str, run: RunDirectory) -> bool:
 
 
 def _config_name(path: Path, arm: str, config: Mapping[str, Any]) -> str:
-    """Return the name of these settings in configs.json, written there where they are new."""
+    """Return the name of these settings in configs.json; add them if they are new."""
     configs = json.loads(path.read_text(encoding="utf-8"))
     plain = json.loads(json.dumps(config))
     if same := [name for name, known in configs.items() if known == plain]:
@@ -84,7 +84,7 @@ def _mean(rows: np.ndarray, name: str) -> str:
 
 
 def main() -> None:
-    """Add the finished runs at and below the paths."""
+    """Add the finished runs in and below the paths."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("folder", type=Path)

@@ -1,9 +1,9 @@
 """Fill in the tables of the pages in results/ and of docs/results.md, and draw their pictures: `make results`.
 
-A page says in a comment what stands below it: `<!-- table`, lines of TOML, `-->`, and at the end `<!-- end -->`. Their
-`kind` is a function in KINDS, the others are its arguments. Each folder has `runs.csv`, a row for each run,
-`evaluations.csv`, a row for each evaluation, which is the mean over its episodes, and `configs.json`, the settings that
-the column `config` names. Runs that differ in their seed alone are an arm.
+A page describes each table in a comment above it: `<!-- table`, lines of TOML, `-->`; the table ends with
+`<!-- end -->`. In the TOML, `kind` names a function in KINDS; the other keys are its arguments. Each folder has
+`runs.csv` (a row per run), `evaluations.csv` (a row per evaluation, the mean over its episodes) and `configs.json` (the
+settings that the column `config` names). Runs that differ only in their seed form an arm.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from csac.studies.paper import RETURNS
 
 TABLE = re.compile(r"(<!-- table\n(.*?)-->\n).*?(<!-- end -->)", re.DOTALL)
 COLUMNS = [("seed", int), ("step", int), ("return", float), ("success", float)]
-TOLD_SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the time, in the table of returns at equal time
+TOLD_SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the total time, columns of the equal-time table
 Rows = list[dict[str, str]]
 
 
 class Page:
-    """A page, the folder that its files are in, and all runs."""
+    """A page with access to all runs and to the files in its folder."""
 
     def __init__(self, path: Path, runs: dict[tuple[str, str, str], np.ndarray], has_pictures: bool = True) -> None:
         self.path, self.runs, self.has_pictures = path, runs, has_pictures
@@ -59,7 +59,7 @@ class Page:
         return KINDS[told.pop("kind")](self, **told)
 
     def file(self, name: str) -> Path:
-        """Return a file by its path from the page."""
+        """Return a file by its path relative to the page."""
         return self.path.parent / name
 
     def arms(
@@ -70,7 +70,7 @@ class Page:
         until: float = np.inf,
         changed: str = "",
     ) -> dict[str, np.ndarray]:
-        """Return the evaluations of arms, by the names they are shown with; one of a single task needs no `task`."""
+        """Return the evaluations of arms by displayed name; `task` may be omitted for arms with a single task."""
         shown = arms if isinstance(arms, dict) else {arm: arm for arm in arms}
         found = {}
         for label, arm in shown.items():
@@ -100,11 +100,11 @@ def read_runs(directory: Path) -> dict[tuple[str, str, str], np.ndarray]:
     return {key: np.array(rows, COLUMNS) for key, rows in found.items()}
 
 
-# What stands on pages.
+# The kinds of tables.
 
 
 def returns(page: Page, arms: Any, picture: str = "", title: str = "", **chosen: Any) -> str:
-    """Return the returns of arms, and draw their curves."""
+    """Return a table of the returns of arms, and draw their curves."""
     found = page.arms(arms, **chosen)
     if picture and page.has_pictures:
         learning_curve(list(found.items()), page.file(picture), title)
@@ -114,7 +114,7 @@ def returns(page: Page, arms: Any, picture: str = "", title: str = "", **chosen:
 def boundary(
     page: Page, arms: Any, boundary: float, steps: int, picture: str = "", title: str = "", **chosen: Any
 ) -> str:
-    """Return when each seed first reached a return, and draw the curves."""
+    """Return tables of when each seed first reached the boundary, and draw the curves."""
     found = page.arms(arms, **chosen)
     if picture and page.has_pictures:
         learning_curve(list(found.items()), page.file(picture), title)
@@ -122,14 +122,14 @@ def boundary(
 
 
 def finals(page: Page, tasks: list[str], steps: int, **chosen: Any) -> str:
-    """Return the final returns of arms on several tasks."""
+    """Return a table of the final returns of arms on several tasks."""
     found = {task: page.arms(task=task, until=steps, **chosen) for task in tasks}
     lines = [[task, *(plus_minus(measure(rows, steps).final) for rows in found[task].values())] for task in tasks]
     return table(["final return, mean ± std", *found[tasks[0]]], lines)
 
 
 def growth(page: Page, arm: str, tasks: list[str], at: list[int], picture: str, title: str) -> str:
-    """Return the returns of one arm after some steps, the final ones of its seeds, and draw its curve on each task."""
+    """Return an arm's mean returns at some steps and the final return of each seed; draw its curve on each task."""
     found = {task: page.arms([arm], task)[arm] for task in tasks}
     if page.has_pictures:
         learning_curve(list(found.items()), page.file(picture), title)
@@ -142,7 +142,7 @@ def growth(page: Page, arm: str, tasks: list[str], at: list[int], picture: str, 
 
 
 def paired(page: Page, arms: dict[str, str], tasks: list[str], steps: int, seeds: list[int]) -> str:
-    """Return what a second arm gains on the first in runs that both are of, as a share of the first's mean return."""
+    """Return the gain of a second arm over the first on the same seeds, as a share of the first's mean return."""
     first, second = arms
     lines, gains = [], []
     for task in tasks:
@@ -158,7 +158,7 @@ def paired(page: Page, arms: dict[str, str], tasks: list[str], steps: int, seeds
 
 
 def published(page: Page, steps: dict[str, int], ours: str, others: str, seeds: list[int]) -> str:
-    """Return the paper's maximum average returns of CSAC and SAC beside those of two arms, after some steps."""
+    """Return the maximum average returns of CSAC and SAC in the paper and of two arms after some steps."""
     lines, finals = [], []
     for task, until in steps.items():
         arms = page.arms([ours, others], task, seeds, until)
@@ -175,7 +175,7 @@ def published(page: Page, steps: dict[str, int], ours: str, others: str, seeds: 
 def recoveries(
     page: Page, arms: Any, step: int, friction: str = "", picture: str = "", title: str = "", **chosen: Any
 ) -> str:
-    """Return what a change of the friction after a step cost, and draw the curves."""
+    """Return the cost of a change of friction after a step, and draw the curves."""
     found = page.arms(arms, changed=f"friction={friction}@{step}" if friction else "", **chosen)
     if picture and page.has_pictures:
         learning_curve(list(found.items()), page.file(picture), title, [(step, f"friction x {friction}")])
@@ -190,7 +190,7 @@ def study(
     seeds: tuple[int, ...] = (),
     same: dict[str, str] | None = None,
 ) -> str:
-    """Return all tables of a study, or of some of its methods, tasks or seeds; `same` are arms by other names."""
+    """Return all tables of a study, or of some methods, tasks or seeds; `same` maps labels to arms named otherwise."""
     told = tomllib.loads(page.file(file).read_text(encoding="utf-8"))
     labels = methods or [method["label"] for method in told["methods"]]
     first = told.get("first_seed", 0)
@@ -208,7 +208,7 @@ def study(
 
 
 def cases(page: Page, data: str) -> str:
-    """Return how often each event came in 1,000 fresh rollouts of each seed; returns and waypoints are means."""
+    """Return the frequency of each event in 1,000 fresh rollouts per seed; returns and waypoints are means."""
     rows = read_csv(page.file(data))
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     lines = []
@@ -223,7 +223,7 @@ def cases(page: Page, data: str) -> str:
 
 
 def equal_time(page: Page, data: str, peers: list[str], own: dict[str, str], seeds: list[int], picture: str) -> str:
-    """Return what arms have reached in the same time T, and draw it; `own` are csac's, by the names in `data`."""
+    """Return and draw the returns of arms in the same time T; `own` maps csac's names in `data` to its arms."""
     plan, speeds, parts = read_csv(page.file(data)), [], []
     finals: Finals = {}
     drawn: dict[str, dict[str, np.ndarray]] = {}  # [seed, share], by task and arm
@@ -250,9 +250,9 @@ def equal_time(page: Page, data: str, peers: list[str], own: dict[str, str], see
 
 
 def _in_time(rows: np.ndarray, told: Rows, is_own: bool) -> tuple[dict[float, np.ndarray], np.ndarray]:
-    """Return each seed's last evaluation at each share of T, and the mean of those in the last fifth.
+    """Return each seed's last evaluation at each share of T, and its final return, the mean over the last fifth.
 
-    It is the last fifth of a peer's time, but of the steps of an own arm, which is what the other stages judge it by.
+    For a peer this is the last fifth of the time, for an own arm that of its steps, as in the other stages.
     """
     at, _, values = evaluation_matrix(rows)
     reached = {float(row["share"]): values[:, at <= int(row["steps"])][:, -1] for row in told}
@@ -271,7 +271,7 @@ def _against(finals: Finals, label: str, peers: list[str]) -> str:
 
 
 def mechanism(page: Page, data: str, picture: str) -> str:
-    """Return the means over the second half of the runs with one weight, and draw these runs."""
+    """Return means over the second half of the runs with one weight, and draw these runs."""
     arms = {name: rows for name, rows in _columns(page.file(data)).items() if "tau" not in name}
     if page.has_pictures:
         draw_mechanism(page.file(picture), arms)
@@ -281,7 +281,7 @@ def mechanism(page: Page, data: str, picture: str) -> str:
 
 
 def weights(page: Page, data: str, columns: list[str]) -> str:
-    """Return some of these means for the runs with other weights, ordered by weight times lag."""
+    """Return some of these means for runs with different weights, sorted by weight times lag."""
     lines = []
     for name, arm in _columns(page.file(data)).items():
         tau, product = arm["tau"][0], arm["tau"][0] * arm["lag"][0]
@@ -292,7 +292,7 @@ def weights(page: Page, data: str, columns: list[str]) -> str:
 
 
 def _columns(path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Return the columns of each arm in a table whose first column names it."""
+    """Return the columns of a table by arm; its first column names the arm."""
     arms: dict[str, Rows] = {}
     for row in read_csv(path):
         arms.setdefault(row.pop("arm"), []).append(row)
@@ -323,7 +323,7 @@ KINDS = {
 
 
 def main(root: Path = Path(__file__).parents[1], has_pictures: bool = True) -> None:
-    """Make every page of a working copy."""
+    """Fill in every page of a working copy."""
     runs = read_runs(root / "results")
     others = root / "results" / "reference" / "mechanism.md", root / "docs" / "results.md"
     for path in (*sorted(root.glob("results/*/README.md")), *others):

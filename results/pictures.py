@@ -1,4 +1,4 @@
-"""The pictures of the pages in results/ that are no learning curves."""
+"""Pictures of the pages in results/ other than learning curves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def draw_equal_time(path: Path, reached: dict[str, dict[str, np.ndarray]], times: dict[str, list[float]]) -> None:
-    """Draw the mean over seeds and their range against the seconds of training."""
+    """Draw the mean and range over seeds against the seconds of training."""
     figure = _figure(7.5, 4.2)
     for axes, (task, arms) in zip(figure.subplots(1, len(reached), sharey=True), reached.items(), strict=True):
         for colour, (label, values) in zip(COLOURS, arms.items(), strict=True):
@@ -41,7 +41,7 @@ FIGURES = (
 
 
 def draw_mechanism(path: Path, arms: dict[str, dict[str, np.ndarray]]) -> None:
-    """Draw what the relative entropy does along the runs: a colour for each reference, dots for the sampled KL."""
+    """Draw the effect of the relative entropy during the runs: a colour per reference, dotted for the sampled KL."""
     figure = _figure(16, 7.5)
     colours = dict(zip(dict.fromkeys(name.partition(", ")[0] for name in arms), COLOURS, strict=False))
     for axes, (column, title, is_log) in zip(figure.subplots(2, 4).flat, FIGURES, strict=True):

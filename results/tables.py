@@ -1,4 +1,4 @@
-"""The tables of the pages in results/, in Markdown, from rows of evaluations with the columns seed, step and return."""
+"""The Markdown tables of the pages in results/, from evaluations with the columns seed, step and return."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from csac.record.statistics import (
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-WORDS = {"method", "so", "against (bold: counterpart)"}  # headings of columns without numbers, beside the first
-LAST_SHARE = 0.2  # of a run's steps: its evaluations there are its final return
-EARLY = 100_000  # steps at which others publish their returns
-COUNTERPARTS = {"CSAC, candidate": "SAC, candidate"}  # of the other forms of CSAC it is SAC, 0.2
+WORDS = {"method", "so", "against (bold: counterpart)"}  # headings of left-aligned columns besides the first
+LAST_SHARE = 0.2  # of a run's steps; the mean of the evaluations there is the final return
+EARLY = 100_000  # steps, a common length in publications
+COUNTERPARTS = {"CSAC, candidate": "SAC, candidate"}  # for other forms of CSAC: SAC, 0.2
 
 Interval = tuple[float, float] | None
 Finals = dict[str, dict[str, np.ndarray]]  # final returns [seed], by task and arm
 
 
 class Measured(NamedTuple):
-    """What the seeds of one arm on one task have reached."""
+    """The results of the seeds of one arm on one task."""
 
     final: np.ndarray  # [seed]
     early: np.ndarray  # [seed] at 100,000 steps
     drawdown: np.ndarray  # [seed]
-    loss: np.ndarray  # [seed] area lost as a share of the return before a change; without one, the drawdown
+    loss: np.ndarray  # [seed] area lost as a share of the return before a change; the drawdown if nothing changes
     dispersion: float
 
 
@@ -50,14 +50,14 @@ class Measured(NamedTuple):
 
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> str:
-    """Return a table in Markdown, numbers to the right."""
+    """Return a Markdown table with numbers aligned to the right."""
     rules = ["---" if index == 0 or heading in WORDS else "---:" for index, heading in enumerate(headings)]
     lines = [f"| {' | '.join(cells)} |" for cells in (headings, rules, *rows)]
     return "\n".join([f"**{title}**", "", *lines] if title else lines)
 
 
 def number(value: float, largest: float | None = None) -> str:
-    """Return a return as people read it, a small one with three digits; `largest` sets the form of a whole column."""
+    """Format a return, small ones with three digits; `largest` sets the format of a whole column."""
     size = abs(value if largest is None else largest)
     return f"{value:.3g}" if 0 < size < 0.1 else f"{value:,.{1 if size >= 100 else 2}f}"
 
@@ -69,19 +69,19 @@ def plus_minus(values: np.ndarray) -> str:
 
 
 def with_interval(value: float, interval: Interval, form: str = ".3f") -> str:
-    """Return a value with its interval in brackets, if it has one."""
+    """Format a value, with its interval in brackets if there is one."""
     return f"{value:{form}}" + (f" ({interval[0]:{form}} to {interval[1]:{form}})" if interval else "")
 
 
 def verdict(interval: Interval) -> str:
-    """Say what the interval of a probability of improvement says; there is none below five seeds."""
+    """Return the verdict for the interval of a probability of improvement; below five seeds there is no interval."""
     if interval is None:
         return "no verdict"
     return "better" if interval[0] > 0.5 else "worse" if interval[1] < 0.5 else "no significant difference"
 
 
 def comma(values: Sequence[object]) -> str:
-    """Return values in one line."""
+    """Return the values separated by commas."""
     return ", ".join(map(str, values))
 
 
@@ -89,7 +89,7 @@ def comma(values: Sequence[object]) -> str:
 
 
 def returns_table(runs: Mapping[str, np.ndarray]) -> str:
-    """Return what the last three evaluations of each arm are, and how they compare with the first arm's."""
+    """Return a table of the last three evaluations of each arm, compared with the first arm's."""
     scores = [np.array(list(last_evaluations(rows).values())) for rows in runs.values()]
     has_middles = max(map(len, scores)) >= FEWEST_FOR_BOOTSTRAP
     has_success = not any(np.isnan(rows["success"]).any() for rows in runs.values())
@@ -142,7 +142,7 @@ def _form(value: float, spread: float = np.nan) -> str:
 
 
 def recovery_table(runs: Mapping[str, np.ndarray], step: int) -> str:
-    """Return what a change after `step` cost each seed, how it came back, and how two arms of five seeds compare."""
+    """Return each seed's loss and recovery after a change at `step`, and a comparison of two arms of five seeds."""
     headings = ("run", "seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "drawdown")
     lines, told = [], []
     for label, rows in runs.items():
@@ -175,9 +175,9 @@ def _recovery_cells(one: Recovery, largest: float) -> list[str]:
 
 
 def boundary_tables(runs: Mapping[str, np.ndarray], boundary: float, steps: int) -> str:
-    """Return when each seed first reached a return, and how two arms of five seeds compare in that.
+    """Return when each seed first reached the boundary, and a comparison of two arms of five seeds.
 
-    A seed that never does is censored at its last step: two such are equal. The return is that of the last tenth.
+    A seed that never reaches it is censored at its last step; two such seeds tie. Returns are means of the last tenth.
     """
     times, finals, falls, lines = [], [], [], []
     for label, rows in runs.items():
@@ -203,7 +203,7 @@ def _boundary_comparison(
     falls: Sequence[np.ndarray],
     steps: int,
 ) -> str:
-    """Return the first arm against the second: by the steps to the boundary, the return and the drawdown."""
+    """Compare the first arm with the second by the steps to the boundary, the return and the drawdown."""
     censored = [stats.CensoredData(uncensored=t[t <= steps], right=np.full(sum(t > steps), steps)) for t in times]
     difference = stats.ttest_ind(finals[0], finals[1], equal_var=False)
     bounds = difference.confidence_interval()
@@ -221,7 +221,7 @@ def _boundary_comparison(
 
 
 def measure(rows: np.ndarray, steps: int, changed_at: int | None = None) -> Measured:
-    """Return what an arm has reached; a seed's final return is the mean of its evaluations in the last fifth."""
+    """Return the results of an arm; a seed's final return is the mean of its evaluations in the last fifth."""
     at, _, values = evaluation_matrix(rows)
     falls = np.array([drawdown(curve) for curve in values])
     areas = [one.area_lost / abs(one.before) for one in recovery(rows, changed_at).values()] if changed_at else falls
@@ -235,10 +235,10 @@ def measure(rows: np.ndarray, steps: int, changed_at: int | None = None) -> Meas
 
 
 def dispersion_across(returns: np.ndarray) -> float:
-    """Interquartile range over seeds of `returns` [seed, t], averaged over the evaluations that hold every seed.
+    """Interquartile range over seeds of `returns` [seed, t], averaged over the evaluations that include every seed.
 
-    How much the outcome depends on the seed; NaN below two seeds. After Chan et al. 2020, "Measuring the Reliability of
-    Reinforcement Learning Algorithms" (dispersion across runs), without its smoothing.
+    It measures how much the outcome depends on the seed; NaN below two seeds. After Chan et al. 2020, "Measuring the
+    Reliability of Reinforcement Learning Algorithms" (dispersion across runs), without its smoothing.
     """
     together = returns[:, ~np.isnan(returns).any(axis=0)]
     if len(returns) < 2 or not together.size:
@@ -250,7 +250,7 @@ def dispersion_across(returns: np.ndarray) -> float:
 def study_tables(
     title: str, found: Mapping[str, Mapping[str, Measured]], seeds: Sequence[int], is_changed: bool = False
 ) -> list[str]:
-    """Return what each arm has reached on each task, by task and arm, and the comparisons over all tasks."""
+    """Return a table of arms for each task, the scores over all tasks, and the comparisons."""
     finals = {task: {label: one.final for label, one in arms.items()} for task, arms in found.items()}
     losses = {task: {label: one.loss for label, one in arms.items()} for task, arms in found.items()}
     comparisons = _comparison_table(finals, losses, "less area lost" if is_changed else "smaller drawdown")
@@ -268,7 +268,7 @@ def _task_table(task: str, arms: Mapping[str, Measured]) -> str:
 
 
 def overall_table(title: str, finals: Finals) -> str:
-    """Return the scores over all tasks: final returns as shares of the first arm's mean."""
+    """Return a table of scores over all tasks: final returns as shares of the first arm's mean."""
     values = stacked(finals)
     first = next(iter(values))
     lines = []
@@ -286,13 +286,13 @@ def stacked(values: Finals) -> dict[str, np.ndarray]:
 
 
 def compared(values: np.ndarray, others: np.ndarray, repetitions: int = 2_000) -> tuple[str, str]:
-    """Return the probability that the first are higher, with its interval, and the verdict."""
+    """Return the probability that `values` are higher than `others`, with its interval, and the verdict."""
     interval = improvement_interval(values, others, repetitions)
     return with_interval(probability_of_improvement(values, others), interval), verdict(interval)
 
 
 def _comparison_table(finals: Finals, losses: Finals, less: str) -> str:
-    """Compare each form of CSAC with each of SAC, and these with the first; without SAC, all with the first of all."""
+    """Compare forms of CSAC with each SAC, and SACs with the first SAC; without SAC, all arms with the first."""
     final, loss = stacked(finals), stacked(losses)
     forms_of_sac = [label for label in final if label.startswith("SAC")] or list(final)[:1]
     lines = []

@@ -1,12 +1,12 @@
-/* A control loop in C: read the sensors, ask the policy, drive the actuators, at a fixed rate.
+/* A control loop in C: read sensors, run the policy, drive actuators, at a fixed rate.
  *
  *     csac train Pendulum-v1 --steps 20000 --warmup-steps 1000 --directory runs/swing
  *     csac export runs/swing --format c --fallback zero
  *     cc -std=c99 -O2 -I runs/swing/export/c examples/deploy/control_loop.c -o control_loop -lm
  *     ./control_loop < observations.txt > actions.txt
  *
- * Sensors and actuators are standard input and output here, a line for each step. On a robot, write these two functions
- * anew: the rest stays.
+ * Here sensors and actuators are standard input and output, one line per step. For a robot, replace read_sensors and
+ * drive_actuators; the rest stays.
  */
 #define _POSIX_C_SOURCE 200112L
 #include <stdbool.h>
@@ -16,13 +16,13 @@
 #include "policy.h"
 
 #ifndef CSAC_CONTROL_RATE_HZ
-#define CSAC_CONTROL_RATE_HZ 100.0f /* where the task does not say: as often as the policy was trained to act */
+#define CSAC_CONTROL_RATE_HZ 100.0f /* if the task states no rate; use the rate of training */
 #endif
 
 static bool read_sensors(float observation[CSAC_OBSERVATIONS])
 {
     for (int i = 0; i < CSAC_OBSERVATIONS; i++)
-        if (scanf("%f", &observation[i]) != 1) /* "nan" is a number here: a sensor that fails, for the guard */
+        if (scanf("%f", &observation[i]) != 1) /* "nan" is valid: a failed sensor, which the guard handles */
             return false;
     return true;
 }
@@ -46,7 +46,7 @@ static void sleep_until(struct timespec due)
 {
 #ifdef TIMER_ABSTIME
     clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
-#else /* macOS sleeps for a while only, not until a time */
+#else /* macOS cannot sleep until a given time, only for a duration */
     struct timespec now, wait;
     clock_gettime(CLOCK_MONOTONIC, &now);
     wait.tv_sec = due.tv_sec - now.tv_sec;
@@ -62,7 +62,7 @@ static void sleep_until(struct timespec due)
 
 int main(void)
 {
-    static csac_state state = CSAC_INITIAL; /* what the guards remember; csac_reset(&state) where an episode begins */
+    static csac_state state = CSAC_INITIAL; /* memory of the guards; call csac_reset(&state) when an episode begins */
     float observation[CSAC_OBSERVATIONS], action[CSAC_ACTIONS];
     const long period = (long)(1e9f / CSAC_CONTROL_RATE_HZ);
     long steps = 0, missed = 0;
@@ -78,11 +78,11 @@ int main(void)
         clock_gettime(CLOCK_MONOTONIC, &now);
         if (now.tv_sec > due.tv_sec || (now.tv_sec == due.tv_sec && now.tv_nsec > due.tv_nsec)) {
             missed++;
-            due = now; /* go on from here: steps that are late are not made up for by steps that are early */
+            due = now; /* continue from now: do not shorten later steps to catch up */
         } else
             sleep_until(due);
     }
-    /* Actuators keep the last action until somebody tells them another: on a robot, command here what is safe for it. */
+    /* Actuators hold the last action until they get another: on a robot, command a safe action here. */
     fprintf(stderr, "%ld steps at %g Hz, %ld of them too late\n", steps, (double)CSAC_CONTROL_RATE_HZ, missed);
     return 0;
 }

@@ -1,11 +1,11 @@
-"""A control loop in Python, on NumPy alone: read the sensors, ask the policy, drive the actuators, at a fixed rate.
+"""A control loop in Python with NumPy only: read sensors, run the policy, drive actuators, at a fixed rate.
 
     csac train Pendulum-v1 --steps 20000 --warmup-steps 1000 --directory runs/swing
     csac export runs/swing --fallback zero
     python examples/deploy/control_loop.py runs/swing/export/numpy < observations.txt > actions.txt
 
-Neither csac nor JAX is needed: `policy.py` lies in the artefact's folder. Sensors and actuators are standard input and
-output here, a line for each step. On a robot, write these two functions anew: the rest stays.
+It needs neither csac nor JAX: `policy.py` is in the artefact's folder. Here sensors and actuators are standard input
+and output, one line per step. For a robot, replace `read_sensors` and `drive_actuators`; the rest stays.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-USUAL_RATE = 100.0  # Hz, where the task does not say: as often as the policy was trained to act
+USUAL_RATE = 100.0  # Hz, if the task states no rate; use the rate of training
 
 
 def load_policy(folder: Path) -> Any:
-    """Return the policy of an artefact, by the loader beside it."""
+    """Load the policy of an artefact with the loader in its folder."""
     spec = importlib.util.spec_from_file_location("exported_policy", folder / "policy.py")
     assert spec is not None
     assert spec.loader is not None
@@ -32,18 +32,18 @@ def load_policy(folder: Path) -> Any:
 
 
 def read_sensors() -> np.ndarray | None:
-    """Return the observation, float32 [observation], or None where there are no more."""
+    """Return the observation, float32 [observation], or None at the end of input."""
     line = sys.stdin.readline().split()
-    return np.array(line, np.float32) if line else None  # "nan" is a number here: a sensor that fails, for the guard
+    return np.array(line, np.float32) if line else None  # "nan" is valid: a failed sensor, which the guard handles
 
 
 def drive_actuators(action: np.ndarray) -> None:
-    """Take an action, float32 [action]."""
+    """Apply an action, float32 [action]."""
     print(*(f"{value:.9g}" for value in action), flush=True)
 
 
 def main() -> None:
-    """Control until the sensors say nothing more."""
+    """Control until the end of input."""
     policy = load_policy(Path(sys.argv[1]))
     rate = policy.contract["control_rate_hz"] or USUAL_RATE
     steps = missed = 0
@@ -57,8 +57,8 @@ def main() -> None:
             time.sleep(wait)
         else:
             missed += 1
-            due -= wait  # go on from here: steps that are late are not made up for by steps that are early
-    # Actuators keep the last action until somebody tells them another: on a robot, command here what is safe for it.
+            due -= wait  # continue from now: do not shorten later steps to catch up
+    # Actuators hold the last action until they get another: on a robot, command a safe action here.
     print(f"{steps} steps at {rate:g} Hz, {missed} of them too late", file=sys.stderr)
 
 

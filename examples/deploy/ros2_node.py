@@ -1,11 +1,11 @@
-"""A policy as a node of ROS 2: it hears observations on one topic and says actions on another, at a fixed rate.
+"""A policy as a ROS 2 node: it subscribes to observations and publishes actions at a fixed rate.
 
     csac train Pendulum-v1 --steps 20000 --warmup-steps 1000 --directory runs/swing
     csac export runs/swing --fallback zero
     python examples/deploy/ros2_node.py runs/swing/export/numpy
 
-`Controller` is all that a node does, without ROS. Where `rclpy` is installed, `run_with_ros` gives it topics and a
-timer; where it is not, `run_without_ros` plays the robot's part by the task that the policy was trained for.
+`Controller` holds the node's logic, without ROS. If `rclpy` is installed, `run_with_ros` connects it to topics and a
+timer; otherwise `run_without_ros` simulates the robot with the task that the policy was trained on.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from control_loop import USUAL_RATE, load_policy
 
 
 class Controller:
-    """Keeps the newest observation, and has an action for each tick of the clock.
+    """Keeps the newest observation and returns an action at each tick.
 
     Args:
-        folder: of a NumPy artefact, exported with `--fallback`.
+        folder: a NumPy artefact, exported with `--fallback`.
         patience: seconds after which an observation is too old to act on.
     """
 
@@ -37,12 +37,12 @@ class Controller:
         self._newest = self._nothing
 
     def hear(self, observation: np.ndarray, now: float) -> None:
-        """Take what a topic says, at `now` seconds; numbers that are too many or too few are as good as none."""
+        """Store an observation received at `now` seconds; one of the wrong size counts as missing."""
         flat = np.asarray(observation, np.float32).reshape(-1)
         self._newest, self._heard_at = (flat if flat.shape == self._nothing.shape else self._nothing), now
 
     def tick(self, now: float) -> np.ndarray:
-        """Return the action, float32 [action]: the fallback where nothing was heard for too long."""
+        """Return the action, float32 [action]: the fallback if the last observation is too old."""
         is_old = now - self._heard_at > self._patience
         return self.policy.act(self._nothing if is_old else self._newest)
 
@@ -72,7 +72,7 @@ def run_with_ros(controller: Controller) -> None:
 
 
 def run_without_ros(controller: Controller, seconds: float) -> None:
-    """Let the task be the robot, in simulated time; its sensors fail for the second half of the time."""
+    """Use the task as the robot, in simulated time; its sensors fail in the second half."""
     import gymnasium
 
     contract = controller.policy.contract
@@ -102,7 +102,7 @@ def run_without_ros(controller: Controller, seconds: float) -> None:
 
 
 def main() -> None:
-    """Run as a node, or, without ROS, beside a simulated robot."""
+    """Run as a node or, without ROS, with a simulated robot."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("artefact", type=Path, help="folder that csac export --format numpy has written")
     parser.add_argument("--seconds", type=float, default=2.0, help="simulated, without ROS")
