@@ -139,7 +139,7 @@ class RunDirectory:
     def rows(self, name: Table) -> np.ndarray:
         """Return all rows of a table as a structured array, empty if nothing was written yet.
 
-        If the file is damaged, or was altered since the newest checkpoint, return the checkpoint's rows, with a warning.
+        If the file is damaged or was altered since the newest checkpoint, return the checkpoint's rows, with a warning.
         """
         path, copy = self.table(name), self._saved_copy(name)
         try:
