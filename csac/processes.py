@@ -105,7 +105,7 @@ def die_with_parent() -> None:
 def outlive_termination() -> None:
     """Have this worker ignore SIGTERM, since its parent decides when it ends, but not the processes of its task.
 
-    SIGTERM is blocked until now (`worker_surroundings`). A mask survives an exec and a handler does not: with the mask,
+    SIGTERM is blocked until now (`worker_settings`). A mask survives an exec and a handler does not: with the mask,
     a task would send its simulator a SIGTERM without effect, and wait for it for ever. What a terminal sends to all its
     processes, a Ctrl-C or a hang-up, stays blocked: simulators live until their seeds are saved.
     """
@@ -176,7 +176,7 @@ class Child:
         before = os.environ.get(_SAFE_PATH)
         self.process = context.Process(target=_run_child, args=(before, work, child_connection, *arguments))
         try:
-            with safe_path(), worker_surroundings(), _hide_missing_script():
+            with safe_path(), worker_settings(), _hide_missing_script():
                 self.process.start()
         except BaseException:  # a Ctrl-C that was blocked while the process started
             if self.process.pid:
@@ -247,7 +247,7 @@ def end(children: Sequence[Child], seconds: float = SECONDS_TO_CLOSE) -> None:
 
 
 @contextmanager
-def worker_surroundings() -> Iterator[None]:
+def worker_settings() -> Iterator[None]:
     """Start workers in this block with one BLAS thread, since NumPy only evaluates there, and with signals blocked.
 
     A Ctrl-C reaches every process of the terminal; the parent alone decides what it means.

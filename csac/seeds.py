@@ -19,7 +19,7 @@ def training_seed(seed: int, episode: int, environment: int = 0) -> int:
     return FIRST_TRAINING_SEED + word % FIRST_TRAINING_SEED
 
 
-def seeds_told(seeds: Sequence[int]) -> str:
+def name_seeds(seeds: Sequence[int]) -> str:
     """Return seeds in words: seed 3; seeds 3, 5; seeds 0 to 4."""
     if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
         return f"seeds {seeds[0]} to {seeds[-1]}"

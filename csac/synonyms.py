@@ -54,19 +54,19 @@ _FORMER_VALUES: Mapping[tuple[str, str], str] = {
 }
 
 
-def called_here(option: str, known: Collection[str]) -> str:
+def option_hint(option: str, known: Collection[str]) -> str:
     """Return a hint such as "it is --discount here" if `option` is another name of a `known` one, else ""."""
     names_here = NAMES.get(option, "")
     return f"it is {names_here} here" if {*re.findall(r"--[a-z-]+", names_here)} & {*known} else ""
 
 
-def called_in_python(name: str, known: Collection[str]) -> str:
+def argument_hint(name: str, known: Collection[str]) -> str:
     """Return a hint such as "it is discount here" if `name` is another name of a `known` one, else ""."""
     flag, *flags = ("--" + word.replace("_", "-") for word in (name, *known))
-    return re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), called_here(flag, flags))
+    return re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), option_hint(flag, flags))
 
 
-def written_in_python(name: str, value: object) -> str:
+def value_hint(name: str, value: object) -> str:
     """Return how a value of former versions is written now, or ""."""
     if name == "exploration_noise" and isinstance(value, float):
         return f"write exploration_std={value}"

@@ -22,7 +22,7 @@ from typing import (
 import numpy as np
 
 from csac.checks import did_you_mean
-from csac.synonyms import called_in_python, written_in_python
+from csac.synonyms import argument_hint, value_hint
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def check_hyperparameters(algorithm: Any) -> None:
         try:
             object.__setattr__(algorithm, field.name, _convert(value, hints[field.name]))
         except ValueError as error:
-            hint = written_in_python(field.name, value)
+            hint = value_hint(field.name, value)
             raise InputError(f"{field.name} must be {error}, not {value!r}{hint and f': {hint}'}") from None
 
 
@@ -75,7 +75,7 @@ def reject_unknown_names(algorithm: type[Algorithm]) -> type[Algorithm]:
     def checked_init(self: Any, *values: Any, **named: Any) -> None:
         for name in named:
             if name not in known:
-                hint = called_in_python(name, known) or did_you_mean(name, known)
+                hint = argument_hint(name, known) or did_you_mean(name, known)
                 raise InputError(f"{kind.__name__} has no hyperparameter {name!r}{hint and f': {hint}'}")
         init(self, *values, **named)
 

@@ -17,7 +17,7 @@ from tyro.conf import DisallowNone
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from csac.checks import did_you_mean
-from csac.synonyms import called_here
+from csac.synonyms import option_hint
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -148,6 +148,6 @@ def _one_line(complaint: str, command: type[Any], hint_for: Callable[[str], str]
         return re.sub(r"^Missing from [^:]*: (\S+).*", r"\1 is missing", what)
     option = unknown[1].partition("=")[0].replace("_", "-") if unknown[1].startswith("-") else unknown[1]
     meant = re.findall(r"^ *(--[a-z-]+)", more, re.MULTILINE)[:2]
-    hint = called_here(option, options_of(command)) or hint_for(option)
+    hint = option_hint(option, options_of(command)) or hint_for(option)
     hint = hint or (f"did you mean {' or '.join(meant)}?" if meant else "")
     return f"there is no {option} here" + (f": {hint}" if hint else "")

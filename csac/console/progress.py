@@ -17,7 +17,7 @@ from rich.text import Text
 from csac.console.tables import duration, make_console, program, result_tables
 from csac.console.waiting import SECONDS_OF_SILENCE, Speed
 from csac.record.rendering import number, short
-from csac.seeds import seeds_told
+from csac.seeds import name_seeds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -65,7 +65,7 @@ class Reporter:
         self._printed = self._newest_common_step()
         self._started = self._last_output = self._clock()
         title = Text.assemble((f"{config.algorithm} on {config.task}", "bold"))
-        self._print(title.append(f", {seeds_told(runs.seeds)}, {config.steps:,} steps{' each' * (len(runs.runs) > 1)}"))
+        self._print(title.append(f", {name_seeds(runs.seeds)}, {config.steps:,} steps{' each' * (len(runs.runs) > 1)}"))
         for line in (str(runs.path), *notes):
             self._print(Text(line, "dim"))
         if self.console.is_interactive:

@@ -40,7 +40,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
     If there are several writers, even on machines that share the folder, the last one wins.
     """
-    aside = name_aside(path)
+    aside = temporary_path(path)
     try:
         with open(aside, "wb") as file:
             file.write(data)
@@ -51,13 +51,13 @@ def write_atomically(path: Path, data: bytes) -> None:
         aside.unlink(missing_ok=True)
 
 
-def name_aside(path: Path) -> Path:
+def temporary_path(path: Path) -> Path:
     """Return the temporary name of a file until it is complete, unique among all writers on all machines."""
     unique = secrets.token_hex(4)  # containers on several machines often have equal process ids
     return path.with_name(f".{path.name}.{unique}.{os.getpid()}")
 
 
-def kept_from_children(file: IO[str]) -> IO[str]:
+def closed_in_children(file: IO[str]) -> IO[str]:
     """Return the file, which forked processes will close: a task's helper process would otherwise keep its lock."""
     _held_locks.add(file)
     return file

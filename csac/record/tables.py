@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
-from csac.record.files import name_aside, write_atomically, writing
+from csac.record.files import temporary_path, write_atomically, writing
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def check_new(path: Path) -> None:
         raise InputError(f"the table is a .csv file: name it {better}")
     try:
         with suppress(FileNotFoundError):
-            name_aside(path).lstat()
+            temporary_path(path).lstat()
     except OSError as error:  # the name is too long, or a part of the path is not a folder
         raise InputError(f"cannot write {path}: {error.strerror}; choose another place or name") from None
     if path.exists():
@@ -90,7 +90,7 @@ def check_new(path: Path) -> None:
 
 def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
     """Write a table as `append_rows` does, and give the file its name once complete. Raises InputError."""
-    aside = name_aside(path)
+    aside = temporary_path(path)
     try:
         with writing(path):
             append_rows(aside, columns, rows)

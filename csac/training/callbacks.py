@@ -135,7 +135,7 @@ def mean_return(episodes: Iterable[EvaluationEpisode]) -> float:
     return float(np.mean([episode.episode_return for episode in episodes]))
 
 
-class Hears(NamedTuple):
+class Interests(NamedTuple):
     """The events that callbacks handle."""
 
     intervals: tuple[int, ...] = ()
@@ -194,14 +194,14 @@ class Callbacks:
         self.failure: CallbackFailure | None = None
 
     @property
-    def hears(self) -> Hears:
+    def interests(self) -> Interests:
         """The events that they handle."""
 
         def overriding(method: str) -> list[Callback]:
             return [one for one in self.callbacks if getattr(type(one), method) is not getattr(Callback, method)]
 
         has_function = self.on_evaluation is not None or self.stop_when is not None
-        return Hears(
+        return Interests(
             tuple(sorted({callback.interval for callback in overriding("on_step")})),
             bool(overriding("on_episode")),
             bool(overriding("on_evaluation")) or has_function,
@@ -224,7 +224,7 @@ class Callbacks:
 
     def would_stop_again(self, run: RunDirectory) -> bool:
         """Return whether the callbacks would end a run at its last evaluation, as they did before."""
-        if run.manifest.state != "finished" or not self.hears.evaluations or not len(run.evaluations):
+        if run.manifest.state != "finished" or not self.interests.evaluations or not len(run.evaluations):
             return False
         rows, names = run.evaluations, run.evaluations.dtype.names or ()
         episodes = [
@@ -263,23 +263,23 @@ class Notifier:
 
     def __init__(
         self,
-        hears: Hears,
+        interests: Interests,
         call: Callable[[Event], Answer],
         runs: Sequence[RunDirectory],
         recorders: Sequence[Recorder],
         metrics: tuple[str, ...],
         policy: Callable[[int], Policy],
     ) -> None:
-        self._hears, self._call, self._runs, self._recorders = hears, call, runs, recorders
+        self._interests, self._call, self._runs, self._recorders = interests, call, runs, recorders
         self._metrics, self._policy = metrics, policy
         self.stopped_by = ""  # what ended the runs
 
     def after_step(self, step: int, stride: int, alive: np.ndarray, episodes: Sequence[FinishedEpisode]) -> bool:
         """Report the last `stride` steps and the episodes that ended; return whether to stop."""
-        if episodes and self._hears.episodes:
+        if episodes and self._interests.episodes:
             indices = [episode.seed_index for episode in episodes]
             self._notify("on_episode", step, indices, [(episode,) for episode in episodes])
-        due = tuple(interval for interval in self._hears.intervals if step % interval < stride)
+        due = tuple(interval for interval in self._interests.intervals if step % interval < stride)
         if due:
             indices = np.flatnonzero(alive).tolist()
             self._notify("on_step", step, indices, [()] * len(indices), due)
@@ -287,7 +287,7 @@ class Notifier:
 
     def evaluated(self, step: int, results: Mapping[int, tuple[Policy, Any]]) -> bool:
         """Report an evaluation: each seed's policy and episodes, by seed index; return whether to stop."""
-        if results and self._hears.evaluations:
+        if results and self._interests.evaluations:
             policies = {index: policy for index, (policy, _) in results.items()}
             self._notify("on_evaluation", step, [*results], [(e,) for _, e in results.values()], policies=policies)
         return bool(self.stopped_by)
@@ -307,7 +307,7 @@ class Notifier:
                 self._runs[index].seed,
                 step,
                 self._runs[index].path,
-                policy_of(index) if self._hears.policies else None,
+                policy_of(index) if self._interests.policies else None,
                 metrics=self._metrics,
             )
             for index in indices

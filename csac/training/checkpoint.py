@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import safetensors.numpy
 
-from csac.record.files import name_aside, write_atomically
+from csac.record.files import temporary_path, write_atomically
 from csac.types import InputError, Snapshot
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ class Writer:
 
 def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:
     """Write a folder next to `path`, sync and rename it, so that it is complete or absent. Raises OSError."""
-    aside = name_aside(path)
+    aside = temporary_path(path)
     shutil.rmtree(path, ignore_errors=True)
     aside.mkdir()
     for name, content in contents.items():

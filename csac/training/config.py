@@ -10,7 +10,7 @@ from csac.algorithms import ALGORITHMS
 from csac.checks import check_arguments, check_whole, did_you_mean
 from csac.evaluation.evaluator import LONGEST_EPISODE
 from csac.record.config import SEED_LIMIT, RunConfig, as_json
-from csac.synonyms import called_in_python
+from csac.synonyms import argument_hint
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import Perturbation, perturbations_of, refuse_late
 from csac.tasks.preflight import limit_warning, seed_warning, try_task, wrapper_warnings
@@ -196,7 +196,7 @@ def _refuse_unknown(given: TrainOptions, algorithm: Algorithm) -> None:
     for name in given:
         if name in RUN_OPTIONS:
             continue
-        hint = called_in_python(name, RUN_OPTIONS) or did_you_mean(name, RUN_OPTIONS)
+        hint = argument_hint(name, RUN_OPTIONS) or did_you_mean(name, RUN_OPTIONS)
         if name in (item.name for item in dataclasses.fields(algorithm)):  # pyright: ignore[reportArgumentType]
             hint = f"it is a hyperparameter, as in {type(algorithm).__name__}({name}=...)"
         raise InputError(f"train takes no {name}" + (f": {hint}" if hint else ""))

@@ -74,7 +74,9 @@ class Loop:
             self._begin(points)
             self.recorders = [Recorder(run, self.step, program.tensorboard, program.wandb) for run in runs]
             recorded = self.runs, self.recorders
-            self.notifier = Notifier(program.hears, watcher.call, *recorded, self.learner.metric_names, self._policy)
+            self.notifier = Notifier(
+                program.interests, watcher.call, *recorded, self.learner.metric_names, self._policy
+            )
             self.evaluations = Evaluations(program, *recorded, self.environments, watcher, self.notifier, stack)
             self._saved_at, self._saved_time = self.step, time.monotonic()
             self.has_returned = False

@@ -11,7 +11,7 @@ import psutil
 
 from csac.checks import check_whole
 from csac.processes import cores_to_use, may_be_imported, memory_left, script, usable_cores
-from csac.training.callbacks import Hears
+from csac.training.callbacks import Interests
 from csac.training.devices import preallocates
 from csac.types import InputError
 
@@ -45,7 +45,7 @@ class Program(NamedTuple):
     """How many processes share the environments; None chooses by what a step costs."""
     tensorboard: bool = True
     wandb: bool | str = False
-    hears: Hears = Hears()
+    interests: Interests = Interests()
     """The events that are sent to callbacks; training waits for each call."""
     command: str | None = None
 
@@ -89,8 +89,8 @@ def programs_of(
     spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
     processes = template.evaluation_processes
     if processes is None:
-        is_worthwhile = spare > 0 and not template.hears.evaluations and 0 < config.evaluation_interval < config.steps
-        is_worthwhile = is_worthwhile and config.evaluation_environments > 0
+        is_worthwhile = spare > 0 and config.evaluation_environments > 0 and not template.interests.evaluations
+        is_worthwhile = is_worthwhile and 0 < config.evaluation_interval < config.steps
         processes = min(batches, max(1, spare // len(directories))) if is_worthwhile and has_processes else 0
     check_whole("evaluation_processes", processes, 0, 1_000)
     if not config.evaluation_environments and max(config.environments, *map(len, directories)) > 1:

@@ -253,7 +253,7 @@ class Source(NamedTuple):
         if wanted.steps <= self.step:
             raise InputError(f"steps counts from the beginning: give more than the {self.step:,} made already")
 
-    def refuse_misfit(self, algorithm: Algorithm, spec: Spec, wanted: RunConfig) -> None:
+    def refuse_incompatible_state(self, algorithm: Algorithm, spec: Spec, wanted: RunConfig) -> None:
         """Raise InputError if the checkpoint's learned state does not fit the new run's algorithm and task."""
         learnt = self.checkpoints[wanted.seed].state().part("learner")
         if problem := incompatibility(algorithm, spec, wanted.steps, learnt):

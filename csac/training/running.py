@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from csac.processes import move_to, usable_cores
 from csac.record.run import RunDirectory
-from csac.seeds import seeds_told
+from csac.seeds import name_seeds
 from csac.tasks.preflight import seed_globals
 from csac.training.devices import choose_device
 from csac.training.loop import Loop
@@ -44,7 +44,7 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
             _note_begin(run, point, current, watcher)
         loop = Loop(program, runs, points, watcher)
         stack.callback(loop.close)
-        stack.enter_context(stalls_noted(lambda: loop.step, watcher.note, seeds_told([run.seed for run in runs])))
+        stack.enter_context(stalls_noted(lambda: loop.step, watcher.note, name_seeds([run.seed for run in runs])))
         try:
             loop.run(should_stop)
         finally:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from csac.processes import Child, end
 from csac.record.run import RunDirectory, StorageFailure
-from csac.seeds import seeds_told
+from csac.seeds import name_seeds
 from csac.tasks.failures import one_line
 from csac.training.callbacks import STOPPED
 from csac.training.watch import Watcher
@@ -108,7 +108,7 @@ def _replace(
         restarted.add(worker.program.directories)
         for run in runs:
             run.log(f"{reason}; its process is restarted")
-        watcher.note(f"{seeds_told([run.seed for run in runs])}: {reason}; restarting from the newest checkpoint")
+        watcher.note(f"{name_seeds([run.seed for run in runs])}: {reason}; restarting from the newest checkpoint")
         return [worker.program]
     for run in runs:
         if run.manifest.state != "failed" and run.manifest.steps_done < run.config.steps:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from csac.checks import check_flag, check_path
 from csac.deploy.choosing import TrainedRuns
 from csac.processes import cores_to_use, end_if_unguarded
-from csac.record.files import name_aside
+from csac.record.files import temporary_path
 from csac.record.manifest import Manifest
 from csac.record.run import RunDirectory, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
@@ -124,10 +124,10 @@ def train(
     place = place or new_set_directory(configs[0].task, configs[0].algorithm)
     existing = _existing_runs(place, configs, resume, source, algorithm.cadence.has_schedule)
     if source:
-        source.refuse_misfit(algorithm, spec, configs[0])
+        source.refuse_incompatible_state(algorithm, spec, configs[0])
 
     groups = choose_groups(wanted, existing, seeds_per_process, configs[0].device, task, algorithm)
-    settings = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
+    settings = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.interests, command
     template = Program((), algorithm, task, 1, *settings)
     directories = [[run_path(place, seed) for seed in group] for group in groups]
     programs = programs_of(template, directories, existing, configs[0])
@@ -180,7 +180,7 @@ def resume(
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
     tensorboard = any(run.tensorboard.exists() for run in runs.runs)
     wandb = any((run.path / "wandb").exists() for run in runs.runs)
-    settings = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.hears, command
+    settings = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.interests, command
     template = Program((), algorithm, config.task, 1, *settings)
     programs = programs_of(template, [[existing[seed].path for seed in group] for group in groups], existing, config)
     return _run(runs, programs, watch, [])
@@ -253,7 +253,7 @@ def _create(
     changed = [config for config in configs if config.seed in existing and config != existing[config.seed].config]
     _set_configs([existing[config.seed] for config in changed], changed)
     new = [config for config in configs if config.seed not in existing]
-    temporary = {config.seed: name_aside(run_path(place, config.seed)) for config in new}
+    temporary = {config.seed: temporary_path(run_path(place, config.seed)) for config in new}
     try:
         for config in new:
             program = next(group for group in groups if config.seed in group)
