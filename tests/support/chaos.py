@@ -163,7 +163,10 @@ def one_run(
         process = start(folder, command, cache, subprocess.DEVNULL)
         while kinds and process.poll() is None:
             target = shares[len(kills)] * STEPS
-            while process.poll() is None and max(map(reached, folder.glob("run/seed-*")), default=0) < target:
+            while process.poll() is None and (
+                max(map(reached, folder.glob("run/seed-*")), default=0) < target
+                or not workers_of(process)  # SIGINT while Python itself starts gives exit code 1
+            ):
                 time.sleep(0.02)
             if process.poll() is not None:
                 break
@@ -185,7 +188,7 @@ def one_run(
         if process.returncode == 0:
             exact = not differences(folder / "run", whole)
             return [kill._replace(exact=exact) for kill in kills]
-        if process.returncode not in (-9, -2, -15, 130, 143):  # -2 and -15: Python has not come to csac yet
+        if process.returncode not in (-9, -2, -15, 130, 143):  # -2 and -15: csac has returned
             return kills  # none of which is exact
         command = train if generator.random() < 0.5 else ["resume", "run"]
 
