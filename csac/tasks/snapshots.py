@@ -1,8 +1,8 @@
 """Save and restore a Gymnasium environment in the middle of an episode, as named arrays and JSON values.
 
 An environment supports this with `get_snapshot() -> (arrays, values)` and `set_snapshot(arrays, values)`, which is
-called after a `reset` with the seed of the episode. For Gymnasium's own MuJoCo tasks both are built in. The time limit
-and the random generator are handled here.
+called after a `reset` with the seed of the episode. For Gymnasium's own MuJoCo and classic-control tasks both are built
+in. The time limit and the random generator are handled here.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ def snapshot(environment: gymnasium.Env) -> Snapshot | None:
         arrays, values = inner.get_snapshot()  # pyright: ignore[reportAttributeAccessIssue]
         arrays = {f"own.{name}": np.array(array) for name, array in arrays.items()}
         values = {"own": values}
-    elif _is_mujoco(inner):
+    elif _is_gymnasiums("classic_control", inner):
+        arrays, values = {"state": np.array(inner.state)}, {}  # pyright: ignore[reportAttributeAccessIssue]
+    elif _is_gymnasiums("mujoco", inner):
         arrays = {f"mujoco.{name}": array.copy() for name, array in _mujoco_arrays(inner).items()}
         values = {"mujoco_time": float(inner.data.time)}  # pyright: ignore[reportAttributeAccessIssue]
     else:
@@ -46,6 +48,8 @@ def restore(environment: gymnasium.Env, saved: Snapshot) -> None:
     if "own" in values:
         arrays = {name.removeprefix("own."): array for name, array in saved.arrays.items()}
         inner.set_snapshot(arrays, values["own"])  # pyright: ignore[reportAttributeAccessIssue]
+    elif "state" in saved.arrays:
+        inner.state = saved.arrays["state"]  # pyright: ignore[reportAttributeAccessIssue]
     else:
         _set_mujoco(inner, saved)
     for limit, elapsed in zip(_time_limits(environment) or (), values["elapsed_steps"], strict=True):
@@ -65,9 +69,9 @@ def _time_limits(environment: gymnasium.Env) -> list[TimeLimit] | None:
     return limits
 
 
-def _is_mujoco(environment: gymnasium.Env) -> bool:
-    """Return whether this is one of Gymnasium's own MuJoCo tasks. A subclass may have state beyond its physics."""
-    return type(environment).__module__.startswith("gymnasium.envs.mujoco.") and hasattr(environment, "data")
+def _is_gymnasiums(kind: str, environment: gymnasium.Env) -> bool:
+    """Return whether this is one of Gymnasium's own tasks of a kind. A subclass may have more state."""
+    return type(environment).__module__.startswith(f"gymnasium.envs.{kind}.")
 
 
 def _mujoco_arrays(environment: Any) -> dict[str, np.ndarray]:
