@@ -35,7 +35,8 @@ def pytest_configure(config: pytest.Config) -> None:
     Their programs run but for moments. What depends on the last bits has a process of its own, without the flag.
     """
     if config.getoption("markexpr") != "slow":
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
+        quick = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {quick}".strip()
 
 
 LONGEST = ("training", "tasks", "test_results.py", "test_cli.py")  # folders and files
