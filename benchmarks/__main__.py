@@ -8,7 +8,6 @@ import time
 from typing import TYPE_CHECKING
 
 from benchmarks import checkpoint, gpu, growth, limit, peers, policy, start, stepping, vector
-from benchmarks import set as seeds
 from benchmarks.measuring import usable_cores
 from benchmarks.part import Options, Part, shown
 from csac.types import InputError
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
 
 SUITES = {
     "peers": peers,
-    "set": seeds,
     "start": start,
     "limit": limit,
     "growth": growth,

@@ -114,10 +114,10 @@ def call_command(function: str, **arguments: Any) -> list[str]:
     return [sys.executable, "-m", "benchmarks.call", function, json.dumps(arguments)]
 
 
-def time_command(command: Sequence[str], cores: int | None = None, **variables: str) -> float:
-    """Return the seconds from launch to exit. Raises ProcessFailure like `answers`."""
+def time_command(command: Sequence[str], **variables: str) -> float:
+    """Return the seconds from launch to exit, on all cores. Raises ProcessFailure like `answers`."""
     began = time.monotonic()
-    with started([Launch(command, usable_cores()[:cores])], surroundings(**variables)) as (folder, (process,)):
+    with started([Launch(command, usable_cores())], surroundings(**variables)) as (folder, (process,)):
         if process.wait():
             raise failure(folder, process)
         return time.monotonic() - began
