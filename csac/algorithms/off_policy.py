@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from csac.algorithms.architecture import Architecture
 from csac.algorithms.exploration import Noise, noise_of
 from csac.algorithms.hyperparameters import (
     COUNT,
@@ -26,6 +25,7 @@ from csac.algorithms.hyperparameters import (
 from csac.algorithms.memory import Replay
 from csac.algorithms.networks import (
     MLP,
+    Architecture,
     Schedule,
     apply_schedule,
     copy_tree,
