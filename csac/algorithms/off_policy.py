@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from csac.algorithms.distributions import policy_at
 from csac.algorithms.exploration import Noise, noise_of
 from csac.algorithms.hyperparameters import (
     COUNT,
@@ -36,8 +37,8 @@ from csac.algorithms.networks import (
     plain_layers,
     polyak,
 )
-from csac.algorithms.shapes import Action, Count, Key, Scalar
-from csac.algorithms.statistics import Statistics, normaliser_of
+from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
+from csac.algorithms.statistics import Statistics, normalise, normaliser_of
 from csac.algorithms.temperature import Temperature, adapt, make_temperature
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
@@ -199,6 +200,16 @@ class MaximumEntropy(TwinCritics):
         """Return the initial state's fields that the two share; the average is a copy of the actor."""
         networks = super().first_networks(key, spec, steps, actor_outputs)
         return networks | {"average": copy_tree(networks["actor"]) if self.policy_average_rate < 1 else None}
+
+    def act(self, state: Any, observation: Observation, key: Key, explore: bool) -> Action:
+        """Return ã(s, ξ) if exploring (CSAC's Eq. actor), else tanh(mean)."""
+        actor = state.actor if explore else evaluated_actor(state)
+        policy = policy_at(actor, normalise(state.observation_statistics, observation))
+        return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
+
+    def policy(self, state: Any) -> PolicyNetwork:
+        """Return the evaluated actor's layers and its observation normaliser."""
+        return policy_network(evaluated_actor(state), state.observation_statistics, "tanh_gaussian")
 
     def first_temperature(self, given: float | Literal["auto"]) -> Temperature:
         """Return the initial temperature: the given weight, or `initial_entropy_weight` for `auto`."""
