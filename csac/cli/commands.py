@@ -34,7 +34,10 @@ def run(name: str, words: list[str]) -> int:
                 f"no command is called {name!r}{_hint(name, [*COMMANDS, 'report', 'study'])} (csac --help)"
             )
         kind, function = COMMANDS[name]
-        with _leaving_at_once() if name in ("train", "resume") else nullcontext():
+        leaving = nullcontext
+        if name in ("train", "resume"):
+            from csac.training.signals import leaving_at_once as leaving  # imports NumPy
+        with leaving():
             options = (parse_training if name in ("train", "tune") else parse)(kind, words, f"csac {name}")
             return function(options, command)
     except HelpShown:
@@ -51,12 +54,6 @@ def _resume(options: Resume, command: str) -> int:
     from csac.training.train import resume
 
     return _run_training(resume, **vars(options), command=command)
-
-
-def _leaving_at_once() -> Any:
-    from csac.training.signals import leaving_at_once  # imports NumPy
-
-    return leaving_at_once()
 
 
 def _run_training(training: Callable[..., RunSet], *arguments: Any, **options: Any) -> int:

@@ -7,6 +7,7 @@ import shlex
 import shutil
 import sys
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -72,11 +73,11 @@ def duration(seconds: float) -> str:
     return f"{whole} s"
 
 
+@dataclass
 class Fitted:
     """A table on a terminal; if that is too narrow, cells are folded so that no digit is lost."""
 
-    def __init__(self, table: Table) -> None:
-        self.table = table
+    table: Table
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[rich.table.Table]:
         table = self.table
