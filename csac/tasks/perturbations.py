@@ -143,10 +143,8 @@ def refuse_late(perturbations: Iterable[Perturbation], steps: int, planned: bool
 
 def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:
     """Return (step, labels of the perturbations that start there), in order of the steps."""
-    labels: dict[int, list[str]] = {}
-    for item in perturbations_of(perturbations):
-        labels.setdefault(item.step, []).append(item.label)
-    return [(step, ", ".join(texts)) for step, texts in labels.items()]
+    groups = itertools.groupby(perturbations_of(perturbations), attrgetter("step"))
+    return [(step, ", ".join(item.label for item in group)) for step, group in groups]
 
 
 def _checked(kind: str, value: object) -> float:
