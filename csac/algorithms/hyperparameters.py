@@ -22,7 +22,7 @@ from typing import (
 import numpy as np
 
 from csac.checks import did_you_mean
-from csac.synonyms import argument_hint, value_hint
+from csac.synonyms import argument_hint
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -62,8 +62,7 @@ def check_hyperparameters(algorithm: Any) -> None:
         try:
             object.__setattr__(algorithm, field.name, _convert(value, hints[field.name]))
         except ValueError as error:
-            hint = value_hint(field.name, value)
-            raise InputError(f"{field.name} must be {error}, not {value!r}{hint and f': {hint}'}") from None
+            raise InputError(f"{field.name} must be {error}, not {value!r}") from None
 
 
 def reject_unknown_names(algorithm: type[Algorithm]) -> type[Algorithm]:

@@ -92,7 +92,6 @@ def _evaluate(options: Evaluate, _: str) -> int:
         console.print(table)
     failed = {seed: reason for seed, reason in runs.failures.items() if seed in results}
     notes = [f"seed {seed} failed at {reason}; it is in no mean, and in no file" for seed, reason in failed.items()]
-    notes += [f"no episode's last info holds a number called {name!r}" for name in tables.silent_events(results)]
     sound = [run for run in runs.runs if run.seed in results and run.seed not in failed]
     if options.stochastic and {load(run.path, which=options.which).network.head for run in sound} == {"tanh"}:
         notes.append("the policy is deterministic: --stochastic changes nothing")

@@ -138,12 +138,6 @@ def _evaluation_table(rows: np.ndarray, failed: Collection[int]) -> Table:
     return Table(headings, tuple(body), note=report_tables.few_seeds(len(sound)))
 
 
-def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[str]:
-    """Return the names of the events that no episode recorded."""
-    rows = _rows(results)
-    return [name for name in (rows.dtype.names or ())[len(COLUMNS["evaluations"]) :] if np.isnan(rows[name]).all()]
-
-
 def run_lines(sets: Sequence[RunSet]) -> list[Text]:
     """Return a line for each set of runs: task, algorithm, seeds, steps, state, last return, directory.
 

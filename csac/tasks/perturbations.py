@@ -130,14 +130,11 @@ def continued(before: Sequence[Perturbation], given: Sequence[Perturbation], beg
     return perturbations_of([*past, *(item for item in given if item.step >= begin)])
 
 
-def refuse_late(perturbations: Iterable[Perturbation], steps: int, planned: bool = False) -> None:
-    """Raise InputError for a perturbation that starts only when a run of `steps` is over.
-
-    `planned` says that the perturbations come from the source run of a fork, not from the user.
-    """
-    hint = "the source run planned it: --perturb none leaves it out" if planned else "give an earlier step"
+def refuse_late(perturbations: Iterable[Perturbation], steps: int) -> None:
+    """Raise InputError for a perturbation that starts only when a run of `steps` is over."""
     for item in perturbations:
         if item.step >= steps:
+            hint = "give an earlier step, or --perturb none"
             raise InputError(f"{item} would change nothing: the run ends at step {steps}; {hint}")
 
 
