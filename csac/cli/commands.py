@@ -93,8 +93,6 @@ def _evaluate(options: Evaluate, _: str) -> int:
     failed = {seed: reason for seed, reason in runs.failures.items() if seed in results}
     notes = [f"seed {seed} failed at {reason}; it is in no mean, and in no file" for seed, reason in failed.items()]
     sound = [run for run in runs.runs if run.seed in results and run.seed not in failed]
-    if options.stochastic and {load(run.path, which=options.which).network.head for run in sound} == {"tanh"}:
-        notes.append("the policy is deterministic: --stochastic changes nothing")
     untested = [str(seed) for seed in runs.seeds if seed not in results and options.seed is None]
     notes += [f"without such a policy yet: seed {', '.join(untested)}"] * bool(untested)
     tables.print_lines(console, [f"note: {text}" for text in notes + _untrained_notes(runs)])
