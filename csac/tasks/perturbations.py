@@ -60,7 +60,12 @@ class Perturbation:
         if self.kind not in KINDS:
             raise InputError(f"no perturbation is called {self.kind!r}: there are {', '.join(KINDS)}")
         check_whole(f"the step of {self.kind}", self.step, 0, STEPS_LIMIT)
-        object.__setattr__(self, "value", _checked(self.kind, self.value))
+        number = math.nan if isinstance(self.value, str | bool) else _number(self.value)
+        if not 0 <= number < math.inf or (self.kind == "mass" and not number):
+            what = "factor" if self.kind in PHYSICS else "standard deviation"
+            least = "above 0" if self.kind == "mass" else "of 0 or more"
+            raise InputError(f"{self.kind} takes a finite {what} {least}, not {number}")
+        object.__setattr__(self, "value", number)
         object.__setattr__(self, "step", int(self.step))
 
     @classmethod
@@ -142,16 +147,6 @@ def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:
     """Return (step, labels of the perturbations that start there), in order of the steps."""
     groups = itertools.groupby(perturbations_of(perturbations), attrgetter("step"))
     return [(step, ", ".join(item.label for item in group)) for step, group in groups]
-
-
-def _checked(kind: str, value: object) -> float:
-    """Return the value of a perturbation as a float. Raise InputError if it is invalid for its kind."""
-    number = math.nan if isinstance(value, str | bool) else _number(value)
-    if not 0 <= number < math.inf or (kind == "mass" and not number):
-        what = "factor" if kind in PHYSICS else "standard deviation"
-        least = "above 0" if kind == "mass" else "of 0 or more"
-        raise InputError(f"{kind} takes a finite {what} {least}, not {number}")
-    return number
 
 
 def _number(value: object) -> float:
