@@ -39,7 +39,7 @@ from csac.algorithms.networks import (
 )
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
 from csac.algorithms.statistics import Statistics, normalise, normaliser_of
-from csac.algorithms.temperature import Temperature, adapt, make_temperature
+from csac.algorithms.temperature import Temperature, adapt, finite_log
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 if TYPE_CHECKING:
@@ -213,8 +213,8 @@ class MaximumEntropy(TwinCritics):
 
     def first_temperature(self, given: float | Literal["auto"]) -> Temperature:
         """Return the initial temperature: the given weight, or `initial_entropy_weight` for `auto`."""
-        weight = self.initial_entropy_weight if given == "auto" else given
-        return make_temperature(weight, make_optimiser(self.weight_learning_rate))
+        log_weight = finite_log(self.initial_entropy_weight if given == "auto" else given)
+        return Temperature(log_weight, init_optimiser(make_optimiser(self.weight_learning_rate), log_weight))
 
     def average_after(self, average: MLP | None, actor: MLP, step: Count) -> MLP | None:
         """Return the average after adding the actor of update number `step`; None if there is no average.
