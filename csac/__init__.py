@@ -14,11 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from csac.algorithms.csac import CSAC
-    from csac.algorithms.ppo import PPO
-    from csac.algorithms.sac import SAC
-    from csac.algorithms.sd3 import SD3
-    from csac.algorithms.td3 import TD3
+    from csac.algorithms import CSAC, PPO, SAC, SD3, TD3
     from csac.deploy.choosing import load
     from csac.deploy.policy import Policy
     from csac.evaluation.evaluator import evaluate, evaluate_episodes
@@ -51,33 +47,25 @@ __all__ = [
 ]
 
 _MODULES = {
-    "CSAC": "csac.algorithms.csac",
-    "PPO": "csac.algorithms.ppo",
-    "SAC": "csac.algorithms.sac",
-    "SD3": "csac.algorithms.sd3",
-    "TD3": "csac.algorithms.td3",
-    "Callback": "csac.training.callbacks",
-    "SaveEvery": "csac.training.callbacks",
-    "StopAfterNoImprovement": "csac.training.callbacks",
-    "StopOnReturn": "csac.training.callbacks",
-    "InputError": "csac.types",
-    "Policy": "csac.deploy.policy",
-    "evaluate": "csac.evaluation.evaluator",
-    "evaluate_episodes": "csac.evaluation.evaluator",
-    "load": "csac.deploy.choosing",
-    "load_checkpoint": "csac.training.learnt",
-    "train": "csac.training.train",
-    "resume": "csac.training.train",
+    "csac.algorithms": {"CSAC", "PPO", "SAC", "SD3", "TD3"},
+    "csac.deploy.choosing": {"load"},
+    "csac.deploy.policy": {"Policy"},
+    "csac.evaluation.evaluator": {"evaluate", "evaluate_episodes"},
+    "csac.training.callbacks": {"Callback", "SaveEvery", "StopAfterNoImprovement", "StopOnReturn"},
+    "csac.training.learnt": {"load_checkpoint"},
+    "csac.training.train": {"resume", "train"},
+    "csac.types": {"InputError"},
 }
 
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         value = import_module("importlib.metadata").version("csac")
-    elif name in _MODULES:
-        value = getattr(import_module(_MODULES[name]), name)
     else:
-        raise AttributeError(f"module 'csac' has no attribute {name!r}")
+        module = next((module for module, names in _MODULES.items() if name in names), None)
+        if module is None:
+            raise AttributeError(f"module 'csac' has no attribute {name!r}")
+        value = getattr(import_module(module), name)
     globals()[name] = value
     return value
 

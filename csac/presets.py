@@ -97,8 +97,7 @@ _PAPER: Mapping[str, Mapping[str, Any]] = {
 _SD3_TASKS = (("Ant", 0.001), ("HalfCheetah", 0.005), ("Hopper", 0.05), ("Walker2d", 0.1))
 _PAPER_TASKS: Mapping[tuple[str, str], Mapping[str, Any]] = {
     ("csac", "PyFlyt/QuadX-Waypoints-v1"): {"relative_entropy_weight": 0.1},
-    **{("sd3", f"{task}-v4"): {"inverse_temperature": beta} for task, beta in _SD3_TASKS},
-    **{("sd3", f"{task}-v5"): {"inverse_temperature": beta} for task, beta in _SD3_TASKS},
+    **{("sd3", f"{task}-v{v}"): {"inverse_temperature": beta} for task, beta in _SD3_TASKS for v in (4, 5)},
 }
 
 # Critics that learn faster: parts and sources in docs/algorithms/critics.md, runs in results/strong.

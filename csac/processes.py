@@ -8,9 +8,9 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 import time
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -113,33 +113,22 @@ def outlive_termination() -> None:
         return
     before = signal.signal(signal.SIGTERM, _ignore_signal)
     signal.siginterrupt(signal.SIGTERM, False)  # native code may not expect interrupted system calls
-    os.register_at_fork(  # for forks without an exec
-        before=_block_sigterm, after_in_parent=_restore_mask, after_in_child=lambda: _restore_sigterm(before)
+    block, unblock = (
+        partial(signal.pthread_sigmask, how, {signal.SIGTERM}) for how in (signal.SIG_BLOCK, signal.SIG_UNBLOCK)
     )
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+
+    def restore() -> None:
+        if signal.getsignal(signal.SIGTERM) is _ignore_signal:  # the task has set no other
+            signal.signal(signal.SIGTERM, before)
+        unblock()
+
+    # For forks without an exec: a SIGTERM reaches the child only after its handler is restored.
+    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=restore)
+    unblock()
 
 
 def _ignore_signal(*_: Any) -> None:
     """Handle a signal by doing nothing."""
-
-
-def _restore_sigterm(handler: Any) -> None:
-    """Restore the SIGTERM handler from before `outlive_termination`, unless the task has set another."""
-    if signal.getsignal(signal.SIGTERM) is _ignore_signal:
-        signal.signal(signal.SIGTERM, handler)
-    _restore_mask()
-
-
-_forking = threading.local()
-
-
-def _block_sigterm() -> None:
-    """Block SIGTERM around a fork, so that it reaches the child only after its handler is restored."""
-    _forking.mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-
-
-def _restore_mask() -> None:
-    signal.pthread_sigmask(signal.SIG_SETMASK, _forking.mask)
 
 
 def script() -> Path | None:

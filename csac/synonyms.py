@@ -1,4 +1,4 @@
-"""Names of our options in papers and other libraries, and how values of former versions are written now."""
+"""Names of our options in papers and other libraries."""
 
 from __future__ import annotations
 
@@ -48,11 +48,6 @@ NAMES: Mapping[str, str] = {
     "--out": "--video",
 }
 
-_FORMER_VALUES: Mapping[tuple[str, str], str] = {
-    ("reference_policy", "previous"): 'reference_policy="average", reference_rate=1',
-    ("reference_policy", "algorithm1"): 'reference_policy="periodic", reference_period=1',
-}
-
 
 def option_hint(option: str, known: Collection[str]) -> str:
     """Return a hint such as "it is --discount here" if `option` is another name of a `known` one, else ""."""
@@ -64,10 +59,3 @@ def argument_hint(name: str, known: Collection[str]) -> str:
     """Return a hint such as "it is discount here" if `name` is another name of a `known` one, else ""."""
     flag, *flags = ("--" + word.replace("_", "-") for word in (name, *known))
     return re.sub(r"--[a-z-]+", lambda match: match[0][2:].replace("-", "_"), option_hint(flag, flags))
-
-
-def value_hint(name: str, value: object) -> str:
-    """Return how a value of former versions is written now, or ""."""
-    if name == "exploration_noise" and isinstance(value, float):
-        return f"write exploration_std={value}"
-    return f"write {_FORMER_VALUES[name, value]}" if isinstance(value, str) and (name, value) in _FORMER_VALUES else ""

@@ -16,11 +16,11 @@ from csac.algorithms.critics import Critics, min_q, update_critics
 from csac.algorithms.distributions import action_at, bounded, kl, log_ratio, policy_at
 from csac.algorithms.hyperparameters import COUNT, NOT_NEGATIVE, RATE
 from csac.algorithms.networks import MLP, copy_tree, gradient_step, polyak
-from csac.algorithms.off_policy import MaximumEntropy, evaluated_actor, first_metrics, improve_delayed, policy_network
+from csac.algorithms.off_policy import MaximumEntropy, first_metrics, improve_delayed
 from csac.algorithms.shapes import Action, Actions, Count, Key, Observation, Observations, Scalar
-from csac.algorithms.statistics import Statistics, normalise, normalise_batch
+from csac.algorithms.statistics import Statistics, normalise_batch
 from csac.algorithms.temperature import Temperature
-from csac.types import Metrics, PolicyNetwork, Spec, Transition
+from csac.types import Metrics, Spec, Transition
 
 
 class State(NamedTuple):
@@ -72,16 +72,6 @@ class CSAC(MaximumEntropy):
             temperature=self.first_temperature("auto") if self.entropy_weight == "auto" else None,
             actor_metrics=first_metrics(("actor_loss", "entropy", "relative_entropy"), self.policy_delay),
         )
-
-    def act(self, state: State, observation: Observation, key: Key, explore: bool) -> Action:
-        """Return ã(s, ξ) if exploring (Eq. actor), else tanh(mean)."""
-        actor = state.actor if explore else evaluated_actor(state)
-        policy = policy_at(actor, normalise(state.observation_statistics, observation))
-        return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
-
-    def policy(self, state: State) -> PolicyNetwork:
-        """Return the evaluated actor's layers and its observation normaliser."""
-        return policy_network(evaluated_actor(state), state.observation_statistics, "tanh_gaussian")
 
     def update(self, state: State, batch: Transition, key: Key, step: Count) -> tuple[State, Metrics]:
         """Run the update phase of Algorithm 1, lines 12 to 23, on the mini-batch of line 13."""

@@ -22,7 +22,7 @@ from typing import (
 import numpy as np
 
 from csac.checks import did_you_mean
-from csac.synonyms import argument_hint, value_hint
+from csac.synonyms import argument_hint
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -62,8 +62,7 @@ def check_hyperparameters(algorithm: Any) -> None:
         try:
             object.__setattr__(algorithm, field.name, _convert(value, hints[field.name]))
         except ValueError as error:
-            hint = value_hint(field.name, value)
-            raise InputError(f"{field.name} must be {error}, not {value!r}{hint and f': {hint}'}") from None
+            raise InputError(f"{field.name} must be {error}, not {value!r}") from None
 
 
 def reject_unknown_names(algorithm: type[Algorithm]) -> type[Algorithm]:
@@ -85,21 +84,41 @@ def reject_unknown_names(algorithm: type[Algorithm]) -> type[Algorithm]:
 
 def _convert(value: Any, hint: Any) -> Any:
     """Return a value as a plain Python value of the hinted type. Raises ValueError with what it must be."""
-    if get_origin(hint) in (Union, UnionType):
-        return _convert_union(value, get_args(hint))
-    kind, *limits = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    value = _CONVERSIONS.get(get_origin(kind) or kind, lambda value, _: value)(value, kind)
-    # Limits apply to the value in 32 bits, where 1 - 1e-9 is 1.
-    rounded = float(np.float32(value)) if kind is float else value
-    for limit in limits:
-        if not limit.accepts(rounded):
-            raise ValueError(limit.words)
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return None if value is None and NoneType in arguments else _convert_union(value, arguments)
+    if origin is Annotated:
+        kind, *limits = arguments
+        value = _convert(value, kind)
+        # Limits apply to the value in 32 bits, where 1 - 1e-9 is 1.
+        rounded = float(np.float32(value)) if kind is float else value
+        for limit in limits:
+            if not limit.accepts(rounded):
+                raise ValueError(limit.words)
+        return value
+    if origin is tuple:
+        if not isinstance(value, tuple | list):
+            raise ValueError("a tuple of whole numbers" if arguments[0] is int else "a tuple")
+        return tuple(_convert(one, arguments[0]) for one in value)
+    if origin is Literal and (not isinstance(value, str) or value not in arguments):
+        raise ValueError(f"{'one of ' * (len(arguments) > 1)}{', '.join(arguments)}")
+    if hint is bool and not isinstance(value, bool):
+        raise ValueError("true or false")
+    if hint is float:
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
+        if not (is_number and -LARGEST_FLOAT <= value <= LARGEST_FLOAT):  # pyright: ignore[reportOperatorIssue]
+            raise ValueError("a finite number")
+        return float(value)
+    if hint is int:
+        if isinstance(value, bool) or not isinstance(value, Integral):
+            raise ValueError("a whole number")
+        if (number := int(value)) > LARGEST_INTEGER:
+            raise ValueError(f"at most {LARGEST_INTEGER:,}")
+        return number
     return value
 
 
 def _convert_union(value: Any, kinds: tuple[Any, ...]) -> Any:
-    if value is None and NoneType in kinds:
-        return None
     problems = []
     for kind in kinds:
         if kind is not NoneType:
@@ -108,47 +127,3 @@ def _convert_union(value: Any, kinds: tuple[Any, ...]) -> Any:
             except ValueError as error:
                 problems.append(str(error))
     raise ValueError(", or ".join(problems))
-
-
-def _as_float(value: Any, kind: Any) -> float:
-    is_number = isinstance(value, Real) and not isinstance(value, bool)
-    if not (is_number and -LARGEST_FLOAT <= value <= LARGEST_FLOAT):  # pyright: ignore[reportOperatorIssue]
-        raise ValueError("a finite number")
-    return float(value)
-
-
-def _as_integer(value: Any, kind: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise ValueError("a whole number")
-    number = int(value)
-    if number > LARGEST_INTEGER:
-        raise ValueError(f"at most {LARGEST_INTEGER:,}")
-    return number
-
-
-def _as_boolean(value: Any, kind: Any) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError("true or false")
-    return value
-
-
-def _as_literal(value: Any, kind: Any) -> str:
-    choices = get_args(kind)
-    if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{'one of ' * (len(choices) > 1)}{', '.join(choices)}")
-    return value
-
-
-def _as_tuple(value: Any, kind: Any) -> tuple[Any, ...]:
-    if not isinstance(value, tuple | list):
-        raise ValueError("a tuple of whole numbers" if get_args(kind)[:1] == (int,) else "a tuple")
-    return tuple(_convert(one, get_args(kind)[0]) for one in value)
-
-
-_CONVERSIONS: dict[Any, Callable[[Any, Any], Any]] = {
-    float: _as_float,
-    int: _as_integer,
-    bool: _as_boolean,
-    Literal: _as_literal,
-    tuple: _as_tuple,
-}

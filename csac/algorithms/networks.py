@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
@@ -40,6 +41,37 @@ class Hidden(NamedTuple):
 PLAIN = Hidden()
 
 
+@dataclass(frozen=True)
+class Architecture:
+    """Activation and layer norm of the hidden layers of actor and critics."""
+
+    activation: Activation = "relu"
+    """Activation of the hidden layers."""
+    layer_norm: bool = False
+    """Whether hidden layers are normalised over their outputs before the activation."""
+    actor_activation: Activation | None = None
+    """Activation of the actor, if it differs from `activation`."""
+    critic_activation: Activation | None = None
+    """Activation of the critics, if it differs from `activation`."""
+    actor_layer_norm: bool | None = None
+    """Whether the actor has layer norm, if it differs from `layer_norm`."""
+    critic_layer_norm: bool | None = None
+    """Whether the critics have layer norm, if it differs from `layer_norm`."""
+
+    @property
+    def actor_hidden(self) -> Hidden:
+        """Activation and layer norm of the actor's hidden layers."""
+        return self._hidden(self.actor_activation, self.actor_layer_norm)
+
+    @property
+    def critic_hidden(self) -> Hidden:
+        """Activation and layer norm of each critic's hidden layers."""
+        return self._hidden(self.critic_activation, self.critic_layer_norm)
+
+    def _hidden(self, activation: Activation | None, layer_norm: bool | None) -> Hidden:
+        return Hidden(activation or self.activation, self.layer_norm if layer_norm is None else layer_norm)
+
+
 class MLP(eqx.Module):
     """A multilayer perceptron for one example."""
 
@@ -63,26 +95,21 @@ class MLP(eqx.Module):
 def make_mlp(key: Key, input_size: int, hidden_sizes: Sequence[int], output_size: int, hidden: Hidden = PLAIN) -> MLP:
     """Return an MLP with weights and biases uniform in ±1/sqrt(inputs), as PyTorch (and so SB3) draws them."""
     sizes = (input_size, *hidden_sizes, output_size)
-    keys = jax.random.split(key, len(sizes) - 1)
-    layers = [_make_layer(k, n_in, n_out) for k, n_in, n_out in zip(keys, sizes[:-1], sizes[1:], strict=True)]
-    return MLP(_normed(layers, hidden), hidden.activation)
+    layers = []
+    for layer_key, n_in, n_out in zip(jax.random.split(key, len(sizes) - 1), sizes[:-1], sizes[1:], strict=True):
+        bound = 1.0 / n_in**0.5
+        uniform = partial(jax.random.uniform, minval=-bound, maxval=bound)
+        weight_key, bias_key = jax.random.split(layer_key)
+        layers.append(Layer(uniform(weight_key, (n_in, n_out)), uniform(bias_key, (n_out,))))
+    return _with_hidden(layers, hidden)
 
 
-def _make_layer(key: Key, n_in: int, n_out: int) -> Layer:
-    weight_key, bias_key = jax.random.split(key)
-    bound = 1.0 / n_in**0.5
-    weight = jax.random.uniform(weight_key, (n_in, n_out), minval=-bound, maxval=bound)
-    return Layer(weight, jax.random.uniform(bias_key, (n_out,), minval=-bound, maxval=bound))
-
-
-def _normed(layers: Sequence[Layer], hidden: Hidden) -> tuple[Layer, ...]:
-    """Return the layers, with layer norm added to the hidden ones if `hidden` has it."""
-    if not hidden.layer_norm:
-        return tuple(layers)
-    normed = (
-        layer._replace(scale=jnp.ones_like(layer.bias), shift=jnp.zeros_like(layer.bias)) for layer in layers[:-1]
-    )
-    return *normed, layers[-1]
+def _with_hidden(layers: list[Layer], hidden: Hidden) -> MLP:
+    """Return the MLP of these affine layers, with `hidden`'s activation and layer norm, if any, between them."""
+    if hidden.layer_norm:
+        normed = [one._replace(scale=jnp.ones_like(one.bias), shift=jnp.zeros_like(one.bias)) for one in layers[:-1]]
+        layers = [*normed, layers[-1]]
+    return MLP(tuple(layers), hidden.activation)
 
 
 def make_orthogonal_mlp(
@@ -96,7 +123,7 @@ def make_orthogonal_mlp(
         Layer(jax.nn.initializers.orthogonal(gain)(k, (n_in, n_out)), jnp.zeros(n_out))
         for k, gain, n_in, n_out in zip(keys, gains, sizes[:-1], sizes[1:], strict=True)
     ]
-    return MLP(_normed(layers, hidden), hidden.activation)
+    return _with_hidden(layers, hidden)
 
 
 def learnable(network: Any) -> Any:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from csac.algorithms.architecture import Architecture
+from csac.algorithms.distributions import policy_at
 from csac.algorithms.exploration import Noise, noise_of
 from csac.algorithms.hyperparameters import (
     COUNT,
@@ -26,6 +26,7 @@ from csac.algorithms.hyperparameters import (
 from csac.algorithms.memory import Replay
 from csac.algorithms.networks import (
     MLP,
+    Architecture,
     Schedule,
     apply_schedule,
     copy_tree,
@@ -36,9 +37,9 @@ from csac.algorithms.networks import (
     plain_layers,
     polyak,
 )
-from csac.algorithms.shapes import Action, Count, Key, Scalar
-from csac.algorithms.statistics import Statistics, normaliser_of
-from csac.algorithms.temperature import Temperature, adapt, make_temperature
+from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar
+from csac.algorithms.statistics import Statistics, normalise, normaliser_of
+from csac.algorithms.temperature import Temperature, adapt, finite_log
 from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParameters, Spec, Transition
 
 if TYPE_CHECKING:
@@ -200,10 +201,20 @@ class MaximumEntropy(TwinCritics):
         networks = super().first_networks(key, spec, steps, actor_outputs)
         return networks | {"average": copy_tree(networks["actor"]) if self.policy_average_rate < 1 else None}
 
+    def act(self, state: Any, observation: Observation, key: Key, explore: bool) -> Action:
+        """Return ã(s, ξ) if exploring (CSAC's Eq. actor), else tanh(mean)."""
+        actor = state.actor if explore else evaluated_actor(state)
+        policy = policy_at(actor, normalise(state.observation_statistics, observation))
+        return policy.sample(self.noise(key, policy.mean.size)) if explore else policy.mode()
+
+    def policy(self, state: Any) -> PolicyNetwork:
+        """Return the evaluated actor's layers and its observation normaliser."""
+        return policy_network(evaluated_actor(state), state.observation_statistics, "tanh_gaussian")
+
     def first_temperature(self, given: float | Literal["auto"]) -> Temperature:
         """Return the initial temperature: the given weight, or `initial_entropy_weight` for `auto`."""
-        weight = self.initial_entropy_weight if given == "auto" else given
-        return make_temperature(weight, make_optimiser(self.weight_learning_rate))
+        log_weight = finite_log(self.initial_entropy_weight if given == "auto" else given)
+        return Temperature(log_weight, init_optimiser(make_optimiser(self.weight_learning_rate), log_weight))
 
     def average_after(self, average: MLP | None, actor: MLP, step: Count) -> MLP | None:
         """Return the average after adding the actor of update number `step`; None if there is no average.

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from csac.algorithms.architecture import Architecture
 from csac.algorithms.distributions import Gaussian
 from csac.algorithms.hyperparameters import (
     COUNT,
@@ -25,6 +24,7 @@ from csac.algorithms.hyperparameters import (
 from csac.algorithms.memory import Rollout
 from csac.algorithms.networks import (
     MLP,
+    Architecture,
     Schedule,
     gradient_step,
     init_optimiser,
@@ -34,13 +34,12 @@ from csac.algorithms.networks import (
 )
 from csac.algorithms.returns import advantages_of, discounted_returns, explained_variance
 from csac.algorithms.shapes import Action, Count, Key, Observation, Scalar, Scalars
-from csac.algorithms.statistics import EPSILON, Statistics, normalise
+from csac.algorithms.statistics import EPSILON, Statistics, normalise, normaliser_of
 from csac.types import (
     Activation,
     Cadence,
     InputError,
     Metrics,
-    Normaliser,
     PolicyNetwork,
     PolicyParameters,
     Spec,
@@ -275,13 +274,10 @@ class PPO(Architecture):
 
     def policy(self, state: State) -> PolicyNetwork:
         """Return the actor's layers, its log standard deviation and its observation normaliser."""
-        actor, statistics = state.parameters.actor, state.observation_statistics
-        normaliser = Normaliser(statistics.mean, statistics.std, jnp.float32(self.normalisation_limit))
-        parameters = PolicyParameters(
-            actors=(actor.layers,),
-            normaliser=normaliser if self.normalise_observations else None,
-            log_std=state.parameters.log_std,
-        )
+        actor, _, log_std = state.parameters
+        statistics = state.observation_statistics if self.normalise_observations else None
+        normaliser = normaliser_of(statistics, self.normalisation_limit)
+        parameters = PolicyParameters((actor.layers,), normaliser=normaliser, log_std=log_std)
         return PolicyNetwork(parameters, actor.activation, "clipped_gaussian")
 
     def _optimiser(self, learning_rate: float | Scalar) -> optax.GradientTransformation:

@@ -77,6 +77,6 @@ def normalise_batch(statistics: Statistics | None, batch: Transition) -> tuple[S
     return statistics, batch._replace(observation=see(batch.observation), next_observation=see(batch.next_observation))
 
 
-def normaliser_of(statistics: Statistics | None) -> Normaliser | None:
+def normaliser_of(statistics: Statistics | None, limit: float = LIMIT) -> Normaliser | None:
     """Return the normaliser of the exported policy, which does what `normalise` does."""
-    return None if statistics is None else Normaliser(statistics.mean, statistics.std, jnp.float32(LIMIT))
+    return None if statistics is None else Normaliser(statistics.mean, statistics.std, jnp.float32(limit))

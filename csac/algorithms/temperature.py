@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 
-from csac.algorithms.networks import gradient_step, init_optimiser
+from csac.algorithms.networks import gradient_step
 from csac.algorithms.shapes import Scalar
 from csac.types import Metrics
 
@@ -23,12 +23,6 @@ class Temperature(NamedTuple):
 
     log_weight: Scalar
     optimiser: Any
-
-
-def make_temperature(weight: float, optimiser: optax.GradientTransformation) -> Temperature:
-    """Return the initial state of a learnt weight."""
-    log_weight = finite_log(weight)
-    return Temperature(log_weight, init_optimiser(optimiser, log_weight))
 
 
 def finite_log(weight: float) -> Scalar:

@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = _run(words)
     finally:
         failure = _flush()
-    return complain(_write_error_message(failure), 1) if failure and not code else code
+    return _unwritten(failure) if failure and not code else code
 
 
 def _run(words: list[str]) -> int:
@@ -66,7 +66,7 @@ def _run(words: list[str]) -> int:
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        return complain(_write_error_message(error), 1)
+        return _unwritten(error)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -86,8 +86,8 @@ def _dispatch(words: list[str]) -> int:
     return run(words[0], words[1:])
 
 
-def _write_error_message(error: OSError) -> str:
-    return f"not all of the output could be written: {error.strerror}"
+def _unwritten(error: OSError) -> int:
+    return complain(f"not all of the output could be written: {error.strerror}", 1)
 
 
 def _prepare_streams() -> None:

@@ -34,7 +34,10 @@ def run(name: str, words: list[str]) -> int:
                 f"no command is called {name!r}{_hint(name, [*COMMANDS, 'report', 'study'])} (csac --help)"
             )
         kind, function = COMMANDS[name]
-        with _leaving_at_once() if name in ("train", "resume") else nullcontext():
+        leaving = nullcontext
+        if name in ("train", "resume"):
+            from csac.training.signals import leaving_at_once as leaving  # imports NumPy
+        with leaving():
             options = (parse_training if name in ("train", "tune") else parse)(kind, words, f"csac {name}")
             return function(options, command)
     except HelpShown:
@@ -51,12 +54,6 @@ def _resume(options: Resume, command: str) -> int:
     from csac.training.train import resume
 
     return _run_training(resume, **vars(options), command=command)
-
-
-def _leaving_at_once() -> Any:
-    from csac.training.signals import leaving_at_once  # imports NumPy
-
-    return leaving_at_once()
 
 
 def _run_training(training: Callable[..., RunSet], *arguments: Any, **options: Any) -> int:
@@ -95,10 +92,7 @@ def _evaluate(options: Evaluate, _: str) -> int:
         console.print(table)
     failed = {seed: reason for seed, reason in runs.failures.items() if seed in results}
     notes = [f"seed {seed} failed at {reason}; it is in no mean, and in no file" for seed, reason in failed.items()]
-    notes += [f"no episode's last info holds a number called {name!r}" for name in tables.silent_events(results)]
     sound = [run for run in runs.runs if run.seed in results and run.seed not in failed]
-    if options.stochastic and {load(run.path, which=options.which).network.head for run in sound} == {"tanh"}:
-        notes.append("the policy is deterministic: --stochastic changes nothing")
     untested = [str(seed) for seed in runs.seeds if seed not in results and options.seed is None]
     notes += [f"without such a policy yet: seed {', '.join(untested)}"] * bool(untested)
     tables.print_lines(console, [f"note: {text}" for text in notes + _untrained_notes(runs)])

@@ -21,7 +21,6 @@ from csac.seeds import name_seeds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
-    from pathlib import Path
 
     from rich.console import Console, RenderableType
 
@@ -81,7 +80,9 @@ class Reporter:
             self._speed = Speed(self._clock)
         self._speed.add(sum(one.step for one in self._seeds.values()))
         if not self._live and self._clock() - self._last_output >= SECONDS_OF_SILENCE:
-            self._print(Text(f"step {self._range()} of {self._steps:,}{self._pace()}{self._newer_returns()}"))
+            reached = sorted({one.step for one in (self._living() or self._seeds).values()})
+            span = " to ".join(f"{step:,}" for step in dict.fromkeys((reached[0], reached[-1])))
+            self._print(Text(f"step {span} of {self._steps:,}{self._pace()}"))
 
     def evaluated(self, step: int, returns: Mapping[int, float]) -> None:
         """Record the mean returns of some seeds' evaluations at `step`; print a line once no seed is behind."""
@@ -141,19 +142,6 @@ class Reporter:
 
     def _is_warming_up(self) -> bool:
         return any(one.step < min(self._warmup, self._steps) for one in self._living().values())
-
-    def _range(self) -> str:
-        steps = [one.step for one in (self._living() or self._seeds).values()]
-        return f"{min(steps):,}" + (f" to {max(steps):,}" if max(steps) > min(steps) else "")
-
-    def _newer_returns(self) -> str:
-        """Return the last return of each seed that has an evaluation newer than the last one printed."""
-        returns = [
-            f"seed {seed} {number(one.returns[max(one.returns)])} at {max(one.returns):,}"
-            for seed, one in self._living().items()
-            if max(one.returns, default=0) > self._printed
-        ]
-        return f"; last returns: {', '.join(returns)}" if returns and len(returns) <= MOST_SEEDS_SHOWN else ""
 
     def _pace(self) -> str:
         """Return the speed and the time left, or the phase: compiling, warm-up or finishing."""
@@ -226,7 +214,7 @@ def _next_lines(runs: RunSet, has_curve: bool) -> list[tuple[str, str]]:
     """Return (label, line) pairs that say where to look and what to type next."""
     directory, config = shlex.quote(str(runs.path)), runs.config
     logs = [run.path / "log.txt" for run in runs.runs if run.seed in runs.failures]
-    lines = [("why", f"the traceback is in {log}") for log in logs if _has_traceback(log)]
+    lines = [("why", f"see {log}") for log in logs if log.exists()]
     lines += [("curve", str(runs.curve))] if has_curve else []
     if not any(run.policy_file().exists() for run in runs.runs if run.seed not in runs.failures):
         return lines
@@ -238,11 +226,6 @@ def _next_lines(runs: RunSet, has_curve: bool) -> list[tuple[str, str]]:
         film = shlex.quote(str(runs.path / "play.mp4"))
         lines.append(("watch it", f"{program()} play {directory} --video {film}"))
     return [*lines, ("export", f"{program()} export {directory} --format numpy")]
-
-
-def _has_traceback(log: Path) -> bool:
-    """Return whether a log has a traceback; a run that failed because a number was not finite has none."""
-    return log.exists() and "\nTraceback (most recent" in log.read_text("utf-8", "replace")
 
 
 def _outcome(runs: RunSet, time_taken: str) -> str:

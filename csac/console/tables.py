@@ -7,6 +7,7 @@ import shlex
 import shutil
 import sys
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -72,11 +73,11 @@ def duration(seconds: float) -> str:
     return f"{whole} s"
 
 
+@dataclass
 class Fitted:
     """A table on a terminal; if that is too narrow, cells are folded so that no digit is lost."""
 
-    def __init__(self, table: Table) -> None:
-        self.table = table
+    table: Table
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[rich.table.Table]:
         table = self.table
@@ -135,12 +136,6 @@ def _evaluation_table(rows: np.ndarray, failed: Collection[int]) -> Table:
         body += report_tables.interval_rows([over], largest, len(blank))
     headings = ("seed", "mean return", "± std", "min", "max", "length", *["success"] * has_success)
     return Table(headings, tuple(body), note=report_tables.few_seeds(len(sound)))
-
-
-def silent_events(results: Mapping[int, Sequence[EvaluationEpisode]]) -> list[str]:
-    """Return the names of the events that no episode recorded."""
-    rows = _rows(results)
-    return [name for name in (rows.dtype.names or ())[len(COLUMNS["evaluations"]) :] if np.isnan(rows[name]).all()]
 
 
 def run_lines(sets: Sequence[RunSet]) -> list[Text]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -31,20 +32,17 @@ _LOADER = FOLDER / "policy.py"  # runs any policy with NumPy alone; copied next 
 FILES: dict[str, str] = {"numpy": "policy.py", "onnx": "policy.onnx", "c": "policy.h"}
 
 
+@dataclass(eq=False)
 class Artefact:
     """An exported policy, as opened by `open_artefact`.
 
     `fields` is the content of its `contract.json`; `runner` computes its actions.
     """
 
-    def __init__(
-        self,
-        fields: dict[str, Any],
-        contract: Contract,
-        guards: Guards,
-        runner: Loader | onnx.Session | c.Library,
-    ) -> None:
-        self.fields, self.contract, self.guards, self.runner = fields, contract, guards, runner
+    fields: dict[str, Any]
+    contract: Contract
+    guards: Guards
+    runner: Loader | onnx.Session | c.Library
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return the action, float32 [action], on the environment's scale, for a flat observation [observation]."""

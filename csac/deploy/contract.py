@@ -201,14 +201,10 @@ def write_with_checksum(path: Path, content: bytes, fields: Mapping[str, Any] | 
     write_contract(new)
 
 
-def check_checksum(path: Path, fields: Any) -> None:
+def check_checksum(path: Path, fields: Mapping[str, Any]) -> None:
     """Raise InputError if the contract's `fields` have no checksum of a file, or a different one."""
-    checksums = fields.get("sha256") if isinstance(fields, dict) else None
-    known = checksums.get(path.name) if isinstance(checksums, dict) else None
-    if not isinstance(known, str):
-        raise InputError(f"{path.with_name(CONTRACT)} has no checksum of {path.name}: restore both from a copy")
-    if sha256_of(path) not in known:
-        raise InputError(f"{path} does not match its checksum in {CONTRACT}: restore it from a copy")
+    if sha256_of(path) not in (fields.get("sha256") or {}).get(path.name, ""):
+        raise InputError(f"{path} does not match its checksum in {CONTRACT}: restore both from a copy")
 
 
 def sha256_of(path: Path) -> str:

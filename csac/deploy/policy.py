@@ -13,7 +13,7 @@ from csac.checks import check_flag, check_path
 from csac.deploy.contract import CONTRACT, Contract, check_checksum, read_json, write_with_checksum
 from csac.deploy.parameters import copied, from_tensors, to_tensors
 from csac.record.files import writing
-from csac.types import LAYER_NORM_EPSILON, InputError, Layer, Normaliser, PolicyNetwork
+from csac.types import LAYER_NORM_EPSILON, InputError, Layer, PolicyNetwork
 
 if TYPE_CHECKING:
     from csac.types import Activation
@@ -108,8 +108,10 @@ class Policy:
         The values are None for a single actor. For each row, `act` takes the action with the highest value, the first
         in a tie. For float64 observations, the computation is in float64.
         """
-        normaliser = self.network.parameters.normaliser
-        inputs = observations if normaliser is None else _normalised(observations, normaliser)
+        inputs = observations
+        if (normaliser := self.network.parameters.normaliser) is not None:
+            inputs = (observations - normaliser.mean) / normaliser.std
+            np.clip(inputs, -normaliser.limit, normaliser.limit, out=inputs)
         with np.errstate(over="ignore", invalid="ignore"):  # non-finite actions are refused where they are used
             if len(self._actors) == 1:
                 return self._action(self._actors[0], inputs, noise)[None], None
@@ -192,11 +194,6 @@ def _split_actor(layers: tuple[Layer, ...], contract: Contract) -> _Actor:
     weight, bias, size = *layers[-1][:2], contract.spec.action_size
     mean = Layer(np.ascontiguousarray(weight[:, :size]), bias[:size])
     return _Actor(layers[:-1], mean, Layer(np.ascontiguousarray(weight[:, size:]), bias[size:]))
-
-
-def _normalised(observations: np.ndarray, normaliser: Normaliser) -> np.ndarray:
-    scaled = (observations - normaliser.mean) / normaliser.std
-    return np.clip(scaled, -normaliser.limit, normaliser.limit, out=scaled)
 
 
 def _hidden(layers: tuple[Layer, ...], inputs: np.ndarray, activation: Activation) -> np.ndarray:

@@ -98,7 +98,12 @@ def export_run(
             if runs.curve.exists():
                 write_atomically(folder / CURVE, runs.curve.read_bytes())
             write_atomically(folder / CARD, model_card(fields, runs.curve.exists()).encode())
-    return Exported(place, fields, _notes(run, episodes))
+    notes, manifest = [], run.manifest
+    if manifest.state == "failed":
+        notes.append(f"seed {run.seed} failed at {manifest.failure}; this is the policy that it has left")
+    if episodes:
+        notes += [f"{line}: csac evaluate --perturb tests it so" for line in unlike_training(run.config.perturbations)]
+    return Exported(place, fields, notes)
 
 
 @contextmanager
@@ -234,12 +239,3 @@ def control_rate(raw: Any) -> float | None:
         return rate
     frames = raw.metadata.get("render_fps")
     return float(frames) if isinstance(frames, int | float) and frames > 0 else None
-
-
-def _notes(run: RunDirectory, episodes: int) -> list[str]:
-    notes, manifest = [], run.manifest
-    if manifest.state == "failed":
-        notes.append(f"seed {run.seed} failed at {manifest.failure}; this is the policy that it has left")
-    if episodes:
-        notes += [f"{line}: csac evaluate --perturb tests it so" for line in unlike_training(run.config.perturbations)]
-    return notes

@@ -18,7 +18,7 @@ from csac.tasks.failures import EnvironmentFailure, failure_of, one_line, raise_
 from csac.tasks.perturbations import NOISES, PHYSICS, Noise, Physics
 from csac.tasks.pybullet import quietly
 from csac.tasks.registry import Task, has_memory, is_pybullet, make, task_name
-from csac.tasks.spaces import check_finite, contract_parts, dict_part, part, scalar, size
+from csac.tasks.spaces import check_finite, contract_parts, dict_part, part, scalar
 from csac.types import InputError, Snapshot, Spec
 
 _log = logging.getLogger(__name__)
@@ -49,7 +49,7 @@ class Environment:
             self.close()
             raise InputError(f"{self.task_name}: {error}") from None
         self._parts, self._action_shape, low, high = self.contract_parts
-        self.spec = Spec(size(self._parts), math.prod(self._action_shape))
+        self.spec = Spec(sum(math.prod(shape) for _, shape in self._parts), math.prod(self._action_shape))
         self.bounds = ActionBounds(low, high)
         self.raw_observation: Any = None  # the latest, as returned by the environment
         self._physics: Physics | None = None

@@ -60,7 +60,12 @@ class Perturbation:
         if self.kind not in KINDS:
             raise InputError(f"no perturbation is called {self.kind!r}: there are {', '.join(KINDS)}")
         check_whole(f"the step of {self.kind}", self.step, 0, STEPS_LIMIT)
-        object.__setattr__(self, "value", _checked(self.kind, self.value))
+        number = math.nan if isinstance(self.value, str | bool) else _number(self.value)
+        if not 0 <= number < math.inf or (self.kind == "mass" and not number):
+            what = "factor" if self.kind in PHYSICS else "standard deviation"
+            least = "above 0" if self.kind == "mass" else "of 0 or more"
+            raise InputError(f"{self.kind} takes a finite {what} {least}, not {number}")
+        object.__setattr__(self, "value", number)
         object.__setattr__(self, "step", int(self.step))
 
     @classmethod
@@ -130,33 +135,18 @@ def continued(before: Sequence[Perturbation], given: Sequence[Perturbation], beg
     return perturbations_of([*past, *(item for item in given if item.step >= begin)])
 
 
-def refuse_late(perturbations: Iterable[Perturbation], steps: int, planned: bool = False) -> None:
-    """Raise InputError for a perturbation that starts only when a run of `steps` is over.
-
-    `planned` says that the perturbations come from the source run of a fork, not from the user.
-    """
-    hint = "the source run planned it: --perturb none leaves it out" if planned else "give an earlier step"
+def refuse_late(perturbations: Iterable[Perturbation], steps: int) -> None:
+    """Raise InputError for a perturbation that starts only when a run of `steps` is over."""
     for item in perturbations:
         if item.step >= steps:
+            hint = "give an earlier step, or --perturb none"
             raise InputError(f"{item} would change nothing: the run ends at step {steps}; {hint}")
 
 
 def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:
     """Return (step, labels of the perturbations that start there), in order of the steps."""
-    labels: dict[int, list[str]] = {}
-    for item in perturbations_of(perturbations):
-        labels.setdefault(item.step, []).append(item.label)
-    return [(step, ", ".join(texts)) for step, texts in labels.items()]
-
-
-def _checked(kind: str, value: object) -> float:
-    """Return the value of a perturbation as a float. Raise InputError if it is invalid for its kind."""
-    number = math.nan if isinstance(value, str | bool) else _number(value)
-    if not 0 <= number < math.inf or (kind == "mass" and not number):
-        what = "factor" if kind in PHYSICS else "standard deviation"
-        least = "above 0" if kind == "mass" else "of 0 or more"
-        raise InputError(f"{kind} takes a finite {what} {least}, not {number}")
-    return number
+    groups = itertools.groupby(perturbations_of(perturbations), attrgetter("step"))
+    return [(step, ", ".join(item.label for item in group)) for step, group in groups]
 
 
 def _number(value: object) -> float:

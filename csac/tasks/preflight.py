@@ -51,10 +51,8 @@ def seed_warning(environment: Environment) -> str | None:
 
 def limit_warning(environment: Environment, task: Task, longest: int) -> str | None:
     """Return a warning if the task has no known time limit, so that an episode may take `longest` steps; else None."""
-    wrapper, spec = environment.raw, environment.raw.spec
-    while isinstance(wrapper, gymnasium.Wrapper) and not isinstance(wrapper, TimeLimit):
-        wrapper = wrapper.env
-    if isinstance(wrapper, TimeLimit) or (spec and spec.max_episode_steps) or adapter_of(task):
+    spec, has_limit = environment.raw.spec, any(isinstance(one, TimeLimit) for one in _wrappers(environment))
+    if has_limit or (spec and spec.max_episode_steps) or adapter_of(task):
         return None
     remedy = "--env-kwargs '{\"max_episode_steps\": 1000}'" if isinstance(task, str) else "gymnasium.wrappers.TimeLimit"
     return (
@@ -65,15 +63,19 @@ def limit_warning(environment: Environment, task: Task, longest: int) -> str | N
 
 def wrapper_warnings(environment: Environment) -> list[str]:
     """Return a warning for each wrapper that learns statistics, which csac neither saves nor exports."""
-    lines, wrapper = [], environment.raw
+    return [
+        f"{environment.task_name}: {type(wrapper).__name__} keeps statistics that are saved neither with the policy "
+        "nor in checkpoints, and each environment has its own: leave it out (PPO normalises by itself)"
+        for wrapper in _wrappers(environment)
+        if isinstance(wrapper, NormalizeObservation | NormalizeReward)
+    ]
+
+
+def _wrappers(environment: Environment) -> Iterator[gymnasium.Wrapper]:
+    wrapper = environment.raw
     while isinstance(wrapper, gymnasium.Wrapper):
-        if isinstance(wrapper, NormalizeObservation | NormalizeReward):
-            lines.append(
-                f"{environment.task_name}: {type(wrapper).__name__} keeps statistics that are saved neither with the "
-                "policy nor in checkpoints, and each environment has its own: leave it out (PPO normalises by itself)"
-            )
+        yield wrapper
         wrapper = wrapper.env
-    return lines
 
 
 @contextmanager

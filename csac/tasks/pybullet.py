@@ -10,7 +10,7 @@ import re
 import sys
 import tempfile
 import threading
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -155,8 +155,14 @@ def quietly() -> Iterator[None]:
     PyBullet prints from C, past Python's streams, and PyFlyt from Python, whose streams need not write to the file
     descriptors (a notebook's do not). Any other output is passed on at the end of the block.
     """
-    with _lock, _filter_descriptor(1), _filter_descriptor(2), _filter_stream("stdout"), _filter_stream("stderr"):
-        yield
+    out, err = io.StringIO(), io.StringIO()
+    try:
+        with _lock, _filter_descriptor(1), _filter_descriptor(2), redirect_stdout(out), redirect_stderr(err):
+            yield
+    finally:
+        for stream, buffer in ((sys.stdout, out), (sys.stderr, err)):
+            with suppress(OSError, ValueError, AttributeError):  # the reader is gone, or there is no stream
+                stream.write(_without_chatter(buffer.getvalue()))
 
 
 @contextmanager
@@ -181,20 +187,6 @@ def _filter_descriptor(descriptor: int) -> Iterator[None]:
             with suppress(OSError):  # the reader is gone
                 while rest:
                     rest = rest[os.write(descriptor, rest) :]
-
-
-@contextmanager
-def _filter_stream(name: str) -> Iterator[None]:
-    """Replace Python's stream of this name by a buffer during this block, then pass on what is not chatter."""
-    stream, buffer = getattr(sys, name), io.StringIO()
-    setattr(sys, name, buffer)
-    try:
-        yield
-    finally:
-        if getattr(sys, name) is buffer:
-            setattr(sys, name, stream)
-        with suppress(OSError, ValueError, AttributeError):  # the reader is gone, or there is no stream
-            stream.write(_without_chatter(buffer.getvalue()))
 
 
 def _without_chatter(written: str) -> str:

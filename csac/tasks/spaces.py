@@ -86,11 +86,6 @@ def _moved(rounded: np.ndarray, outside: np.ndarray, direction: float) -> np.nda
     return np.where(outside & np.isfinite(rounded), np.nextafter(rounded, np.float32(direction)), rounded)
 
 
-def size(parts: Parts) -> int:
-    """Return the total size of all parts."""
-    return sum(math.prod(shape) for _, shape in parts)
-
-
 def dict_part(observation: Any, key: str | None, shape: tuple[int, ...]) -> np.ndarray:
     """Return one part of a Dict observation, as `part` does. Raise EnvironmentFailure if it is missing or invalid."""
     if not isinstance(observation, dict) or key not in observation:

@@ -229,14 +229,19 @@ class SeedEnvironments:
         self.observations[place], self._reward[place] = arrays.pop("observation"), values["reward"]
         if not values["alive"]:
             self.stop(place[0])
-        elif is_exact and self._is_restored(place, Snapshot(arrays, values["environment"])):
-            self._returns[place], self._lengths[place] = values["episode_return"], values["episode_length"]
-            self._episode_events[place] = EpisodeEvents(self._events, values.get("events"))
-        else:
-            self._episodes_begun[place] -= 1
-            self._reset([place])
-            return False
-        return True
+            return True
+        seed = training_seed(self.seeds[place[0]], self._episodes_begun[place] - 1, *place[1:])
+        try:
+            if is_exact:
+                self._by_place[place].restore(seed, Snapshot(arrays, values["environment"]))
+                self._returns[place], self._lengths[place] = values["episode_return"], values["episode_length"]
+                self._episode_events[place] = EpisodeEvents(self._events, values.get("events"))
+                return True
+        except EnvironmentFailure as error:  # the task may have changed since
+            self.refused[place[0]] = str(error)
+        self._episodes_begun[place] -= 1
+        self._reset([place])
+        return False
 
     def begin_again(self) -> np.ndarray:
         """Restart the episodes in progress; return observations [seed, observation]."""
@@ -277,16 +282,6 @@ class SeedEnvironments:
                 self.observations[place] = self._by_place[place].reset(seed)
             except EnvironmentFailure as error:
                 self._fail(place, error)
-
-    def _is_restored(self, place: Place, saved: Snapshot) -> bool:
-        """Restore an environment's snapshot; return whether it accepts it: the task may have changed since."""
-        seed = training_seed(self.seeds[place[0]], self._episodes_begun[place] - 1, *place[1:])
-        try:
-            self._by_place[place].restore(seed, saved)
-        except EnvironmentFailure as error:
-            self.refused[place[0]] = str(error)
-            return False
-        return True
 
     def _stop_stepping(self, index: int) -> None:
         self._running = [place for place in self._running if place[0] != index]

@@ -108,7 +108,7 @@ def make_configs(
         if configs[0].hindsight:
             check_goals(algorithm, environment)
         changes = perturbations_of(configs[0].perturbations)
-        refuse_late(changes, configs[0].steps, planned=source is not None and perturbations is None)
+        refuse_late(changes, configs[0].steps)
         for item in changes:
             environment.perturb({item.kind: item.value})
     spec = spec._replace(environments=configs[0].environments)

@@ -279,8 +279,6 @@ def test_the_first_state_has_copies_for_targets_and_reference_two_critics_and_bu
         ({"relative_entropy_weight": "auto"}, "relative_entropy_weight"),
         ({"relative_entropy_form": "implicit"}, "relative_entropy_form"),
         ({"critic_reference": "earlier"}, "critic_reference"),
-        ({"reference_policy": "previous"}, 'write reference_policy="average", reference_rate=1'),
-        ({"reference_policy": "algorithm1"}, 'write reference_policy="periodic", reference_period=1'),
     ],
 )
 def test_what_makes_no_sense_is_refused(options, name):

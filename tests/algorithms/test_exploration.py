@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from equations import SPEC, begin
 
-from csac import InputError
 from csac.algorithms import CSAC, SAC, SD3, TD3
 from csac.algorithms.exploration import OCTAVES, keys_at, keys_of, noise_of, uniform_of
 from csac.training.one_seed import OneSeed
@@ -87,9 +86,3 @@ def test_warm_up_actions_are_the_correlated_noise_of_each_environment():
     np.testing.assert_array_equal(actions[0], actions[2])
     np.testing.assert_allclose(actions[0], [uniform_of("pink", key, 2) for key in keys], rtol=1e-6)
     assert np.abs(actions[0] - actions[1]).max() > 0
-
-
-def test_a_number_is_the_standard_deviation_under_its_name_of_now():
-    given: Any = 0.1
-    with pytest.raises(InputError, match=r"one of white, pink, ou, not 0.1: write exploration_std=0.1"):
-        TD3(exploration_noise=given)
