@@ -138,11 +138,7 @@ def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at
             f"this needs about {needed / 2**30:,.1f} GiB of memory and {available / 2**30:.1f} GiB are available: "
             f"use fewer seeds, a smaller replay or batch (one seed takes {per_seed / 2**30:,.2f} GiB)"
         )
-    processes = len(programs) + helpers
-    return (
-        f"memory: about {needed / 2**30:.1f} GiB of the {available / 2**30:.1f} GiB available "
-        f"({seeds} x {per_seed / 2**20:.0f} MiB, {processes} process{'es' if processes > 1 else ''})"
-    )
+    return f"memory: about {needed / 2**30:.1f} of {available / 2**30:.1f} GiB available"
 
 
 def _bytes_per_seed(algorithm: Algorithm, config: RunConfig, spec: Spec) -> int:
