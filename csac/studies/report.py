@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from csac.console.tables import duration
-from csac.record import rendering, report_tables
+from csac.record import report_tables
 from csac.record.files import write_atomically, writing
 from csac.record.plots import encoded, figure_of, looks_of
-from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric
+from csac.record.rendering import EMPTY, Cell, Row, Table, markdown, number, numeric
 from csac.record.statistics import drawdown, evaluation_matrix, is_case, last_evaluations
 from csac.record.summaries import last_rows, over_seeds, recoveries
 from csac.studies import paper
@@ -81,7 +80,6 @@ def write(path: Path, title: str, parts: Sequence[Part]) -> None:
 def _html(title: str, parts: Sequence[Part]) -> str:
     loader = PackageLoader("csac.studies")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.filters["table"] = lambda table: Markup(rendering.html(table))
     environment.filters["picture"] = lambda figure: base64.b64encode(encoded(figure, "svg")).decode()
     template = environment.get_template("report.html.jinja")
     return template.render(title=title, parts=[(type(part).__name__, part) for part in parts])
@@ -102,7 +100,7 @@ def _markdown(path: Path, title: str, parts: Sequence[Part]) -> str:
             case str():
                 texts.append(part)
             case _:
-                texts.append(rendering.markdown(part))
+                texts.append(markdown(part))
     return "\n\n".join(texts) + "\n"
 
 
