@@ -13,14 +13,13 @@ from csac.record.statistics import (
     FEWEST_FOR_INTERVAL,
     REGAINED,
     Recovery,
+    bootstrap_interval,
     evaluation_matrix,
-    improvement_interval,
     interquartile_mean,
     is_case,
     last_evaluations,
     maximum_average_return,
     probability_of_improvement,
-    stratified_bootstrap_interval,
 )
 from csac.record.summaries import OverSeeds, case_names, cases, last_rows, over_seeds
 from csac.types import InputError
@@ -188,13 +187,13 @@ def interval_rows(over: Sequence[OverSeeds], largest: float, blank: int) -> list
 def middle(scores: np.ndarray, form: str = "") -> Cell:
     """Return the interquartile mean of scores [seed, ...] with its bootstrap interval, in a format that suits it."""
     value = interquartile_mean(scores)
-    return _with_interval(value, stratified_bootstrap_interval(scores, interquartile_mean), form or _form(value))
+    return _with_interval(value, bootstrap_interval(interquartile_mean, scores), form or _form(value))
 
 
 def above(scores: np.ndarray, first: np.ndarray) -> Cell:
     """Return the probability that a seed of `scores` [seed, ...] is above one of `first`, with its interval."""
     probability = probability_of_improvement(scores, first) if len(scores) and len(first) else math.nan
-    return _with_interval(probability, improvement_interval(scores, first), ".2f")
+    return _with_interval(probability, bootstrap_interval(probability_of_improvement, scores, first), ".2f")
 
 
 def few_seeds(count: int) -> str:
