@@ -137,8 +137,8 @@ def returns(arms: Sequence[Arm]) -> Iterator[Part]:
     """Yield tables of scores with intervals, maximum average returns and the paper's, worst seeds and drawdowns."""
     yield Heading("Returns")
     for place, group in by_place(arms).items():
-        runs = [(arm.label, arm.rows) for arm in group]
-        yield report_tables.comparison_table(runs, [list(arm.failures) for arm in group], POINTS)._replace(title=place)
+        runs = [(arm.label, arm.rows, len(arm.failures)) for arm in group]
+        yield report_tables.comparison_table(runs)._replace(title=place)
         yield Table(
             ("method", "maximum average return", "the paper's", "worst seed", "largest drawdown"),
             tuple(map(_extremes, group)),
