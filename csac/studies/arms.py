@@ -217,7 +217,7 @@ def train_command(config: RunConfig, seeds: Sequence[int]) -> str:
     default = RunConfig(task=config.task)
     evaluated = ("evaluation_interval", "evaluation_episodes", "evaluation_environments")
     for name in ("environments", *evaluated, "device", "hindsight"):
-        words += _option(name, getattr(config, name)) if getattr(config, name) != getattr(default, name) else []
+        words += option(name, getattr(config, name)) if getattr(config, name) != getattr(default, name) else []
     words += [word for change in config.perturbations for word in ("--perturb", change)]
     words += ["--env-kwargs", json.dumps(config.environment_arguments)] * bool(config.environment_arguments)
     if more := [name for name in config.events if name not in events_of(config.task)]:
@@ -234,12 +234,12 @@ def _options(config: RunConfig) -> list[str]:
             given = hyperparameters(preset, config.algorithm, config.task) if preset else {}
             values = json.loads(json.dumps(dataclasses.asdict(make(**given)))) if make else {}
             changed = {name: own for name, own in config.hyperparameters.items() if own != values.get(name)}
-            options = [word for name, value in changed.items() for word in _option(name, value)]
+            options = [word for name, value in changed.items() for word in option(name, value)]
             choices.append([*(["--preset", preset] if preset else []), *options])
     return min(choices, key=len)
 
 
-def _option(name: str, value: Any) -> list[str]:
+def option(name: str, value: Any) -> list[str]:
     """Return the words of one option; for None there are none, since leaving the option out means None."""
     flag = name.replace("_", "-")
     if value is None:
