@@ -231,7 +231,8 @@ class Source(NamedTuple):
         before = self.runs[wanted.seed].config
         if before.algorithm != wanted.algorithm:
             raise InputError(f"{self.path} does not fit: its algorithm is {before.algorithm}, not {wanted.algorithm}")
-        found = differences(*({name: getattr(one, name) for name in _SAME_IN_FORKS} for one in (before, wanted)))
+        old, new = ({name: getattr(one, name) for name in _SAME_IN_FORKS} for one in (before, wanted))
+        found = differences(old, new)
         old, new = before.hyperparameters, wanted.hyperparameters
         others = [name for name in _LEARNT_WITH if name in old and old[name] != new.get(name)]
         found += [f"its networks have learnt with {name} {old[name]}" for name in others]
