@@ -104,7 +104,8 @@ def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
     rows: list[Row] = []
     for run in runs:
         label = [Cell(run.label)] if len(runs) > 1 else []
-        largest = _largest(run)
+        returns = [value for one in run.seeds.values() for value in (one.before, one.drop, one.final)]
+        largest = float(np.nanmax(np.abs(returns), initial=0.0))  # sets the format of numbers
         for seed, one in run.seeds.items():
             cells = (*label, _whole(seed), *_recovery_cells(one, largest))
             rows.append(Row(cells, "failed" if seed in run.failed else "plain"))
@@ -224,12 +225,6 @@ def _with_interval(value: float, bounds: tuple[float, float] | None, form: str) 
 def _success(rows: np.ndarray) -> OverSeeds | None:
     """Return the share of successful episodes in the last evaluations, None if the task does not report success."""
     return cases(last_rows(rows, points=3), {"success": True})[0].over_seeds if is_case(rows["success"]) else None
-
-
-def _largest(run: RecoverySummary) -> float:
-    """Return the largest absolute return in a table, which sets their number format."""
-    returns = [abs(value) for one in run.seeds.values() for value in (one.before, one.drop, one.final)]
-    return max((value for value in returns if not math.isnan(value)), default=0.0)
 
 
 def _recovery_cells(one: Recovery, largest: float) -> list[Cell]:

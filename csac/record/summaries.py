@@ -92,11 +92,9 @@ def perturbation_recoveries(
 
     Perturbations with no evaluation before or none after them are left out.
     """
-    found = []
-    for index, (step, text) in enumerate(perturbed):
-        until = perturbed[index + 1][0] if index + 1 < len(perturbed) else None
+    found, steps = [], [step for step, _ in perturbed]
+    for (step, text), since, until in zip(perturbed, [-1, *steps], [*steps[1:], None], strict=False):
         end = f", until {until:,}" if until and until < rows["step"].max(initial=0) else ""
-        since = perturbed[index - 1][0] if index else -1
         summary = recoveries(f"{text} after step {step:,}{end}", rows, step, until, since, failed)
         if any(np.isfinite(one.drop) for one in summary.seeds.values()):
             found.append(summary)

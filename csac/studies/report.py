@@ -184,9 +184,9 @@ def robustness(arms: Sequence[Arm]) -> Iterator[Part]:
     if any(arm.marks for arm in arms):
         yield Heading("Perturbations")
     for group in by_place(arm for arm in arms if arm.marks).values():
-        steps = [-1, *(step for step, _ in group[0].marks), None]
-        for index, (step, text) in enumerate(group[0].marks):
-            found = [recoveries(arm.label, arm.rows, step, steps[index + 2], steps[index] or -1) for arm in group]
+        steps = [step for step, _ in group[0].marks]
+        for (step, text), since, until in zip(group[0].marks, [-1, *steps], [*steps[1:], None], strict=False):
+            found = [recoveries(arm.label, arm.rows, step, until, since) for arm in group]
             yield report_tables.recovery_table(found)._replace(title=f"{group[0].task}, {text} after step {step:,}")
 
 
