@@ -103,9 +103,8 @@ def gather(study: Study, directory: Path) -> list[Arm]:
     arms: dict[tuple[str, tuple[str, ...], str], Arm] = {}
     for wanted in study.runs():
         method, config, _ = wanted
-        key = config.task, config.perturbations, method.label
         new_arm = Arm(method.label, config.task, config.perturbations, published=method.published)
-        arm = arms.setdefault(key, new_arm)
+        arm = arms.setdefault((config.task, config.perturbations, method.label), new_arm)
         if run := wanted.open(directory):
             arm.runs.append(run)
         else:
@@ -122,8 +121,7 @@ def read_arms(
     """Group the runs at and below these paths into arms: by label, or by configuration apart from the seed."""
     groups: dict[tuple[Any, ...], Arm] = {}
     seen: set[Path] = set()
-    plain = [("", path) for path in paths]
-    for label, path in [*((label, path) for label, some in labelled for path in some), *plain]:
+    for label, path in [*((label, path) for label, some in labelled for path in some), *(("", path) for path in paths)]:
         for run in _runs(path, on_damaged):
             if not label and run.path in seen:
                 continue
@@ -267,7 +265,5 @@ def seconds_per_step(run: RunDirectory) -> float | None:
 
 def by_place(arms: Iterable[Arm]) -> dict[str, list[Arm]]:
     """Group arms by their `place`, that is by task and perturbations."""
-    groups: dict[str, list[Arm]] = {}
-    for arm in arms:
-        groups.setdefault(arm.place, []).append(arm)
-    return groups
+    arms = list(arms)
+    return {place: [arm for arm in arms if arm.place == place] for place in dict.fromkeys(arm.place for arm in arms)}

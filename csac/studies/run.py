@@ -127,10 +127,7 @@ class Progress:
         self.over.add(path)
         returns = last_evaluations(RunDirectory.open(path).evaluations, points=1)
         last = f", last return {number(next(iter(returns.values())))}" if returns else ""
-        self.say(f"{len(self.over)} of {len(self.runs)}: {self.runs[path].name}: {outcome}{last}")
-
-    def say(self, text: str) -> None:
-        """Print a line."""
+        text = f"{len(self.over)} of {len(self.runs)}: {self.runs[path].name}: {outcome}{last}"
         self.console.print(text, soft_wrap=True)
 
 
@@ -152,4 +149,4 @@ class RunProgress(Watcher):
 
     def note(self, text: str) -> None:
         """Print a line about the run."""
-        self.study.say(f"{self.study.runs[self.path].name}: {text}")
+        self.study.console.print(f"{self.study.runs[self.path].name}: {text}", soft_wrap=True)
