@@ -11,9 +11,9 @@ from csac.record.statistics import (
     FEWEST_FOR_BOOTSTRAP,
     FEWEST_FOR_INTERVAL,
     Recovery,
+    bootstrap_interval,
     drawdown,
     evaluation_matrix,
-    improvement_interval,
     interquartile_mean,
     last_evaluations,
     maximum_average_return,
@@ -21,7 +21,6 @@ from csac.record.statistics import (
     probability_of_improvement,
     recovery,
     steps_to_reach,
-    stratified_bootstrap_interval,
 )
 
 if TYPE_CHECKING:
@@ -123,10 +122,12 @@ def _mean_and_interval(values: np.ndarray) -> tuple[str, str]:
 
 def _middle_and_above(values: np.ndarray, first: np.ndarray) -> tuple[str, str]:
     middle = interquartile_mean(values)
-    text = with_interval(middle, stratified_bootstrap_interval(values, interquartile_mean), _form(middle))
+    text = with_interval(middle, bootstrap_interval(interquartile_mean, values), _form(middle))
     if values is first:
         return text, ""
-    return text, with_interval(probability_of_improvement(values, first), improvement_interval(values, first), ".2f")
+    return text, with_interval(
+        probability_of_improvement(values, first), bootstrap_interval(probability_of_improvement, values, first), ".2f"
+    )
 
 
 def _success(rows: np.ndarray) -> str:
@@ -274,7 +275,7 @@ def overall_table(title: str, finals: Finals) -> str:
     lines = []
     for label, own in values.items():
         shares = own / values[first].mean(axis=0)
-        middle = with_interval(interquartile_mean(shares), stratified_bootstrap_interval(shares, interquartile_mean))
+        middle = with_interval(interquartile_mean(shares), bootstrap_interval(interquartile_mean, shares))
         lines.append([label, f"{shares.mean(axis=0).mean():.3f}", middle, f"{shares.min():.3f}"])
     title = f"{title}: over {comma(list(finals))}, as shares of {first}"
     return table(["method", "scaled mean", "scaled IQM", "worst seed"], lines, title)
@@ -287,7 +288,7 @@ def stacked(values: Finals) -> dict[str, np.ndarray]:
 
 def compared(values: np.ndarray, others: np.ndarray, repetitions: int = 2_000) -> tuple[str, str]:
     """Return the probability that `values` are higher than `others`, with its interval, and the verdict."""
-    interval = improvement_interval(values, others, repetitions)
+    interval = bootstrap_interval(probability_of_improvement, values, others, repetitions=repetitions)
     return with_interval(probability_of_improvement(values, others), interval), verdict(interval)
 
 

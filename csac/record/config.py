@@ -118,7 +118,7 @@ def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
         kept = json.loads(json.dumps(plain))
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{name} cannot be kept in a manifest: {error}; use numbers, texts, lists and dicts") from None
-    if not isinstance(values, dict) or not same(kept, plain):
+    if not isinstance(values, dict) or kept != plain:
         raise InputError(f"{name} cannot be kept in a manifest: keys must be texts, not {values!r:.60}")
     return kept
 
@@ -131,15 +131,6 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def same(old: Any, new: Any) -> bool:
-    """Return whether two JSON values are equal, where NaN equals NaN."""
-    if isinstance(old, list) and isinstance(new, list):
-        return len(old) == len(new) and all(map(same, old, new))
-    if isinstance(old, dict) and isinstance(new, dict):
-        return old.keys() == new.keys() and all(same(old[key], new[key]) for key in old)
-    return old == new or (old != old and new != new)
-
-
 def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
     """Return "name is X, not Y" for each value that differs, with one line per hyperparameter or argument."""
     lines = []
@@ -147,7 +138,7 @@ def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -
         old, new = before.get(name), now.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
             lines += differences(old, new, f"{name}." if name in ("environment_arguments", "demonstrations") else "")
-        elif not same(_listed(old), _listed(new)):
+        elif _listed(old) != _listed(new):
             lines.append(f"{prefix}{name} is {_listed(old)!r}, not {_listed(new)!r}")
     return lines
 

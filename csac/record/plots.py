@@ -113,9 +113,8 @@ def figure_of(
         for curve in curves:
             _draw_curve(axes, curve, looks[curve.label])
         _dress(axes, curves, marks)
-        axes.set_ylabel(quantity)
+        axes.set(ylabel=quantity, ylim=limits)
         if curves:
-            axes.set_ylim(limits or _limits(curves))
             _draw_legend(figure, curves, looks)
         if title:
             lines = textwrap.wrap(title, int(0.68 * CHARACTERS * WIDTH))
@@ -164,16 +163,6 @@ def _draw_curve(axes: Axes, curve: Curve, look: Look) -> None:
             there = ~np.isnan(line)
             axes.plot(curve.steps[there], line[there], color=colour, alpha=0.4, linewidth=0.7, marker=marker, zorder=2)
     axes.plot(curve.steps, curve.mean, color=colour, linestyle=style, linewidth=2.2, marker=marker, zorder=3)
-
-
-def _limits(curves: Sequence[Curve]) -> tuple[float, float]:
-    """Return the axis limits: they show all seeds, and bands up to a quarter of the seeds' range beyond."""
-    lowest, highest = (float(f([f(curve.returns) for curve in curves])) for f in (np.nanmin, np.nanmax))
-    reach = 0.25 * (highest - lowest) or 1.0
-    bands = [curve for curve in curves if curve.seeds >= FEWEST_FOR_BAND]
-    low = min((float(np.nanmin(curve.low)) for curve in bands), default=lowest)
-    high = max((float(np.nanmax(curve.high)) for curve in bands), default=highest)
-    return max(min(low, lowest) - 0.2 * reach, lowest - reach), min(max(high, highest) + 0.2 * reach, highest + reach)
 
 
 def _draw_legend(figure: Figure, curves: Sequence[Curve], looks: Mapping[str, Look]) -> None:

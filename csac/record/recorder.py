@@ -9,14 +9,13 @@ import numpy as np
 
 from csac.record.run import TABLES
 from csac.record.statistics import best_return, is_case
+from csac.record.summaries import events_in
 from csac.record.wandb import WandbLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from csac.record.run import RunDirectory, Table
-
-_NUMBERS = ("seed", "step", "episode", "return", "length")  # columns of evaluations.csv that are not events
 
 
 class Recorder:
@@ -38,7 +37,7 @@ class Recorder:
 
             episodes = run.rows("episodes")
             recent = [dict(zip(episodes.dtype.names or (), row, strict=True)) for row in episodes.tolist()[-100:]]
-            cases = [name for name in rows.dtype.names or () if name not in _NUMBERS and is_case(rows[name])]
+            cases = [name for name in events_in(rows) if is_case(rows[name])]
             self._log = TensorBoardLog(run.tensorboard, begin, recent, cases)
         if wandb:
             self._wandb = self._call_wandb(WandbLog, run, wandb)

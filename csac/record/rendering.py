@@ -1,8 +1,7 @@
-"""Text tables, rendered as Markdown or HTML; `console` shows them in a terminal."""
+"""Text tables, rendered as Markdown; `console` shows them in a terminal, and reports in HTML."""
 
 from __future__ import annotations
 
-import html as html_text
 import math
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -11,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Cell(NamedTuple):
-    """The text of a cell and, if it is numeric, its value, used to sort the column and to align it right."""
+    """The text of a cell and, if it is numeric, its value; a column of numbers is aligned right."""
 
     text: str
     value: float | None = None
@@ -73,38 +72,9 @@ def markdown(table: Table) -> str:
     return "\n".join(lines)
 
 
-def html(table: Table) -> str:
-    """Return the table in HTML: rows have the class `plain`, `failed` or `summary`, values are in `data-value`."""
-    headings = "".join(
-        f'<th scope="col"{_class(table, column)}>{html_text.escape(heading)}</th>'
-        for column, heading in enumerate(table.headings)
-    )
-    body = "\n".join(_html_row(table, row) for row in table.rows)
-    caption = f"<caption>{html_text.escape(table.title)}</caption>\n" if table.title else ""
-    span = f'<td colspan="{len(table.headings)}">{html_text.escape(table.note)}</td>'
-    foot = f"<tfoot><tr>{span}</tr></tfoot>\n" if table.note else ""
-    return f"<table>\n{caption}<thead><tr>{headings}</tr></thead>\n<tbody>\n{body}\n</tbody>\n{foot}</table>"
-
-
 def _line(texts: Iterable[str]) -> str:
     return f"| {' | '.join(map(_escaped, texts))} |"
 
 
 def _escaped(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
-
-
-def _html_row(table: Table, row: Row) -> str:
-    cells = "".join(
-        f"<td{_class(table, column)}{_value(cell)}>{html_text.escape(cell.text)}</td>"
-        for column, cell in enumerate(row.cells)
-    )
-    return f'<tr class="{row.kind}">{cells}</tr>'
-
-
-def _class(table: Table, column: int) -> str:
-    return ' class="number"' if table.is_numeric(column) else ""
-
-
-def _value(cell: Cell) -> str:
-    return "" if cell.value is None or math.isnan(cell.value) else f' data-value="{cell.value:.10g}"'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,14 +14,13 @@ from csac.record.statistics import (
     FEWEST_FOR_INTERVAL,
     REGAINED,
     Recovery,
+    bootstrap_interval,
     evaluation_matrix,
-    improvement_interval,
     interquartile_mean,
     is_case,
     last_evaluations,
     maximum_average_return,
     probability_of_improvement,
-    stratified_bootstrap_interval,
 )
 from csac.record.summaries import OverSeeds, case_names, cases, last_rows, over_seeds
 from csac.types import InputError
@@ -67,35 +67,30 @@ def results_table(rows: np.ndarray, failed: Collection[int] = (), episodes: Mapp
     return Table(headings, tuple(body), note=few_seeds(len(sound)))
 
 
-def comparison_table(
-    runs: Sequence[tuple[str, np.ndarray]], failed: Sequence[Collection[int]] = (), points: int = 3
-) -> Table:
-    """Return one row per run, given as `(label, rows)`: last evaluations, their interval, maximum average return.
+def comparison_table(runs: Sequence[tuple[str, np.ndarray, int]]) -> Table:
+    """Return one row per run, given as `(label, rows, number of failed seeds)`.
 
-    `failed` are each run's failed seeds, which are counted and left out. The ratio to the first run is given for
+    It has the last evaluations, their interval and the maximum average return. The ratio to the first run is given for
     positive returns only: for costs, a worse run would have a larger ratio. Interquartile means are shown if any run
     has enough seeds for their interval.
     """
-    failed = failed or [()] * len(runs)
-    sound = [rows[~np.isin(rows["seed"], list(lost))] for (_, rows), lost in zip(runs, failed, strict=True)]
-    scores = [np.array(list(last_evaluations(rows, points).values())) for rows in sound]
-    shares = [_success(rows, points) for rows in sound]
+    scores = [np.array(list(last_evaluations(rows).values())) for _, rows, _ in runs]
+    shares = [_success(rows) for _, rows, _ in runs]
     has_middles = any(len(seed_means) >= FEWEST_FOR_BOOTSTRAP for seed_means in scores)
-    first, body = over_seeds(scores[0]).mean if scores else math.nan, []
-    for (label, rows), lost, sound_rows, seed_means, share in zip(runs, failed, sound, scores, shares, strict=True):
+    first, body = over_seeds(scores[0]).mean, []
+    for (label, rows, failed), seed_means, share in zip(runs, scores, shares, strict=True):
         over = over_seeds(seed_means)
         ratio = over.mean / first if first > 0 else math.nan
-        count = Cell(str(over.seeds) + (f" ({len(lost)} failed)" if lost else ""), over.seeds)
+        count = Cell(str(over.seeds) + f" ({failed} failed)" * bool(failed), over.seeds)
         cells = [Cell(label), count, _whole(int(rows["step"].max(initial=0))), plus_minus(over), interval(over)]
-        cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(sound_rows)]
+        cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(rows)]
         cells += [middle(seed_means), EMPTY if seed_means is scores[0] else above(seed_means, scores[0])] * has_middles
         cells += [plus_minus(share, ".0%") if share else EMPTY] * any(shares)
         body.append(Row(tuple(cells)))
-    last = f"last {'three' if points == 3 else points} evaluations"
-    headings = ["run", "seeds", "steps", f"{last}, mean ± std over seeds", "95 % t-interval", "to the first"]
-    headings.append("maximum average return")
+    headings = ["run", "seeds", "steps", "last three evaluations, mean ± std over seeds", "95 % t-interval"]
+    headings += ["to the first", "maximum average return"]
     headings += ["IQM, 95 % bootstrap interval", "above the first, probability"] * has_middles
-    return Table((*headings, *[f"success, {last}"] * any(shares)), tuple(body))
+    return Table((*headings, *["success, last three evaluations"] * any(shares)), tuple(body))
 
 
 def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
@@ -109,7 +104,8 @@ def recovery_table(runs: Sequence[RecoverySummary]) -> Table:
     rows: list[Row] = []
     for run in runs:
         label = [Cell(run.label)] if len(runs) > 1 else []
-        largest = _largest(run)
+        returns = [value for one in run.seeds.values() for value in (one.before, one.drop, one.final)]
+        largest = float(np.nanmax(np.abs(returns), initial=0.0))  # sets the format of numbers
         for seed, one in run.seeds.items():
             cells = (*label, _whole(seed), *_recovery_cells(one, largest))
             rows.append(Row(cells, "failed" if seed in run.failed else "plain"))
@@ -127,21 +123,14 @@ def case_table(rows: np.ndarray) -> Table | None:
     """Return the paper's case table of one run: how often success and each event occurred per 1,000 rollouts, by seed.
 
     A rollout that does not report a case counts as one without it. A number, such as waypoints reached, is shown as
-    its mean over the rollouts that report it. With several seeds, the last columns are their mean and deviation.
+    its mean over the rollouts that report it. With several seeds, the last column is their mean ± std.
     None if the task reports nothing. `rows` [episode] are those of evaluations.csv.
     """
-    found = cases(rows)
-    if not found:
-        return None
-    seeds = list(found[0].by_seed)
-    shown = seeds if len(seeds) <= MOST_COLUMNS else []
-    headings = [_rollouts([rows]), *(f"seed {seed}" for seed in shown), *["mean", "± std"] * (len(seeds) > 1)]
-    body = []
-    for case in found:
-        values = [case.by_seed[seed] for seed in shown]
-        values += [case.over_seeds.mean, case.over_seeds.std] if len(seeds) > 1 else []
-        body.append(Row((Cell(_case_name(case.name, case.is_case)), *(_rate(case.is_case, value) for value in values))))
-    return Table(tuple(headings), tuple(body))
+    seeds = np.unique(rows["seed"]).tolist()
+    runs = [(f"seed {seed}", rows[rows["seed"] == seed]) for seed in seeds if len(seeds) <= MOST_COLUMNS]
+    runs += [("mean ± std", rows)] * (len(seeds) > 1)
+    table = case_comparison_table(runs)
+    return table and table._replace(rows=table.rows[1:])
 
 
 def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | None:
@@ -154,7 +143,7 @@ def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | Non
         return None
     by_run = [{case.name: case for case in cases(rows, names)} for _, rows in runs]
     body = [
-        Row((Cell(_case_name(name, happens)), *(_rate_over_seeds(found.get(name)) for found in by_run)))
+        Row((Cell(name if happens else f"{name} (mean)"), *(_rate_over_seeds(found.get(name)) for found in by_run)))
         for name, happens in names.items()
     ]
     headings = (_rollouts([rows for _, rows in runs]), *(label for label, _ in runs))
@@ -188,13 +177,13 @@ def interval_rows(over: Sequence[OverSeeds], largest: float, blank: int) -> list
 def middle(scores: np.ndarray, form: str = "") -> Cell:
     """Return the interquartile mean of scores [seed, ...] with its bootstrap interval, in a format that suits it."""
     value = interquartile_mean(scores)
-    return _with_interval(value, stratified_bootstrap_interval(scores, interquartile_mean), form or _form(value))
+    return _with_interval(value, bootstrap_interval(interquartile_mean, scores), form or _form(value))
 
 
 def above(scores: np.ndarray, first: np.ndarray) -> Cell:
     """Return the probability that a seed of `scores` [seed, ...] is above one of `first`, with its interval."""
     probability = probability_of_improvement(scores, first) if len(scores) and len(first) else math.nan
-    return _with_interval(probability, improvement_interval(scores, first), ".2f")
+    return _with_interval(probability, bootstrap_interval(probability_of_improvement, scores, first), ".2f")
 
 
 def few_seeds(count: int) -> str:
@@ -222,11 +211,10 @@ def _form(value: float, spread: float = math.nan) -> str:
 
 
 def _maximum(rows: np.ndarray) -> Cell:
-    try:
+    with suppress(InputError):  # no evaluation point has every seed
         best, step = maximum_average_return(rows)
-    except InputError:  # no evaluation point has every seed
-        return EMPTY
-    return Cell(f"{best:{_form(best)}} at {step:,}", best)
+        return Cell(f"{best:{_form(best)}} at {step:,}", best)
+    return EMPTY
 
 
 def _with_interval(value: float, bounds: tuple[float, float] | None, form: str) -> Cell:
@@ -234,16 +222,9 @@ def _with_interval(value: float, bounds: tuple[float, float] | None, form: str) 
     return numeric(value, f"{value:{form}}{between}")
 
 
-def _success(rows: np.ndarray, points: int) -> OverSeeds | None:
+def _success(rows: np.ndarray) -> OverSeeds | None:
     """Return the share of successful episodes in the last evaluations, None if the task does not report success."""
-    found = cases(last_rows(rows, points), {"success": True}) if is_case(rows["success"]) else []
-    return found[0].over_seeds if found else None
-
-
-def _largest(run: RecoverySummary) -> float:
-    """Return the largest absolute return in a table, which sets their number format."""
-    returns = [abs(value) for one in run.seeds.values() for value in (one.before, one.drop, one.final)]
-    return max((value for value in returns if not math.isnan(value)), default=0.0)
+    return cases(last_rows(rows, points=3), {"success": True})[0].over_seeds if is_case(rows["success"]) else None
 
 
 def _recovery_cells(one: Recovery, largest: float) -> list[Cell]:
@@ -268,14 +249,6 @@ def _rollouts(runs: Sequence[np.ndarray]) -> str:
     return f"per {ROLLOUTS:,} rollouts (from {counts} of each seed)"
 
 
-def _case_name(name: str, is_case: bool) -> str:
-    return name if is_case else f"{name} (mean)"
-
-
-def _rate(is_case: bool, value: float) -> Cell:
-    return numeric(value, f"{ROLLOUTS * value:,.1f}" if is_case else f"{value:,.3f}")
-
-
 def _mean_return(rows: np.ndarray) -> Cell:
     over = over_seeds(rows["return"][rows["seed"] == seed].mean() for seed in set(rows["seed"].tolist()))
     return plus_minus(over, ".3g" if 0 < abs(over.mean) < SMALL else ",.1f")
@@ -284,5 +257,5 @@ def _mean_return(rows: np.ndarray) -> Cell:
 def _rate_over_seeds(case: CaseSummary | None) -> Cell:
     if case is None:
         return EMPTY
-    mean, std = (_rate(case.is_case, value).text for value in (case.over_seeds.mean, case.over_seeds.std))
-    return numeric(case.over_seeds.mean, f"{mean} ± {std}" if std else mean)
+    over, form, scale = case.over_seeds, *((",.1f", ROLLOUTS) if case.is_case else (",.3f", 1))
+    return plus_minus(over._replace(mean=scale * over.mean, std=scale * over.std), form)

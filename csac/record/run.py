@@ -159,8 +159,10 @@ class RunDirectory:
         """Return the path of a table's intact copy in the newest checkpoint, or None."""
         for manifest in _manifest_copies(self.path)[:1]:
             copy = manifest.with_name(f"{name}.csv")
-            if copy.is_file() and _matches_checksum(copy, copy.read_bytes()):
-                return copy
+            with suppress(OSError, ValueError, KeyError, TypeError):
+                files = json.loads(manifest.with_name("checkpoint.json").read_bytes())["files"]
+                if files[copy.name]["sha256"] == hashlib.sha256(copy.read_bytes()).hexdigest():
+                    return copy
         return None
 
     def _continues_copy(self, path: Path, copy: Path) -> bool:
@@ -206,14 +208,6 @@ def now() -> str:
 def is_run(path: str | Path) -> bool:
     """Return whether there is a run in this directory, intact or damaged."""
     return os.path.exists(Path(path) / MANIFEST) or bool(_manifest_copies(Path(path)))
-
-
-def _matches_checksum(copy: Path, content: bytes) -> bool:
-    """Return whether a checkpoint's file has the checksum in the checkpoint's list."""
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        files = json.loads((copy.parent / "checkpoint.json").read_bytes())["files"]
-        return files[copy.name]["sha256"] == hashlib.sha256(content).hexdigest()
-    return False
 
 
 def _manifest_copies(path: Path) -> list[Path]:

@@ -5,14 +5,14 @@ A curve is `steps` [t] in increasing order and `returns` [t], each the mean over
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
 FEWEST_FOR_INTERVAL = 3  # seeds: with two, the t-interval is nine standard deviations to either side
 FEWEST_FOR_BOOTSTRAP = 5  # seeds: fewer have too few distinct resamples to say anything
@@ -61,8 +61,8 @@ def mean_over_episodes(values: np.ndarray, is_case: bool) -> float:
     return float(values.mean()) if len(values) else np.nan
 
 
-def mean_and_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
-    """Return the mean over seeds and its t-interval, `mean ± t(n - 1) · s / √n`, for `values` [seed, ...].
+def mean_and_interval(values: np.ndarray) -> Interval:
+    """Return the mean over seeds and its 95 % t-interval, `mean ± t(n - 1) · s / √n`, for `values` [seed, ...].
 
     NaNs are left out. A single value has a mean but no interval.
     """
@@ -74,7 +74,7 @@ def mean_and_interval(values: np.ndarray, confidence: float = 0.95) -> Interval:
     mean = _divide(np.where(present, values, 0.0).sum(axis=0), count)
     squares = (np.where(present, values - mean, 0.0) ** 2).sum(axis=0)
     freedom = np.maximum(count - 1, 0)
-    quantile = special.stdtrit(np.maximum(freedom, 1), 0.5 + confidence / 2)
+    quantile = special.stdtrit(np.maximum(freedom, 1), 0.5 + 0.95 / 2)
     reach = quantile * np.sqrt(_divide(_divide(squares, freedom), count))
     return Interval(mean, mean - reach, mean + reach)
 
@@ -87,16 +87,27 @@ def interquartile_mean(values: np.ndarray) -> float:
     return float(ordered[cut : len(ordered) - cut].mean()) if len(ordered) else np.nan
 
 
-def stratified_bootstrap_interval(
-    scores: np.ndarray, statistic: Callable[[np.ndarray], float], repetitions: int = 2000, seed: int = 0
+def bootstrap_interval(
+    statistic: Callable[..., Any], *samples: np.ndarray, repetitions: int = 2000
 ) -> tuple[float, float] | None:
-    """Return the 95 % percentile interval of `statistic`, resampling the seeds of `scores` [seed, ...] for each task.
+    """Return the 95 % percentile interval of `statistic(*samples)`: a stratified bootstrap over seeds.
 
-    The other axis is the task: average over several evaluations of a seed first. Seeds with any NaN are left out
-    entirely; below five seeds there is no interval. Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of
-    the Statistical Precipice".
+    The seeds of each sample [seed, ...] are resampled separately, for each task separately. The other axis is the task:
+    average over several evaluations of a seed first. Seeds with any NaN are left out entirely; below five seeds there
+    is no interval. Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice".
     """
-    return _bootstrap_interval([scores], statistic, repetitions, seed)
+    arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
+    arrays = [array[~np.isnan(array).any(axis=tuple(range(1, array.ndim)))] for array in arrays]
+    if min(map(len, arrays)) < FEWEST_FOR_BOOTSTRAP:
+        return None
+    generator = np.random.default_rng(0)
+
+    def resampled(array: np.ndarray) -> np.ndarray:
+        return np.take_along_axis(array, generator.integers(len(array), size=array.shape), axis=0)
+
+    values = [statistic(*map(resampled, arrays)) for _ in range(repetitions)]
+    low, high = np.quantile(values, [0.5 - 0.95 / 2, 0.5 + 0.95 / 2])
+    return float(low), float(high)
 
 
 def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
@@ -110,11 +121,6 @@ def probability_of_improvement(scores: np.ndarray, others: np.ndarray) -> float:
     above = np.where(np.isnan(scores) | np.isnan(others), np.nan, (scores > others) + 0.5 * (scores == others))
     pairs = (~np.isnan(above)).sum(axis=(0, 1))
     return float(np.mean(_divide(np.nansum(above, axis=(0, 1)), pairs)))
-
-
-def improvement_interval(scores: np.ndarray, others: np.ndarray, repetitions: int = 2000) -> tuple[float, float] | None:
-    """Return the stratified bootstrap interval of `probability_of_improvement`; None if either has under five seeds."""
-    return _bootstrap_interval([scores, others], probability_of_improvement, repetitions)
 
 
 def maximum_average_return(rows: np.ndarray) -> tuple[float, int]:
@@ -212,24 +218,6 @@ def _recovery(steps: np.ndarray, returns: np.ndarray, step: int, since: int) -> 
     time = steps_to_reach(steps[fallen:] - step, after[fallen:], threshold) if below.any() else 0.0
     relative = drop / abs(before) if before else np.nan
     return Recovery(*map(float, (before, drop, relative, time, area, final, worst)))
-
-
-def _bootstrap_interval(
-    samples: Sequence[np.ndarray], statistic: Callable[..., float], repetitions: int, seed: int = 0
-) -> tuple[float, float] | None:
-    """Return the 95 % percentile interval of `statistic(*samples)`, resampling each sample [seed, ...] on its own."""
-    arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
-    arrays = [array[~np.isnan(array).any(axis=tuple(range(1, array.ndim)))] for array in arrays]
-    if min(map(len, arrays)) < FEWEST_FOR_BOOTSTRAP:
-        return None
-    generator = np.random.default_rng(seed)
-
-    def resampled(array: np.ndarray) -> np.ndarray:
-        return np.take_along_axis(array, generator.integers(len(array), size=array.shape), axis=0)
-
-    values = [statistic(*map(resampled, arrays)) for _ in range(repetitions)]
-    low, high = np.quantile(values, [0.5 - 0.95 / 2, 0.5 + 0.95 / 2])
-    return float(low), float(high)
 
 
 def _divide(numerator: np.ndarray, count: np.ndarray) -> np.ndarray:

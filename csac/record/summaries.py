@@ -92,11 +92,9 @@ def perturbation_recoveries(
 
     Perturbations with no evaluation before or none after them are left out.
     """
-    found = []
-    for index, (step, text) in enumerate(perturbed):
-        until = perturbed[index + 1][0] if index + 1 < len(perturbed) else None
+    found, steps = [], [step for step, _ in perturbed]
+    for (step, text), since, until in zip(perturbed, [-1, *steps], [*steps[1:], None], strict=False):
         end = f", until {until:,}" if until and until < rows["step"].max(initial=0) else ""
-        since = perturbed[index - 1][0] if index else -1
         summary = recoveries(f"{text} after step {step:,}{end}", rows, step, until, since, failed)
         if any(np.isfinite(one.drop) for one in summary.seeds.values()):
             found.append(summary)
@@ -108,8 +106,8 @@ def case_names(runs: Sequence[np.ndarray]) -> dict[str, bool]:
 
     An event that no episode reports is included, as a number that is not known; success is not.
     """
-    names = dict.fromkeys(name for rows in runs for name in rows.dtype.names or () if name in _events(rows))
-    values = {name: np.concatenate([rows[name] for rows in runs if name in _events(rows)]) for name in names}
+    names = dict.fromkeys(name for rows in runs for name in events_in(rows))
+    values = {name: np.concatenate([rows[name] for rows in runs if name in events_in(rows)]) for name in names}
     return {name: is_case(column) for name, column in values.items() if name != "success" or not np.isnan(column).all()}
 
 
@@ -118,13 +116,11 @@ def cases(rows: np.ndarray, names: Mapping[str, bool] | None = None) -> list[Cas
 
     `names` comes from `case_names` of several runs, to treat them alike.
     """
-    found = []
+    found, seeds = [], np.unique(rows["seed"]).tolist()
     for name, happens in (case_names([rows]) if names is None else names).items():
-        if name not in _events(rows):
-            continue
-        seeds = np.unique(rows["seed"]).tolist()
-        by_seed = {seed: mean_over_episodes(rows[name][rows["seed"] == seed], happens) for seed in seeds}
-        found.append(CaseSummary(name, happens, by_seed, over_seeds(by_seed.values())))
+        if name in events_in(rows):
+            by_seed = {seed: mean_over_episodes(rows[name][rows["seed"] == seed], happens) for seed in seeds}
+            found.append(CaseSummary(name, happens, by_seed, over_seeds(by_seed.values())))
     return found
 
 
@@ -137,6 +133,6 @@ def last_rows(rows: np.ndarray, points: int = 1) -> np.ndarray:
     return rows[wanted]
 
 
-def _events(rows: np.ndarray) -> set[str]:
+def events_in(rows: np.ndarray) -> list[str]:
     """Return the columns that describe what happened in an episode."""
-    return {name for name in rows.dtype.names or () if name == "success" or name not in COLUMNS["evaluations"]}
+    return [name for name in rows.dtype.names or () if name == "success" or name not in COLUMNS["evaluations"]]

@@ -74,18 +74,11 @@ def _header(path: Path, line: bytes) -> list[str]:
 def check_new(path: Path) -> None:
     """Raise InputError if no new table can be created at `path`, before anything has been computed for it."""
     if path.suffix.lower() != ".csv":
-        better = path.with_suffix(".csv") if path.name else path / "table.csv"
-        raise InputError(f"the table is a .csv file: name it {better}")
-    try:
-        with suppress(FileNotFoundError):
-            temporary_path(path).lstat()
-    except OSError as error:  # the name is too long, or a part of the path is not a folder
-        raise InputError(f"cannot write {path}: {error.strerror}; choose another place or name") from None
+        raise InputError(f"{path} is no table: give the name of a .csv file")
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
-    folder = path.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(f"cannot write into {folder}: choose a folder that exists and is yours to write")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(f"cannot write into {path.parent}: choose a folder that exists and is yours to write")
 
 
 def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:

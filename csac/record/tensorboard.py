@@ -40,7 +40,7 @@ class TensorBoardLog:
     def __init__(self, folder: Path, begin: int = 0, before: Sequence[Row] = (), cases: Iterable[str] = ()) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         earlier = len([*folder.glob("events.*")])  # a file of the same second would overwrite one
-        self._writer: EventsWriter | None = EventsWriter(str(folder / "events"), f".{earlier}")
+        self._writer = EventsWriter(str(folder / "events"), f".{earlier}")
         self._begin, self._began = begin, time.monotonic()
         self._flushed = self._began
         self._recent: deque[Row] = deque(before, maxlen=EPISODES_AVERAGED)
@@ -62,19 +62,15 @@ class TensorBoardLog:
 
     def flush(self) -> None:
         """Write everything buffered to the file. Raises OSError."""
-        if self._writer:
-            self._writer.flush()
+        self._writer.flush()
         self._flushed = time.monotonic()
 
     def close(self) -> None:
         """Close the file; a write error is ignored, since nothing depends on this file."""
-        writer, self._writer = self._writer, None
-        if writer:
-            with suppress(OSError):
-                writer.close()
+        with suppress(OSError, ValueError):  # ValueError: it is closed already
+            self._writer.close()
 
     def _add(self, event: Event) -> None:
-        assert self._writer
         event.wall_time = time.time()
         self._writer.write_event(event)
         if time.monotonic() - self._flushed >= FLUSH_SECONDS:

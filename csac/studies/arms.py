@@ -103,9 +103,8 @@ def gather(study: Study, directory: Path) -> list[Arm]:
     arms: dict[tuple[str, tuple[str, ...], str], Arm] = {}
     for wanted in study.runs():
         method, config, _ = wanted
-        key = config.task, config.perturbations, method.label
         new_arm = Arm(method.label, config.task, config.perturbations, published=method.published)
-        arm = arms.setdefault(key, new_arm)
+        arm = arms.setdefault((config.task, config.perturbations, method.label), new_arm)
         if run := wanted.open(directory):
             arm.runs.append(run)
         else:
@@ -122,8 +121,7 @@ def read_arms(
     """Group the runs at and below these paths into arms: by label, or by configuration apart from the seed."""
     groups: dict[tuple[Any, ...], Arm] = {}
     seen: set[Path] = set()
-    plain = [("", path) for path in paths]
-    for label, path in [*((label, path) for label, some in labelled for path in some), *plain]:
+    for label, path in [*((label, path) for label, some in labelled for path in some), *(("", path) for path in paths)]:
         for run in _runs(path, on_damaged):
             if not label and run.path in seen:
                 continue
@@ -217,7 +215,7 @@ def train_command(config: RunConfig, seeds: Sequence[int]) -> str:
     default = RunConfig(task=config.task)
     evaluated = ("evaluation_interval", "evaluation_episodes", "evaluation_environments")
     for name in ("environments", *evaluated, "device", "hindsight"):
-        words += _option(name, getattr(config, name)) if getattr(config, name) != getattr(default, name) else []
+        words += option(name, getattr(config, name)) if getattr(config, name) != getattr(default, name) else []
     words += [word for change in config.perturbations for word in ("--perturb", change)]
     words += ["--env-kwargs", json.dumps(config.environment_arguments)] * bool(config.environment_arguments)
     if more := [name for name in config.events if name not in events_of(config.task)]:
@@ -234,12 +232,12 @@ def _options(config: RunConfig) -> list[str]:
             given = hyperparameters(preset, config.algorithm, config.task) if preset else {}
             values = json.loads(json.dumps(dataclasses.asdict(make(**given)))) if make else {}
             changed = {name: own for name, own in config.hyperparameters.items() if own != values.get(name)}
-            options = [word for name, value in changed.items() for word in _option(name, value)]
+            options = [word for name, value in changed.items() for word in option(name, value)]
             choices.append([*(["--preset", preset] if preset else []), *options])
     return min(choices, key=len)
 
 
-def _option(name: str, value: Any) -> list[str]:
+def option(name: str, value: Any) -> list[str]:
     """Return the words of one option; for None there are none, since leaving the option out means None."""
     flag = name.replace("_", "-")
     if value is None:
@@ -267,7 +265,5 @@ def seconds_per_step(run: RunDirectory) -> float | None:
 
 def by_place(arms: Iterable[Arm]) -> dict[str, list[Arm]]:
     """Group arms by their `place`, that is by task and perturbations."""
-    groups: dict[str, list[Arm]] = {}
-    for arm in arms:
-        groups.setdefault(arm.place, []).append(arm)
-    return groups
+    arms = list(arms)
+    return {place: [arm for arm in arms if arm.place == place] for place in dict.fromkeys(arm.place for arm in arms)}

@@ -21,7 +21,7 @@ from csac.processes import cores_to_use
 from csac.record.rendering import Cell, Row, Table, short
 from csac.record.run import StorageFailure
 from csac.record.wandb import import_wandb
-from csac.studies.arms import gather, read_arms, seconds_per_step
+from csac.studies.arms import gather, option, read_arms, seconds_per_step
 from csac.studies.study import find, named
 from csac.types import InputError
 
@@ -82,11 +82,9 @@ class Show:
 
     def words(self) -> list[str]:
         """Return the command-line words that make the same choice."""
-        words = [self.name, *(["--scale", f"{self.scale:g}"] if self.scale != 1 else [])]
-        words += [*(["--tasks", *self.tasks] if self.tasks else [])]
-        words += [*(["--algorithms", *self.algorithms] if self.algorithms else [])]
-        words += ["--seeds", str(self.seeds)] if self.seeds is not None else []
-        return words + (["--directory", str(self.directory)] if self.directory else [])
+        names = ("scale", "tasks", "algorithms", "seeds", "directory")
+        given = {name: getattr(self, name) for name in names if getattr(self, name) != getattr(Show, name)}
+        return [self.name, *(word for name, value in given.items() for word in option(name, value))]
 
 
 @dataclass(frozen=True)
@@ -200,9 +198,7 @@ def show(options: Show) -> int:
         state = existing.state if existing else "waiting"
         rows.append((str(index), run.name, f"{short(steps)} / {short(run.config.steps)}", state, time))
     _print_table(("run", "what", "steps", "state", "such runs take"), rows)
-    counts = Counter(row[3] for row in rows)
-    summary = ", ".join(f"{count} {state}" for state, count in counts.items())
-    make_console().print(f"runs in {directory}: {summary}", soft_wrap=True)
+    _print_states(directory, Counter(row[3] for row in rows))
     return 0
 
 
@@ -220,8 +216,7 @@ def run(options: Run) -> int:
         print(f"csac: {failure}; the same line goes on once that is mended", file=sys.stderr)
         return 1
     states = Counter(existing.state if (existing := one.open(directory)) else "waiting" for one in runs)
-    summary = ", ".join(f"{count} {state}" for state, count in states.items())
-    console.print(f"runs in {directory}: {summary}", soft_wrap=True)
+    _print_states(directory, states)
     for one in runs:
         if (existing := one.open(directory)) and existing.state == "failed":
             console.print(f"{one.name} failed at {existing.manifest.failure} ({existing.path})", soft_wrap=True)
@@ -277,6 +272,11 @@ COMMANDS: Mapping[str, tuple[type, Any]] = {
     "run": (Run, run),
     "report": (StudyReport, report_study),
 }
+
+
+def _print_states(directory: Path, states: Mapping[str, int]) -> None:
+    summary = ", ".join(f"{count} {state}" for state, count in states.items())
+    make_console().print(f"runs in {directory}: {summary}", soft_wrap=True)
 
 
 def _print_table(headings: tuple[str, ...], rows: Sequence[Sequence[str]]) -> None:

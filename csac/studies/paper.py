@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from csac.record.statistics import (
+    bootstrap_interval,
     drawdown,
     evaluation_matrix,
-    improvement_interval,
     mean_over_episodes,
     probability_of_improvement,
     recovery,
@@ -92,7 +92,7 @@ class Claim(NamedTuple):
     def verdict(self) -> tuple[str, str]:
         """Return the verdict and the reason, from the interval of the probability that a seed of ours is better."""
         probability = probability_of_improvement(self.ours, self.others)
-        interval = improvement_interval(self.ours, self.others)
+        interval = bootstrap_interval(probability_of_improvement, self.ours, self.others)
         reason = f"better in {probability:.0%} of the pairs of seeds"
         if interval is None:
             return "not yet decidable", f"{reason}; fewer than five seeds"

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from csac.console.tables import duration
-from csac.record import rendering, report_tables
+from csac.record import report_tables
 from csac.record.files import write_atomically, writing
 from csac.record.plots import encoded, figure_of, looks_of
-from csac.record.rendering import EMPTY, Cell, Row, Table, number, numeric
+from csac.record.rendering import EMPTY, Cell, Row, Table, markdown, number, numeric
 from csac.record.statistics import drawdown, evaluation_matrix, is_case, last_evaluations
 from csac.record.summaries import last_rows, over_seeds, recoveries
 from csac.studies import paper
@@ -81,7 +80,6 @@ def write(path: Path, title: str, parts: Sequence[Part]) -> None:
 def _html(title: str, parts: Sequence[Part]) -> str:
     loader = PackageLoader("csac.studies")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.filters["table"] = lambda table: Markup(rendering.html(table))
     environment.filters["picture"] = lambda figure: base64.b64encode(encoded(figure, "svg")).decode()
     template = environment.get_template("report.html.jinja")
     return template.render(title=title, parts=[(type(part).__name__, part) for part in parts])
@@ -102,7 +100,7 @@ def _markdown(path: Path, title: str, parts: Sequence[Part]) -> str:
             case str():
                 texts.append(part)
             case _:
-                texts.append(rendering.markdown(part))
+                texts.append(markdown(part))
     return "\n\n".join(texts) + "\n"
 
 
@@ -139,8 +137,8 @@ def returns(arms: Sequence[Arm]) -> Iterator[Part]:
     """Yield tables of scores with intervals, maximum average returns and the paper's, worst seeds and drawdowns."""
     yield Heading("Returns")
     for place, group in by_place(arms).items():
-        runs = [(arm.label, arm.rows) for arm in group]
-        yield report_tables.comparison_table(runs, [list(arm.failures) for arm in group], POINTS)._replace(title=place)
+        runs = [(arm.label, arm.rows, len(arm.failures)) for arm in group]
+        yield report_tables.comparison_table(runs)._replace(title=place)
         yield Table(
             ("method", "maximum average return", "the paper's", "worst seed", "largest drawdown"),
             tuple(map(_extremes, group)),
@@ -186,9 +184,9 @@ def robustness(arms: Sequence[Arm]) -> Iterator[Part]:
     if any(arm.marks for arm in arms):
         yield Heading("Perturbations")
     for group in by_place(arm for arm in arms if arm.marks).values():
-        steps = [-1, *(step for step, _ in group[0].marks), None]
-        for index, (step, text) in enumerate(group[0].marks):
-            found = [recoveries(arm.label, arm.rows, step, steps[index + 2], steps[index] or -1) for arm in group]
+        steps = [step for step, _ in group[0].marks]
+        for (step, text), since, until in zip(group[0].marks, [-1, *steps], [*steps[1:], None], strict=False):
+            found = [recoveries(arm.label, arm.rows, step, until, since) for arm in group]
             yield report_tables.recovery_table(found)._replace(title=f"{group[0].task}, {text} after step {step:,}")
 
 

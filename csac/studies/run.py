@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from contextlib import closing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from csac.console.waiting import progress_shown
 from csac.processes import cores_to_use, usable_cores
@@ -74,15 +74,12 @@ def run_study(runs: Sequence[StudyRun], directory: Path, execution: Execution, c
 
 def try_tasks(configs: Iterable[RunConfig]) -> None:
     """Make each task once and apply its perturbations, so that mistakes are reported before anything is written."""
-    tried: list[tuple[str, dict[str, Any], tuple[str, ...]]] = []
-    for config in configs:
-        one = config.task, config.environment_arguments, config.perturbations
-        if one not in tried:
-            tried.append(one)
-            with closing(Environment(config.task, config.environment_arguments)) as environment:
-                remember(config.task)
-                for change in perturbations_of(config.perturbations):
-                    environment.perturb({change.kind: change.value})
+    parts = [(config.task, config.environment_arguments, config.perturbations) for config in configs]
+    for task, arguments, perturbations in {str(one): one for one in parts}.values():
+        with closing(Environment(task, arguments)) as environment:
+            remember(task)
+            for change in perturbations_of(perturbations):
+                environment.perturb({change.kind: change.value})
 
 
 def _program(path: Path, run: StudyRun, execution: Execution) -> Program:
@@ -109,7 +106,7 @@ class Progress:
 
     def __init__(self, runs: Mapping[Path, StudyRun], console: Console, show: Callable[[int, int], None]) -> None:
         self.runs, self.console, self._show = runs, console, show
-        self.done = {path: RunDirectory.open(path).manifest.last_checkpoint if is_run(path) else 0 for path in runs}
+        self.done = {path: RunDirectory.open(path).manifest.last_checkpoint for path in runs}
         self.over: set[Path] = set()
         self._before = sum(self.done.values())
         self._total = sum(run.config.steps for run in runs.values()) - self._before
@@ -130,10 +127,7 @@ class Progress:
         self.over.add(path)
         returns = last_evaluations(RunDirectory.open(path).evaluations, points=1)
         last = f", last return {number(next(iter(returns.values())))}" if returns else ""
-        self.say(f"{len(self.over)} of {len(self.runs)}: {self.runs[path].name}: {outcome}{last}")
-
-    def say(self, text: str) -> None:
-        """Print a line."""
+        text = f"{len(self.over)} of {len(self.runs)}: {self.runs[path].name}: {outcome}{last}"
         self.console.print(text, soft_wrap=True)
 
 
@@ -155,4 +149,4 @@ class RunProgress(Watcher):
 
     def note(self, text: str) -> None:
         """Print a line about the run."""
-        self.study.say(f"{self.study.runs[self.path].name}: {text}")
+        self.study.console.print(f"{self.study.runs[self.path].name}: {text}", soft_wrap=True)

@@ -12,7 +12,7 @@ import sys
 import warnings
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,15 +43,6 @@ SHARE_UNPRUNED = 0.25  # of a trial's steps, from its beginning
 SHOWN = 10  # trials in the table at the end
 
 
-class Trial(NamedTuple):
-    """A trial that this process runs while it holds the lock."""
-
-    trial: optuna.Trial
-    folder: Path
-    values: dict[str, Any]
-    lock: IO[str]
-
-
 def tune(search: Search, directory: Path, trials: int, command: str | None, console: Console) -> int:
     """Run trials until the directory has `trials` of them, show the best, and return the exit code.
 
@@ -63,9 +54,10 @@ def tune(search: Search, directory: Path, trials: int, command: str | None, cons
     try_tasks([search.config])
     study = _open(search, directory)
     with stop_requested(lambda text: console.print(text)) as request:
-        while not request.is_set() and (trial := _next(study, search, directory, trials)):
-            with trial.lock:
-                _run(study, search, trial, command, console)
+        while not request.is_set() and (found := _next(study, search, directory, trials)):
+            trial, lock = found
+            with lock:
+                _run(study, search, trial, _folder(directory, trial), command, console)
     _conclude(study, search, directory, console)
     if request.is_set():
         print(f"csac: stopped; the trial is saved. To go on, type the same line again: {command}", file=sys.stderr)
@@ -108,8 +100,8 @@ def _open(search: Search, directory: Path) -> optuna.Study:
     return study
 
 
-def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> Trial | None:
-    """Return the next trial to run, or None once there are `trials` of them.
+def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> tuple[optuna.Trial, IO[str]] | None:
+    """Return the next trial to run and its lock, or None once there are `trials` of them.
 
     Before that, a trial that is marked as running but whose lock nobody holds goes back to the queue.
     """
@@ -135,7 +127,7 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
         with warnings.catch_warnings(action="ignore"):  # the first trial may lie outside the space
             values = {name: draw(trial, name, dimension) for name, dimension in search.space.items()}
         trial.set_user_attr("values", values)
-        return Trial(trial, folder, values, lock)
+        return trial, lock
 
 
 @contextmanager
@@ -163,33 +155,35 @@ def _requeue(study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
     study.tell(trial.number, state=type(trial.state).FAIL)
 
 
-def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None, console: Console) -> None:
+def _run(
+    study: optuna.Study, search: Search, trial: optuna.Trial, folder: Path, command: str | None, console: Console
+) -> None:
     """Train a trial from its newest checkpoint, and tell Optuna the result."""
     from optuna.trial import TrialState
 
-    label = trial.folder.name
-    console.print(f"{label}: {', '.join(f'{name} {plain(value)}' for name, value in trial.values.items())}")
+    label, values = folder.name, trial.user_attrs["values"]
+    console.print(f"{label}: {', '.join(f'{name} {plain(value)}' for name, value in values.items())}")
     reported: set[int] = set()
     is_pruned = False
 
     def is_enough(step: int, _: Mapping[int, float]) -> bool:
         nonlocal is_pruned
-        runs = RunSet.open(trial.folder)
+        runs = RunSet.open(folder)
         for known, score in _scores(runs.evaluations, search.seeds, step).items():
             if known not in reported:
-                trial.trial.report(score, known)
+                trial.report(score, known)
                 reported.add(known)
-        is_pruned = is_pruned or (step < search.config.steps and step in reported and trial.trial.should_prune())
+        is_pruned = is_pruned or (step < search.config.steps and step in reported and trial.should_prune())
         return is_pruned or bool(runs.failures)
 
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # failed seeds are reported below
             runs = train(
-                dataclasses.replace(search.algorithm, **trial.values),  # pyright: ignore[reportArgumentType]
+                dataclasses.replace(search.algorithm, **values),  # pyright: ignore[reportArgumentType]
                 search.config.task,
                 seeds=search.seeds,
                 first_seed=search.config.seed,
-                directory=trial.folder,
+                directory=folder,
                 resume=True,
                 tensorboard=False,
                 progress=False,
@@ -198,17 +192,17 @@ def _run(study: optuna.Study, search: Search, trial: Trial, command: str | None,
                 **{name: getattr(search.config, name) for name in RUN_OPTIONS},
             )
     except Interrupted:
-        _requeue(study, study.get_trials(deepcopy=False)[trial.trial.number])
+        _requeue(study, study.get_trials(deepcopy=False)[trial.number])
         return
     except InputError:
-        study.tell(trial.trial, state=TrialState.FAIL)
+        study.tell(trial, state=TrialState.FAIL)
         raise
     if is_pruned or runs.failures:
-        study.tell(trial.trial, state=TrialState.PRUNED)
+        study.tell(trial, state=TrialState.PRUNED)
         console.print(f"{label}: {'; '.join(runs.failures.values()) or 'pruned'}", soft_wrap=True)
     else:
         score = float(np.mean(list(last_evaluations(runs.evaluations).values())))
-        study.tell(trial.trial, score)
+        study.tell(trial, score)
         console.print(f"{label}: {number(score)}, best {number(study.best_value)}")
     for run in runs.runs:  # the trial is over, and the replay buffer takes most of the space
         shutil.rmtree(run.checkpoints, ignore_errors=True)

@@ -210,16 +210,20 @@ class Callbacks:
 
     def call(self, event: Event) -> Answer:
         """Pass an event to all of them, and return their answer."""
-        due = [one for one in self.callbacks if event.method != "on_step" or one.interval in event.intervals]
-        stoppers = [self._call_one(callback, event) for callback in due]
+        stopped_by: list[str] = []
+        pairs = list(zip(event.moments, event.arguments, strict=True))
+        for callback in self.callbacks:
+            if event.method == "on_step" and callback.interval not in event.intervals:
+                continue
+            name = f"{type(callback).__name__}.{event.method}"
+            answers = [self._guarded(name, getattr(callback, event.method), m, *more) for m, more in pairs]
+            stopped_by += [type(callback).__name__ for answer in answers if not (answer is None or answer)]
         if event.method == "on_evaluation":
-            moments = zip(event.moments, event.arguments, strict=True)
-            returns = {moment.seed: mean_return(episodes) for moment, (episodes,) in moments}
-            step = event.moments[0].step
+            step, returns = event.moments[0].step, {moment.seed: mean_return(more[0]) for moment, more in pairs}
             self._guarded("on_evaluation", self.on_evaluation, step, dict(returns))
             if self._guarded("stop_when", self.stop_when, step, dict(returns)):
-                stoppers.append("stop_when")
-        stopper = str(self.failure) if self.failure else next(filter(None, stoppers), "")
+                stopped_by.append("stop_when")
+        stopper = str(self.failure) if self.failure else next(iter(stopped_by), "")
         return Answer(stopper, tuple(moment.scalars for moment in event.moments), self.failure is not None)
 
     def would_stop_again(self, run: RunDirectory) -> bool:
@@ -234,14 +238,6 @@ class Callbacks:
         callbacks = Callbacks([c for c in self.callbacks if not c.needs_policy], None, self.stop_when)
         moment = Moment(run.seed, int(rows["step"][-1]), run.path)
         return bool(callbacks.call(Event("on_evaluation", [moment], [(episodes,)])).stopped_by)
-
-    def _call_one(self, callback: Callback, event: Event) -> str:
-        """Return the callback's name if it ends the runs, else an empty string."""
-        name, goes_on = type(callback).__name__, True
-        for moment, arguments in zip(event.moments, event.arguments, strict=True):
-            returned = self._guarded(f"{name}.{event.method}", getattr(callback, event.method), moment, *arguments)
-            goes_on = goes_on and (returned is None or bool(returned))
-        return "" if goes_on else name
 
     def _guarded(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
         """Return what a caller's function returns, or None if it raises or another has raised before."""

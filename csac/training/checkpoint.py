@@ -61,18 +61,15 @@ class Checkpoint(NamedTuple):
         path = folder / f"step_{step}" / LIST
         try:
             fields = json.loads(_read(path))
-            checksum = fields.pop("sha256")
-            first, last = fields["transitions"]
-            if checksum != _checksum(fields) or fields["step"] != step:
+            if fields.pop("sha256") != _checksum(fields) or fields["step"] != step:
                 raise Damaged(f"{path} has changed since it was written")
             if fields["schema_version"] != SCHEMA_VERSION:
                 raise Damaged(f"{path} has schema {fields['schema_version']!r} and this csac reads {SCHEMA_VERSION}")
             if any(not re.fullmatch(r"(replay/)?[a-z0-9-]+\.[a-z]+", name) for name in fields["files"]):
                 raise Damaged(f"{path} names a file that is none of a checkpoint")
-            return cls(folder, step, fields["files"], (int(first), int(last)), fields["values"])
-        except Damaged:
-            raise
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            first, last = fields["transitions"]
+            return cls(folder, step, fields["files"], (first, last), fields["values"])
+        except (UnicodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise Damaged(f"{path} is not a checkpoint ({type(error).__name__}: {error})") from error
 
     def read(self, name: str) -> bytes:
@@ -118,9 +115,7 @@ class Checkpoint(NamedTuple):
         missing, present = first + np.flatnonzero(~known), first + np.flatnonzero(known)
         if len(missing) and not len(present):
             raise Damaged(f"{self.folder / REPLAY} has none of the transitions of step {self.step}")
-        if len(missing):
-            rows[missing % len(rows)] = rows[present[np.arange(len(missing)) % len(present)] % len(rows)]
-            lost = lost or [f"{self.folder / REPLAY} lacks {len(missing):,} transitions: others stand in for them"]
+        rows[missing % len(rows)] = rows[np.resize(present, len(missing)) % len(rows)]
         return lost
 
     def _path(self, name: str) -> Path:

@@ -41,10 +41,10 @@ def keep_programs() -> None:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", SECONDS_WORTH_KEEPING)
 
 
-def tidy_programs() -> str | None:
+def tidy_programs() -> list[str]:
     """Remove broken programs before a run, or all if they are too large; return a note if none can be kept."""
     if _is_users_choice():
-        return None
+        return []
     try:
         home = _make_home()
         programs = list(home.glob("*/*-cache"))
@@ -54,8 +54,8 @@ def tidy_programs() -> str | None:
                 for program in programs:
                     program.unlink(missing_ok=True)
     except OSError as error:
-        return f"note: compiled programs cannot be kept for the next run ({error})"
-    return None
+        return [f"note: compiled programs cannot be kept for the next run ({error})"]
+    return []
 
 
 def _remove_broken(mark: Path, programs: list[Path]) -> None:

@@ -43,7 +43,7 @@ def choose_device(device: str) -> None:
         )
     if config.jax_default_prng_impl != PRNG:
         raise InputError(f"csac's keys are of JAX's {PRNG}: unset JAX_DEFAULT_PRNG_IMPL (jax_default_prng_impl)")
-    before = config.jax_platforms, {name: os.environ.get(name) for name in (FLAGS, PREALLOCATE)}
+    before = config.jax_platforms, {name: os.environ.get(name, "") for name in (FLAGS, PREALLOCATE)}
     jax.config.update("jax_platforms", PLATFORMS[device])
     is_late = device == "gpu" and _has_looked_for_devices()
     if device == "gpu" and not is_late:
@@ -105,9 +105,6 @@ def _has_looked_for_devices() -> bool:
     return xla_bridge.backends_are_initialized()
 
 
-def _restore_settings(platforms: str | None, variables: Mapping[str, str | None]) -> None:
+def _restore_settings(platforms: str | None, variables: Mapping[str, str]) -> None:
     jax.config.update("jax_platforms", platforms)
-    for name, value in variables.items():
-        os.environ.pop(name, None)
-        if value is not None:
-            os.environ[name] = value
+    os.environ.update(variables)

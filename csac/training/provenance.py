@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distributions, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,10 +36,8 @@ def _versions(task: Task, on_gpu: bool) -> dict[str, str]:
     robots = ("pybullet", "PyFlyt", "panda-gym") if adapter_of(task) else ()
     versions = {"csac": __version__, "python": platform.python_version()}
     for package in ("jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco", *robots):
-        try:
+        with suppress(PackageNotFoundError):
             versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
     if on_gpu:
         names = (distribution.name for distribution in distributions())
         versions |= {name: version(name) for name in sorted(names) if name.startswith(("jax-cuda", "nvidia-"))}
@@ -57,12 +56,11 @@ def _processor() -> str:
 
 def _commit() -> str | None:
     """Return the commit of csac's own checkout, if it runs from one."""
-    try:
+    with suppress(OSError, subprocess.SubprocessError):
         # csac may be installed inside somebody else's repository, which does not track its files.
         _git("ls-files", "--error-unmatch", Path(__file__).name)
         return _git("rev-parse", "HEAD").strip() or None
-    except (OSError, subprocess.SubprocessError):
-        return None
+    return None
 
 
 def _git(*arguments: str) -> str:

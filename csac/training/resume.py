@@ -44,7 +44,8 @@ _LEARNT_WITH = (
     *(f"{network}{kind}" for network in ("", "actor_", "critic_") for kind in _KINDS),
 )
 
-# The only fields of the configuration that may change when a run is resumed.
+# The fields of the configuration that may not differ in a fork, and the only ones that may when a run is resumed.
+_SAME_IN_FORKS = ("events", "environments", "hindsight")
 _MAY_DIFFER = ("steps", "device", "checkpoint_interval", "keep_checkpoints")
 
 
@@ -87,10 +88,9 @@ def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
     while len({point.step for point in points}) > 1:
         until = min(point.step for point in points)
         points = [_find(run, until) if point.step > until else point for run, point in zip(runs, points, strict=True)]
-    return [
-        ResumePoint(point.checkpoint, point.notes + _restore(run, point))
-        for run, point in zip(runs, points, strict=True)
-    ]
+    for run, point in zip(runs, points, strict=True):
+        point.notes.extend(_restore(run, point))
+    return points
 
 
 def refuse_lost(run: RunDirectory) -> None:
@@ -139,13 +139,9 @@ def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
 
 def _remove_unfinished(run: RunDirectory) -> None:
     """Remove the files that a process was writing when it was killed."""
-    for path in [
-        *run.path.glob(".*.*"),
-        *run.policies.glob(".*"),
-        *run.checkpoints.glob(".*"),
-        *run.checkpoints.glob("replay/.*"),
-    ]:
-        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+    for folder in (run.path, run.policies, run.checkpoints, run.checkpoints / REPLAY):
+        for path in folder.glob(".*.*"):
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
 def continuation(manifest: Manifest, current: Manifest, point: ResumePoint) -> tuple[Continuation, list[str]]:
@@ -235,11 +231,8 @@ class Source(NamedTuple):
         before = self.runs[wanted.seed].config
         if before.algorithm != wanted.algorithm:
             raise InputError(f"{self.path} does not fit: its algorithm is {before.algorithm}, not {wanted.algorithm}")
-        found = [] if before.events == wanted.events else [f"its events are {list(before.events)}"]
-        if before.environments != wanted.environments:
-            found.append(f"each of its seeds has environments={before.environments}")
-        if before.hindsight != wanted.hindsight:
-            found.append(f"its hindsight is {before.hindsight}")
+        old, new = ({name: getattr(one, name) for name in _SAME_IN_FORKS} for one in (before, wanted))
+        found = differences(old, new)
         old, new = before.hyperparameters, wanted.hyperparameters
         others = [name for name in _LEARNT_WITH if name in old and old[name] != new.get(name)]
         found += [f"its networks have learnt with {name} {old[name]}" for name in others]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-from contextlib import ExitStack, closing, nullcontext, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -275,11 +275,9 @@ def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[s
     """Train every program that is not over, show progress, and draw the curve. Raises as `train`."""
     done = {run.path for run in runs.runs if watch.is_over(run)}
     programs = [program for program in programs if not done.issuperset(program.directories)]
-    reporter = watch.reporter
-    notes = [*notes, *filter(None, [tidy_programs()])]
-    if reporter:
-        reporter.start(runs, notes)
-    with closing(reporter) if reporter else nullcontext(), stop_requested(watch.note) as request:
+    watch.send("start", runs, [*notes, *tidy_programs()])
+    with ExitStack() as stack, stop_requested(watch.note) as request:
+        stack.callback(watch.send, "close")
 
         def should_stop() -> bool:
             return request.is_set() or watch.callbacks.failure is not None
@@ -292,8 +290,7 @@ def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[s
             supervise(programs, lambda _: watch, should_stop, _workers(), turns)
         runs = TrainedRuns(runs.path, [RunDirectory.open(run.path) for run in runs.runs])
         draw_curve(RunSet.open(runs.path), watch.note)
-        if reporter:
-            reporter.finish(runs)
+        watch.send("finish", runs)
     if failure := watch.callbacks.failure:
         raise failure
     if request.is_set() and any(run.manifest.state in ("running", "interrupted") for run in runs.runs):

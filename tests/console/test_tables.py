@@ -50,7 +50,7 @@ def test_evaluations_are_summed_up_by_seed():
     ]
     assert cases[:2] == [
         "per 1,000 rollouts (from 2 of each seed) seed 0 seed 5 mean ± std",
-        "success 500.0 1,000.0 750.0 353.6",
+        "success 500.0 1,000.0 750.0 ± 353.6",
     ]
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from csac.record.rendering import EMPTY, Cell, Row, Table, html, markdown, number, short
+from csac.record.rendering import EMPTY, Cell, Row, Table, markdown, number, short
 
 
 @pytest.mark.parametrize(("steps", "text"), [(999, "999"), (12_500, "12.5k"), (663_250, "663.2k"), (1_000_000, "1M")])
@@ -47,19 +47,4 @@ def test_markdown_puts_numbers_to_the_right_and_keeps_bars_out():
         "| mean | never |",
         "",
         "2 seeds: no interval",
-    ]
-
-
-def test_html_says_what_a_row_is_and_what_to_sort_by():
-    assert html(TABLE).splitlines() == [
-        "<table>",
-        "<caption>T &amp; U</caption>",
-        '<thead><tr><th scope="col">run</th><th scope="col" class="number">return</th></tr></thead>',
-        "<tbody>",
-        '<tr class="plain"><td>a | b</td><td class="number" data-value="1000.5">1,000.5</td></tr>',
-        '<tr class="failed"><td>&lt;c&gt;</td><td class="number"></td></tr>',
-        '<tr class="summary"><td>mean</td><td class="number" data-value="inf">never</td></tr>',
-        "</tbody>",
-        '<tfoot><tr><td colspan="2">2 seeds: no interval</td></tr></tfoot>',
-        "</table>",
     ]

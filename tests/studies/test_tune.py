@@ -216,14 +216,15 @@ def stopping_after(trained):
 def test_a_trial_whose_process_died_is_taken_up_again(tmp_path, trained):
     tune(search(), tmp_path, 1, None, make_console())
     study = module._open(search(), tmp_path)
-    lost = module._next(study, search(), tmp_path, 2)
-    assert lost
+    found = module._next(study, search(), tmp_path, 2)
+    assert found
+    lost, lock = found
     assert module._next(study, search(), tmp_path, 2) is None  # another process has it
-    lost.lock.close()
+    lock.close()
     tune(search(), tmp_path, 2, None, make_console())
     assert states(tmp_path) == ["COMPLETE", "FAIL", "COMPLETE"]
-    assert trained.found[-1][1].name == lost.folder.name == "trial-1"
-    assert trained.found[-1][0].discount == lost.values["discount"]
+    assert trained.found[-1][1].name == "trial-1"
+    assert trained.found[-1][0].discount == lost.user_attrs["values"]["discount"]
 
 
 def test_a_directory_of_another_search_or_of_something_else_is_refused(tmp_path, trained):

@@ -100,10 +100,9 @@ def test_each_number_of_cores_has_its_own_programs(tmp_path, choices, monkeypatc
 def test_a_home_that_cannot_be_written_costs_a_note_and_nothing_else(tmp_path, choices):
     (tmp_path / "csac").write_text("no folder")
 
-    note = compilation.tidy_programs()
+    (note,) = compilation.tidy_programs()
     compilation.keep_programs()
 
-    assert note is not None
     assert note.startswith("note: compiled programs cannot be kept")
     assert str(tmp_path / "csac") in note
     assert SETTINGS.jax_compilation_cache_dir is None
@@ -114,9 +113,9 @@ def test_without_a_home_nothing_is_kept(tmp_path, choices, monkeypatch):
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as Python does for a user that nobody knows
     monkeypatch.chdir(tmp_path)
 
-    assert compilation.tidy_programs() == (
+    assert compilation.tidy_programs() == [
         "note: compiled programs cannot be kept for the next run (there is no home directory)"
-    )
+    ]
     assert not list(tmp_path.iterdir())
 
 
@@ -127,7 +126,7 @@ def test_broken_programs_are_removed_before_a_run(tmp_path, choices):
     for name, content in {"whole": whole, "cut": whole[:-3], "empty": b"", "zstd": b"\x28\xb5\x2f\xfd..."}.items():
         (folder / f"{name}-cache").write_bytes(content)
 
-    assert compilation.tidy_programs() is None
+    assert compilation.tidy_programs() == []
 
     assert [entry.name for entry in kept(tmp_path)] == ["whole-cache", "zstd-cache"]
 
@@ -140,7 +139,7 @@ def test_programs_that_are_too_much_are_removed(tmp_path, choices, monkeypatch, 
         (folder / f"{number}-cache").write_bytes(b"a program")
     monkeypatch.setattr(compilation, "MOST_BYTES", size * len(b"a program"))
 
-    assert compilation.tidy_programs() is None
+    assert compilation.tidy_programs() == []
 
     assert [entry.name for entry in kept(tmp_path)] == left
 
@@ -149,7 +148,7 @@ def test_the_users_own_choice_comes_first(tmp_path, choices):
     own = str(tmp_path / "own")
     jax.config.update("jax_compilation_cache_dir", own)
 
-    assert compilation.tidy_programs() is None
+    assert compilation.tidy_programs() == []
     compilation.keep_programs()
 
     assert SETTINGS.jax_compilation_cache_dir == own

@@ -110,7 +110,7 @@ def test_processes_change_no_number_and_their_episodes_are_resumed(tmp_path, who
 
 
 def test_a_fork_has_as_many_environments_as_the_run(tmp_path, whole):
-    with pytest.raises(InputError, match="environments=4"):
+    with pytest.raises(InputError, match="environments is 4, not "):
         train(tmp_path / "fork", SAC(**SMALL), start_from=f"{whole.path}@360")
     fork = train(tmp_path / "fork", SAC(**SMALL), start_from=f"{whole.path}@360", environments=4)
     assert contents(fork.runs[0]) == contents(whole.runs[0])
