@@ -119,7 +119,7 @@ def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{name} cannot be kept in a manifest: {error}; use numbers, texts, lists and dicts") from None
     if not isinstance(values, dict) or kept != plain:
-        raise InputError(f"{name} cannot be kept in a manifest: keys must be texts, not {values!r:.60}")
+        raise InputError(f"{name} cannot be kept in a manifest: keys must be texts, no value NaN: {values!r:.60}")
     return kept
 
 

@@ -149,11 +149,11 @@ def test_weights_that_are_learnt_come_with_what_they_had_become(tmp_path):
 
 
 def test_infinite_arguments_of_a_task_stand_in_its_contract_as_text(tmp_path):
-    infinite = {"environment_arguments": {"reach": float("inf")}, "hyperparameters": {"bounds": [float("nan")]}}
+    infinite = {"environment_arguments": {"reach": float("inf")}, "hyperparameters": {"bounds": [-float("inf")]}}
     run = make_run(tmp_path / "run", **infinite)
     origin = told(export_run(run.path, episodes=1, card=True).place)["provenance"]
     assert origin["environment_arguments"] == {"reach": "Infinity"}
-    assert origin["hyperparameters"] == {"bounds": ["NaN"]}
+    assert origin["hyperparameters"] == {"bounds": ["-Infinity"]}
 
 
 def test_nothing_is_left_of_an_artefact_that_is_not_the_policy(tmp_path, monkeypatch):
