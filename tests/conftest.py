@@ -9,6 +9,10 @@ import pytest
 
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 os.environ["JAX_PLATFORMS"] = "cpu"
+# XLA optimises little: two thirds of the time would be compilation of programs that run but for moments. What depends
+# on the last bits has processes of its own, without the flags.
+_QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_QUICK}".strip()
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # PyFlyt's few functions take 8 s to compile, and a moment in Python
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[threads] = "1"
@@ -27,16 +31,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # How long an example takes says how busy the machine is.
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Have XLA optimise little, but in the tests that are slow: two thirds of the others' time would be compilation.
-
-    Their programs run but for moments. What depends on the last bits has a process of its own, without the flag.
-    """
-    if config.getoption("markexpr") != "slow":
-        quick = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {quick}".strip()
 
 
 LONGEST = ("training", "tasks", "test_results.py", "test_cli.py")  # folders and files

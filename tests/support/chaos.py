@@ -76,7 +76,7 @@ def start(folder: Path, arguments: Sequence[str], cache: Path, output: int | IO[
     """Start csac in a folder, in a process group of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     surroundings = {
-        **os.environ,
+        **{name: value for name, value in os.environ.items() if name != "XLA_FLAGS"},
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": str(cache),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
