@@ -203,7 +203,8 @@ def write_with_checksum(path: Path, content: bytes, fields: Mapping[str, Any] | 
 
 def check_checksum(path: Path, fields: Mapping[str, Any]) -> None:
     """Raise InputError if the contract's `fields` have no checksum of a file, or a different one."""
-    if sha256_of(path) not in (fields.get("sha256") or {}).get(path.name, ""):
+    checksums = fields.get("sha256")
+    if not isinstance(checksums, dict) or sha256_of(path) not in str(checksums.get(path.name)):
         raise InputError(f"{path} does not match its checksum in {CONTRACT}: restore both from a copy")
 
 

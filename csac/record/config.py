@@ -115,7 +115,7 @@ def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
     """
     plain = _plain(values)
     try:
-        kept = json.loads(json.dumps(plain))
+        kept = json.loads(json.dumps(plain), parse_constant=float)  # no NaN is equal to another
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{name} cannot be kept in a manifest: {error}; use numbers, texts, lists and dicts") from None
     if not isinstance(values, dict) or kept != plain:

@@ -75,6 +75,8 @@ def check_new(path: Path) -> None:
     """Raise InputError if no new table can be created at `path`, before anything has been computed for it."""
     if path.suffix.lower() != ".csv":
         raise InputError(f"{path} is no table: give the name of a .csv file")
+    with writing(path), suppress(FileNotFoundError):
+        temporary_path(path).lstat()
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
     if not os.access(path.parent, os.W_OK):

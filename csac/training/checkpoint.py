@@ -69,7 +69,9 @@ class Checkpoint(NamedTuple):
                 raise Damaged(f"{path} names a file that is none of a checkpoint")
             first, last = fields["transitions"]
             return cls(folder, step, fields["files"], (first, last), fields["values"])
-        except (UnicodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except Damaged:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise Damaged(f"{path} is not a checkpoint ({type(error).__name__}: {error})") from error
 
     def read(self, name: str) -> bytes:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
-from csac.record.plots import encoded, figure_of, learning_curve, looks_of
+from csac.record.plots import Curve, encoded, figure_of, learning_curve, looks_of
 
 
 def evaluations(seeds=3, points=20, interval=5000, height=1000.0):
@@ -101,6 +101,13 @@ def test_a_label_has_one_look_wherever_it_is_drawn():
     looks = looks_of(["a", "b", "c"])
     assert len(set(looks_of(map(str, range(28))).values())) == 28
     assert axes_of(("c", evaluations()), looks=looks).lines[-1].get_color() == looks["c"][0]
+
+
+def test_where_few_seeds_are_left_there_is_no_interval():
+    rows = evaluations(seeds=5, points=3)
+    curve = Curve.of("csac", rows[(rows["step"] < 15_000) | (rows["seed"] < 2)])
+    assert np.isfinite(curve.mean).all()
+    assert np.isnan(curve.high).tolist() == np.isnan(curve.low).tolist() == [False, False, True]
 
 
 def test_the_axis_has_the_limits_that_are_given():

@@ -287,10 +287,16 @@ def test_an_error_is_told_with_its_place_in_the_users_own_code(module):
         task.step(np.zeros(1, np.float32))
 
 
+class Unsaid(Exception):
+    def __str__(self) -> str:
+        raise ValueError("nothing")
+
+
 @pytest.mark.parametrize(
     ("error", "start"),
     [
         (RuntimeError("no file \udcff\nhere"), "RuntimeError: no file \\udcff here"),
+        (Unsaid(), "Unsaid: ("),
         (RuntimeError("\x1b[31mno\x1b[0m file\x07 here"), "RuntimeError: no file here"),
         (RuntimeError(), "RuntimeError"),
     ],
