@@ -32,7 +32,7 @@ _LOADER = FOLDER / "policy.py"  # runs any policy with NumPy alone; copied next 
 FILES: dict[str, str] = {"numpy": "policy.py", "onnx": "policy.onnx", "c": "policy.h"}
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Artefact:
     """An exported policy, as opened by `open_artefact`.
 

@@ -257,5 +257,5 @@ def _mean_return(rows: np.ndarray) -> Cell:
 def _rate_over_seeds(case: CaseSummary | None) -> Cell:
     if case is None:
         return EMPTY
-    over, form, scale = case.over_seeds, *((",.1f", ROLLOUTS) if case.is_case else (",.3f", 1))
+    over, (form, scale) = case.over_seeds, (",.1f", ROLLOUTS) if case.is_case else (",.3f", 1)
     return plus_minus(over._replace(mean=scale * over.mean, std=scale * over.std), form)

@@ -216,10 +216,12 @@ class Callbacks:
             if event.method == "on_step" and callback.interval not in event.intervals:
                 continue
             name = f"{type(callback).__name__}.{event.method}"
-            answers = [self._guarded(name, getattr(callback, event.method), m, *more) for m, more in pairs]
+            method = getattr(callback, event.method)
+            answers = [self._guarded(name, method, moment, *arguments) for moment, arguments in pairs]
             stopped_by += [type(callback).__name__ for answer in answers if not (answer is None or answer)]
         if event.method == "on_evaluation":
-            step, returns = event.moments[0].step, {moment.seed: mean_return(more[0]) for moment, more in pairs}
+            returns = {moment.seed: mean_return(episodes) for moment, (episodes,) in pairs}
+            step = event.moments[0].step
             self._guarded("on_evaluation", self.on_evaluation, step, dict(returns))
             if self._guarded("stop_when", self.stop_when, step, dict(returns)):
                 stopped_by.append("stop_when")
