@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from benchmarks import checkpoint, gpu, growth, limit, peers, policy, start, stepping, vector
+from benchmarks import checkpoint, gpu, growth, latency, limit, peers, start, stepping, vector
 from benchmarks.measuring import usable_cores
 from benchmarks.part import Options, Part, shown
 from csac.types import InputError
@@ -22,7 +22,7 @@ SUITES = {
     "growth": growth,
     "gpu": gpu,
     "checkpoint": checkpoint,
-    "policy": policy,
+    "latency": latency,
     "stepping": stepping,
     "vector": vector,
 }

@@ -21,8 +21,10 @@ def without_controls(content: bytes) -> bytes:
 
 def check_whole(name: str, value: object, least: int, most: int) -> None:
     """Raise InputError unless the value is a whole number from `least` to `most`."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
-        raise InputError(f"{name} must be a whole number from {least:,} to {most:,}, not {value!r:.40}")
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name} must be a whole number of {least:,} or more, not {value!r:.40}")
+    if value > most:
+        raise InputError(f"{name} must be at most {most:,}")
 
 
 def check_flag(name: str, value: object) -> None:

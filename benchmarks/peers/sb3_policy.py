@@ -1,6 +1,6 @@
-"""How long SB3's SAC takes for an action, by `predict` and by the ONNX recipe of its documentation, and to evaluate.
+"""How long SB3's SAC takes for an action, by `predict` and by the ONNX recipe of its documentation.
 
-`python -m benchmarks policy` runs it with the peers' Python. The recipe's graph leaves out the rescaling of actions,
+`python -m benchmarks latency` runs it with the peers' Python. The recipe's graph leaves out the rescaling of actions,
 which this script adds: a controller needs it.
 """
 
@@ -11,12 +11,9 @@ import tempfile
 import time
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import torch
 from stable_baselines3 import SAC
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.monitor import Monitor
 
 WARM_UP = 1_000
 
@@ -68,26 +65,15 @@ def latency(act, calls):
     return dict(zip(("p50", "p99", "p99.9", "max"), percentiles.tolist(), strict=True))
 
 
-def evaluation(model, episodes):
-    """Return the seconds of so many episodes, the environment made before."""
-    environment = Monitor(gymnasium.make("HalfCheetah-v4"))
-    evaluate_policy(model, environment, 1)
-    began = time.perf_counter()
-    evaluate_policy(model, environment, episodes)
-    return {"episodes": episodes, "seconds": time.perf_counter() - began}
-
-
 def main():
     """Measure, and print a line of JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--way", choices=("predict", "onnx", "evaluate"), required=True)
-    parser.add_argument("--count", type=int, default=10, help="calls, or episodes")
+    parser.add_argument("--way", choices=("predict", "onnx"), required=True)
+    parser.add_argument("--count", type=int, default=10, help="calls")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     model = SAC("MlpPolicy", "HalfCheetah-v4", seed=0, device="cpu", buffer_size=1)
-    if arguments.way == "evaluate":
-        found = evaluation(model, arguments.count)
-    elif arguments.way == "onnx":
+    if arguments.way == "onnx":
         found = latency(by_onnx(model), arguments.count)
     else:
         found = latency(lambda observation: model.predict(observation, deterministic=True)[0], arguments.count)

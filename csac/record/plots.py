@@ -81,7 +81,7 @@ class Curve(NamedTuple):
         mean, low, high = mean_and_interval(returns)
         if len(seeds) < FEWEST_FOR_INTERVAL_BAND:
             low, high = np.fmin.reduce(returns), np.fmax.reduce(returns)
-        else:  # two seeds that went on alone would have an interval of 13 standard deviations
+        else:  # of two seeds that go on alone, the interval is ± 9 standard deviations
             few = np.isfinite(returns).sum(axis=0) < FEWEST_FOR_INTERVAL_BAND
             low, high = (np.where(few, np.nan, limit) for limit in (low, high))
         return cls(label, steps, returns, mean, low, high)

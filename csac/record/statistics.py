@@ -74,7 +74,7 @@ def mean_and_interval(values: np.ndarray) -> Interval:
     mean = _divide(np.where(present, values, 0.0).sum(axis=0), count)
     squares = (np.where(present, values - mean, 0.0) ** 2).sum(axis=0)
     freedom = np.maximum(count - 1, 0)
-    quantile = special.stdtrit(np.maximum(freedom, 1), 0.5 + 0.95 / 2)
+    quantile = special.stdtrit(np.maximum(freedom, 1), 0.975)
     reach = quantile * np.sqrt(_divide(_divide(squares, freedom), count))
     return Interval(mean, mean - reach, mean + reach)
 
@@ -106,7 +106,7 @@ def bootstrap_interval(
         return np.take_along_axis(array, generator.integers(len(array), size=array.shape), axis=0)
 
     values = [statistic(*map(resampled, arrays)) for _ in range(repetitions)]
-    low, high = np.quantile(values, [0.5 - 0.95 / 2, 0.5 + 0.95 / 2])
+    low, high = np.quantile(values, [0.025, 0.975])
     return float(low), float(high)
 
 

@@ -19,7 +19,7 @@ from typed import csac
         ("train X --seeds 0,1", "--seeds: "),
         ("train X --discount x", "--discount: "),
         ("train X --discount 1.5", "discount must be"),
-        ("train X --first-seed 1e20", "first_seed must be a whole number from 0 to"),
+        ("train X --first-seed 1e20", "first_seed must be at most"),
         ("train X --steps 0", "steps must be"),
         ("train X --sedes 3", "--seeds"),
         ("train X --no_such_thing=3", "--no-such-thing"),

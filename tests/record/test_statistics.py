@@ -68,6 +68,12 @@ def test_the_interquartile_mean_pools_all_axes_and_leaves_nans_out():
     assert np.isnan(interquartile_mean(np.array([np.nan])))
 
 
+def test_two_values_have_the_cauchy_quantile():
+    # t with one degree of freedom is Cauchy; s / sqrt(2) of 0 and 2 is 1
+    half = np.tan(0.475 * np.pi)
+    assert tuple(mean_and_interval(np.array([0.0, 2.0]))) == pytest.approx((1.0, 1.0 - half, 1.0 + half))
+
+
 def test_the_bootstrap_is_the_same_each_time():
     scores = np.random.default_rng(0).normal(size=(8, 3))
     first = bootstrap_interval(interquartile_mean, scores, repetitions=200)

@@ -1,19 +1,17 @@
-"""Inference cost compared with SB3, on one core: one action of an exported policy, and an evaluation."""
+"""Latency of one action of an exported policy, compared with SB3, on one core."""
 
 from __future__ import annotations
 
 import statistics
-import time
 from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.measuring import ROOT, TASK, Launch, answers, call, usable_cores
 from benchmarks.part import Options, Part
 from benchmarks.peers import PYTHON
-from benchmarks.tables import Row, grouped, table, with_range
+from benchmarks.tables import Row, grouped, table
 
 SCRIPT = ROOT / "benchmarks" / "peers" / "sb3_policy.py"
-EPISODES = 10  # of 1,000 steps each
 
 
 class Case(NamedTuple):
@@ -31,7 +29,6 @@ LATENCIES = [
     Case("SB3's ONNX recipe, ONNX Runtime", way="onnx"),
     Case("SB3's predict, PyTorch", way="predict"),
 ]
-EVALUATIONS = [Case("`csac.evaluate`"), Case("SB3's `evaluate_policy`", way="evaluate")]
 
 
 def ask_sb3(way: str, count: int) -> list[Row]:
@@ -48,7 +45,7 @@ def measure_latency(case: Case, options: Options) -> list[Row]:
     calls = 2_000 if options.quick else 100_000
     if case.way:
         return [{"policy": case.name, **found} for found in ask_sb3(case.way, calls)]
-    return [{"policy": case.name, **call("benchmarks.policy:latency", cores=1, format=case.format, calls=calls)}]
+    return [{"policy": case.name, **call("benchmarks.latency:latency", cores=1, format=case.format, calls=calls)}]
 
 
 def latency(format: str, calls: int) -> dict[str, float]:
@@ -74,26 +71,6 @@ def train_briefly() -> None:
     main(["train", TASK, *words.split()])
 
 
-def measure_evaluation(case: Case, options: Options) -> list[Row]:
-    """Return the seconds of an evaluation."""
-    episodes = 1 if options.quick else EPISODES
-    if case.way:
-        return [{"evaluation": case.name, **found} for found in ask_sb3(case.way, episodes)]
-    return [{"evaluation": case.name, **call("benchmarks.policy:evaluation", cores=1, episodes=episodes)}]
-
-
-def evaluation(episodes: int) -> dict[str, float]:
-    """Return the seconds for the episodes, without creating the environments."""
-    import csac
-
-    train_briefly()
-    policy = csac.load("run")
-    csac.evaluate(policy, TASK, episodes=1)
-    began = time.perf_counter()
-    csac.evaluate(policy, TASK, episodes=episodes)
-    return {"episodes": episodes, "seconds": time.perf_counter() - began}
-
-
 def render_latencies(rows: list[Row]) -> str:
     """Return the medians over repetitions, and each p50 as a multiple of the first policy's."""
     policies = {name: mine for (name,), mine in grouped(rows, "policy").items()}
@@ -105,16 +82,6 @@ def render_latencies(rows: list[Row]) -> str:
     return table(["μs for one action", "p50", "p99", "p99.9", "max", "p50, times the first"], lines)
 
 
-def render_evaluations(rows: list[Row]) -> str:
-    """Return the median seconds and their range."""
-    lines = [
-        [name, str(mine[0]["episodes"]), with_range([row["seconds"] for row in mine], ".2f")]
-        for (name,), mine in grouped(rows, "evaluation").items()
-    ]
-    return table(["", "episodes of 1,000 steps", "seconds"], lines)
-
-
 PARTS = [
     Part("latency", "benchmarks/README.md", "one action", LATENCIES, measure_latency, render_latencies, 3),
-    Part("evaluation", "benchmarks/README.md", "ten episodes", EVALUATIONS, measure_evaluation, render_evaluations, 3),
 ]
