@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from csac.console.waiting import progress_shown
-from csac.processes import cores_to_use, usable_cores
+from csac.processes import cores_to_use
 from csac.record.manifest import Manifest
 from csac.record.rendering import number
 from csac.record.run import RunDirectory, is_run
@@ -17,7 +17,7 @@ from csac.tasks.environment import Environment
 from csac.tasks.perturbations import perturbations_of
 from csac.tasks.trust import remember
 from csac.training.config import algorithm_of
-from csac.training.program import Program
+from csac.training.program import Program, threads_of
 from csac.training.resume import refuse_lost
 from csac.training.signals import stop_requested
 from csac.training.supervisor import supervise
@@ -63,7 +63,7 @@ def run_study(runs: Sequence[StudyRun], directory: Path, execution: Execution, c
         if programs and execution.cluster:
             execution.cluster.run(programs, progress.of, request.is_set)
         elif programs:
-            turns = len(usable_cores()) // programs[0].threads
+            turns = max(1, cores_to_use() // programs[0].threads)
             supervise(programs, progress.of, request.is_set, execution.workers, turns)
     if not execution.keep_checkpoints:
         for path in waiting:
@@ -92,8 +92,7 @@ def _program(path: Path, run: StudyRun, execution: Execution) -> Program:
             with existing.locked():
                 refuse_lost(existing)
                 existing.update_manifest(config=run.config)
-        if existing.manifest.process is not None:  # the last bits of results depend on the threads
-            threads = min(existing.manifest.machine.cores, cores) or threads
+        threads = threads_of([existing], cores, threads)
     else:
         RunDirectory.create(path, Manifest(config=run.config, program=(run.config.seed,)))
     return Program(

@@ -16,7 +16,7 @@ from csac.training.devices import preallocates
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from csac.record.config import RunConfig
@@ -82,9 +82,7 @@ def programs_of(
     Raises InputError for numbers out of range, and for a task or an algorithm that cannot be sent to another process.
     """
     cores = cores_to_use()
-    threads = max(1, cores // len(directories))
-    recorded = [run.manifest.machine.cores for run in existing.values() if run.manifest.process is not None]
-    threads = recorded[0] if recorded and recorded[0] <= cores else threads
+    threads = threads_of(existing.values(), cores, max(1, cores // len(directories)))
     has_processes = can_be_sent(template.task) and may_be_imported()
     spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
     processes = template.evaluation_processes
@@ -106,6 +104,12 @@ def programs_of(
         )
     settings = {"threads": threads, "evaluation_processes": processes, "environment_processes": stepping}
     return [template._replace(directories=tuple(group), **settings) for group in directories]
+
+
+def threads_of(existing: Iterable[RunDirectory], cores: int, default: int) -> int:
+    """Return the threads that existing runs began with if there are as many cores: the last bits depend on them."""
+    recorded = [run.manifest.machine.cores for run in existing if run.manifest.process is not None]
+    return recorded[0] if recorded and 0 < recorded[0] <= cores else default
 
 
 def can_be_sent(task: Task | Algorithm) -> bool:

@@ -32,7 +32,6 @@ def supervised(monkeypatch):
 
 
 def test_each_run_is_a_program_of_its_own(tmp_path, supervised, monkeypatch, capsys):
-    monkeypatch.setattr(module, "usable_cores", lambda: [0, 1, 2, 3])
     monkeypatch.setattr(module, "cores_to_use", lambda: 4)
     runs = tiny_study(tmp_path).runs()
     assert run_study(runs, tmp_path / "runs", Execution(workers=2, command="csac study"), make_console()) is None
