@@ -77,9 +77,9 @@ class OffPolicy(Architecture):
     warmup_steps: Annotated[int, NOT_NEGATIVE] = 10_000
     """Environment steps with uniform random actions before learning starts (the paper's T_initial)."""
     updates_per_step: Annotated[float, UPDATES] = 1.0
-    """Updates per environment step; 0.25 is one every 4 steps (rounded to a fraction with denominator up to 100)."""
+    """Updates per environment step, as a fraction: 0.25 is one every 4 steps, 0.33 a round of 33 every 100 steps."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps between rounds of updates, rounded up to a multiple of the environments; 1 is strict order."""
+    """Environment steps between rounds of updates, if whole numbers of turns and updates fit; 1 is strict order."""
     exploration_noise: Noise = "white"
     """Correlation of exploration noise over steps: none (white), on all time scales (pink), over about 7 steps (ou)."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9

@@ -15,11 +15,12 @@ from csac.types import Normaliser, Transition
 
 # Added to variances and to the standard deviation of advantages, as in SB3 and CleanRL: either may be 0.
 EPSILON = 1e-8
+MOST = 1_000_000  # batches of values that statistics average over: float32 cannot count on for ever
 LIMIT = 10.0  # bound on normalised observations, in standard deviations
 
 
 class Statistics(NamedTuple):
-    """Mean and standard deviation of all values absorbed so far; 0 and 1 before the first."""
+    """Mean and standard deviation of the values of about the last `MOST` batches; 0 and 1 before the first."""
 
     total: Scalar
     mean: Float[Array, "..."]
@@ -33,8 +34,8 @@ class Statistics(NamedTuple):
 
     def absorb(self, values: Float[Array, "n ..."]) -> Statistics:
         """Return the statistics with these values added (Chan, Golub, LeVeque 1979)."""
-        count = self.total + len(values)
-        shares = self.total / count, len(values) / count
+        count = jnp.minimum(self.total + len(values), MOST * len(values))
+        shares = (count - len(values)) / count, len(values) / count
         # Differences to the old mean are small, so that rounding loses little even where the mean is large.
         differences = jax.vmap(jnp.subtract, in_axes=(0, None))(values, self.mean)
         shift = jnp.mean(differences, axis=0)

@@ -43,6 +43,10 @@ class ActionBounds:
         np.maximum(scaled, self._low, out=scaled)
         return np.minimum(scaled, self._high, out=scaled)
 
+    def unscale(self, action: np.ndarray) -> np.ndarray:
+        """Map actions [..., action] on the environment's scale to [-1, 1]; 0 where both bounds are the same."""
+        return (action - self.centre) / np.where(self.half > 0, self.half, 1.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Contract:

@@ -90,6 +90,8 @@ def export_run(
             facts["control_rate_hz"] = control_rate(environment.raw)
     place = Path(runs.path / "export" / format if place is None else place)
     with placed(place) as folder:
+        if not card and (place / CARD).exists():
+            raise InputError(f"{place / CARD} would be lost: --card writes it anew; or choose another folder")
         write_artefact(folder, policy, format, guards, facts)
         verification = _verify(open_artefact(folder), policy, task if episodes else None, arguments, episodes)
         fields = {**read_json(folder / CONTRACT), "verification": verification}
@@ -166,7 +168,9 @@ def _learnt_weights(run: RunDirectory, steps: int) -> dict[str, float]:
     rows = run.rows("metrics")
     rows = rows[rows["step"] <= steps]
     learnt = [name for name, value in run.config.hyperparameters.items() if value == "auto"]
-    return {name: float(rows[name][-1]) for name in learnt if len(rows) and name in (rows.dtype.names or ())}
+    columns = {name: "temperature" if run.config.algorithm == "sac" else name for name in learnt}
+    known = rows.dtype.names or ()
+    return {name: float(rows[column][-1]) for name, column in columns.items() if len(rows) and column in known}
 
 
 def summary(returns: np.ndarray) -> dict[str, Any]:
@@ -230,12 +234,15 @@ def control_rate(raw: Any) -> float | None:
     """Return the actions per second of a Gymnasium environment, or None if it does not define them.
 
     They follow from PyFlyt's number of physics steps per environment step (at 120 Hz), else from `dt`, the time step
-    of MuJoCo and classic control tasks, else from the render frames per second.
+    of MuJoCo and classic control tasks, else from the render frames per second. The outermost wrapper that has a `dt`
+    counts: one that repeats actions can tell how long its step takes.
     """
     if isinstance(ratio := getattr(raw.unwrapped, "env_step_ratio", None), int):
         return 120.0 / ratio
-    step = getattr(raw.unwrapped, "dt", None)
-    if isinstance(step, int | float) and step > 0 and 0 < (rate := round(1.0 / float(step), 6)) <= FLOAT32_MAX:
-        return rate
+    step = raw.get_wrapper_attr("dt") if raw.has_wrapper_attr("dt") else None
+    if isinstance(step, int | float | np.floating) and step > 0:
+        rate = round(1.0 / float(step), 6)
+        if 0 < rate <= FLOAT32_MAX:
+            return rate
     frames = raw.metadata.get("render_fps")
     return float(frames) if isinstance(frames, int | float) and frames > 0 else None

@@ -78,6 +78,7 @@ class RunConfig:
             raise InputError(f"device must be cpu or gpu, not {self.device!r}")
         for name, least, most in _RANGES:
             check_whole(name, getattr(self, name), least, most)
+            object.__setattr__(self, name, int(getattr(self, name)))  # NumPy's are not JSON
         if self.steps % self.environments:
             raise InputError(f"steps must be a multiple of environments, {self.environments}, not {self.steps:,}")
         if self.steps + self.extra_transitions > STEPS_LIMIT:

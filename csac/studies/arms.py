@@ -119,7 +119,7 @@ def read_arms(
     on_damaged: Callable[[InputError], None] | None = None,
 ) -> list[Arm]:
     """Group the runs at and below these paths into arms: by label, or by configuration apart from the seed."""
-    groups: dict[tuple[Any, ...], Arm] = {}
+    found: dict[tuple[Any, ...], dict[Path, list[RunDirectory]]] = {}  # by label or configuration, then by folder
     seen: set[Path] = set()
     for label, path in [*((label, path) for label, some in labelled for path in some), *(("", path) for path in paths)]:
         for run in _runs(path, on_damaged):
@@ -128,14 +128,17 @@ def read_arms(
             seen.add(run.path)
             config = run.config
             alike = json.dumps([config.algorithm, settings(config)], sort_keys=True)
-            key: tuple[Any, ...] = label or alike, config.task, config.perturbations
-            if key in groups and run.seed in [other.seed for other in groups[key].runs]:
-                if label:
-                    raise InputError(f"{label}: {run.path} is a second run of seed {run.seed}; label them apart")
-                key = (*key, run.path.parent)
-            arm = groups.setdefault(key, Arm(label, config.task, config.perturbations, until=until))
-            arm.runs.append(run)
-    arms = list(groups.values())
+            key = label, alike * (not label), config.task, config.perturbations
+            folders = found.setdefault(key, {})
+            if label and run.seed in [other.seed for runs in folders.values() for other in runs]:
+                raise InputError(f"{label}: {run.path} is a second run of seed {run.seed}; label them apart")
+            folders.setdefault(run.path.parent, []).append(run)
+    arms: list[Arm] = []
+    for (label, _, task, perturbations), folders in found.items():
+        together = [run for runs in folders.values() for run in runs]
+        is_one = len({run.seed for run in together}) == len(together)  # else each folder has the same seeds anew
+        several = [together] if is_one else folders.values()
+        arms += [Arm(label, task, perturbations, runs, until=until) for runs in several]
     for arm, label in zip(arms, labels(arms), strict=True):
         arm.label = label
     return arms

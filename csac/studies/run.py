@@ -54,6 +54,9 @@ def run_study(runs: Sequence[StudyRun], directory: Path, execution: Execution, c
         console.print(f"{waiting.pop(path).name}: another process trains it", soft_wrap=True)
     if execution.cluster is None:  # the nodes of a cluster may have tasks that this machine lacks
         try_tasks(run.config for run in waiting.values())
+    for path, run in waiting.items():  # before any is changed
+        if is_run(path) and run.config.steps > (existing := RunDirectory.open(path)).config.steps:
+            refuse_lost(existing)
     programs = [_program(path, run, execution) for path, run in waiting.items()]
     with (
         stop_requested(lambda text: console.print(text)) as request,
@@ -90,7 +93,6 @@ def _program(path: Path, run: StudyRun, execution: Execution) -> Program:
         existing = RunDirectory.open(path)
         if run.config.steps > existing.config.steps:
             with existing.locked():
-                refuse_lost(existing)
                 existing.update_manifest(config=run.config)
         threads = threads_of([existing], cores, threads)
     else:

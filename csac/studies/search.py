@@ -104,8 +104,11 @@ def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: S
         if name not in free:
             raise InputError(f"{name} cannot be searched: it is given, learnt, or does nothing with the other options")
     found = {name: dimension for name, dimension in free.items() if wanted is None or name in wanted}
+    for name, dimension in found.items():
+        if dimension[0] == "one of" and values[name] not in dimension:  # a default of the user's own class
+            found[name] = (*dimension, values[name])
     if not found:
-        raise InputError("there is nothing to search: every hyperparameter of the search space is given")
+        raise InputError(f"there is nothing to search for {family}: its search space is empty, or given")
     return found
 
 

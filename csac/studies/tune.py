@@ -74,7 +74,7 @@ def _open(search: Search, directory: Path) -> optuna.Study:
         raise InputError("Optuna is not installed: pip install '.[tune]' in a clone of csac") from None
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     journal = directory / "journal.log"
-    if directory.exists() and not journal.exists() and any(directory.iterdir()):
+    if directory.exists() and not journal.exists() and (directory.is_file() or any(directory.iterdir())):
         raise InputError(f"{directory} is not empty and holds no search: choose another --directory")
     with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
@@ -224,7 +224,7 @@ def _conclude(study: optuna.Study, search: Search, directory: Path, console: Con
     if not (complete := _complete(study)):
         console.print("no trial is complete")
         return
-    ranked = sorted(complete, key=lambda trial: -(trial.value or -math.inf))
+    ranked = sorted(complete, key=lambda trial: -(-math.inf if trial.value is None else trial.value))
     rows = []
     for trial in ranked[:SHOWN]:
         score = trial.value or 0.0

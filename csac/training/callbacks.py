@@ -217,13 +217,13 @@ class Callbacks:
                 continue
             name = f"{type(callback).__name__}.{event.method}"
             method = getattr(callback, event.method)
-            answers = [self._guarded(name, method, moment, *arguments) for moment, arguments in pairs]
-            stopped_by += [type(callback).__name__ for answer in answers if not (answer is None or answer)]
+            answers = [self._guarded(name, _ends, method, moment, *arguments) for moment, arguments in pairs]
+            stopped_by += [type(callback).__name__ for answer in answers if answer]
         if event.method == "on_evaluation":
             returns = {moment.seed: mean_return(episodes) for moment, (episodes,) in pairs}
             step = event.moments[0].step
             self._guarded("on_evaluation", self.on_evaluation, step, dict(returns))
-            if self._guarded("stop_when", self.stop_when, step, dict(returns)):
+            if self.stop_when and self._guarded("stop_when", _is_true, self.stop_when, step, dict(returns)):
                 stopped_by.append("stop_when")
         stopper = str(self.failure) if self.failure else next(iter(stopped_by), "")
         return Answer(stopper, tuple(moment.scalars for moment in event.moments), self.failure is not None)
@@ -251,6 +251,16 @@ class Callbacks:
             self.failure = CallbackFailure(f"{name} raised {raised(error)}")
             self.failure.__cause__ = error
             return None
+
+
+def _is_true(function: Callable[..., Any], *arguments: Any) -> bool:
+    return bool(function(*arguments))
+
+
+def _ends(method: Callable[..., Any], *arguments: Any) -> bool:
+    """Return whether a callback's answer ends the run."""
+    answer = method(*arguments)
+    return answer is not None and not answer
 
 
 class Notifier:

@@ -150,7 +150,7 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
             raise InputError(f"demonstrations: {name} holds what is not finite")
         return flat.reshape(number, size)
 
-    actions = (field("actions", spec.action_size) - bounds.centre) / np.where(bounds.half > 0, bounds.half, 1.0)
+    actions = bounds.unscale(field("actions", spec.action_size))
     if (beyond := float(np.abs(actions).max())) > 1 + BOUNDS_TOLERANCE:
         problem = f"at {beyond:.3g} times the task's bounds: give them on its own scale, clipped to its bounds"
         raise InputError(f"demonstrations: actions are {problem}")

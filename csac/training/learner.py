@@ -206,9 +206,10 @@ def incompatibility(algorithm: Algorithm, spec: Spec, steps: int, saved: Snapsho
             found = "no such array" if saved_array is None else f"{saved_array.dtype} {saved_array.shape}"
             return f"{name} must be {leaf.dtype} {leaf.shape} and the checkpoint has {found}"
     cadence = algorithm.cadence.side_by_side(spec.environments)
-    planned = saved.arrays.get("state.total_updates", cadence.updates(steps))
-    if cadence.has_schedule and planned != cadence.updates(steps):
-        return f"its schedule is of {cadence.updates(steps):,} updates and the checkpoint's of {planned:,.0f}"
+    if cadence.has_schedule:
+        for name, planned in by_name({"state": algorithm.init(jnp.zeros(2, "uint32"), spec, steps)}).items():
+            if name.endswith(("planned", "total_updates")) and planned != saved.arrays[name]:
+                return f"its schedule is of {planned:,.0f} updates and the checkpoint's of {saved.arrays[name]:,.0f}"
     rows = saved.arrays["waiting"]
     if rows.shape != (cadence.update_interval, row_width(spec)):
         return f"the checkpoint has rollouts of {len(rows)} steps of width {rows.shape[1]}"

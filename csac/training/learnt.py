@@ -79,8 +79,7 @@ class Learnt:
         """
         critics, statistics = self._critics()
         flat = np.atleast_2d(self._contract.flatten(observations))
-        bounds = self._contract.bounds
-        inner = (np.asarray(actions, np.float32).reshape(len(flat), -1) - bounds.centre) / bounds.half
+        inner = self._contract.bounds.unscale(np.asarray(actions, np.float32).reshape(len(flat), -1))
 
         def of_one(observation: jax.Array, action: jax.Array) -> list[jax.Array]:
             return [q_value(critic, normalise(statistics, observation), action) for critic in critics]

@@ -124,7 +124,8 @@ class Loop:
             if restarts and not run.manifest.restarts_episode:
                 problem = saved.values["environment"]["problem"] or "its environment cannot be saved"
                 self.watcher.note_of(run, f"seed {run.seed}: {problem}: a resume restarts the episode in progress")
-            run.update_manifest(steps_done=self.step, restarts_episode=restarts, last_checkpoint=self.step)
+            done = {"steps_done": self.step} if self.environments.alive[index] else {}
+            run.update_manifest(**done, restarts_episode=restarts, last_checkpoint=self.step)
             self._writers[index].write(self.step, saved, self.learner.memory(index, self.step), _tables_and_policy(run))
         self._saved_at, self._saved_time = self.step, time.monotonic()
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 # Hyperparameters that a checkpoint's networks and optimisers depend on.
 _KINDS = ("activation", "layer_norm")
 _LEARNT_WITH = (
-    *("normalise_observations", "normalise_rewards", "learning_rate_schedule"),
+    *("normalise_observations", "normalise_rewards", "learning_rate_schedule", "critic_normalisation"),
     *(f"{network}{kind}" for network in ("", "actor_", "critic_") for kind in _KINDS),
 )
 

@@ -17,6 +17,7 @@ from csac.training.provenance import provenance
 from csac.training.resume import continuation, roll_back
 from csac.training.signals import storage_failures
 from csac.training.stalls import stalls_noted
+from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,7 +43,13 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
         current = provenance(program.task, program.command, program.threads)
         for run, point in zip(runs, points, strict=True):
             _note_begin(run, point, current, watcher)
-        loop = Loop(program, runs, points, watcher)
+        try:
+            loop = Loop(program, runs, points, watcher)
+        except InputError as error:
+            for run in (run for run in runs if run.manifest.state == "running"):
+                run.log(str(error))
+                run.update_manifest(state="interrupted")
+            raise
         stack.callback(loop.close)
         stack.enter_context(stalls_noted(lambda: loop.step, watcher.note, name_seeds([run.seed for run in runs])))
         try:

@@ -155,6 +155,9 @@ def _work(connection: Connection, program: Program) -> None:
     except (BrokenPipeError, EOFError, ConnectionResetError):
         return  # the parent is gone
     except (InputError, StorageFailure) as error:
+        if isinstance(error, InputError):
+            seeds = [RunDirectory.open(path).seed for path in program.directories]
+            error = InputError(f"{name_seeds(seeds)}: {error}")
         connection.send(("error", error))
         connection.send(("over",))
     except Exception as error:

@@ -119,6 +119,14 @@ def test_statistics_are_those_of_everything_absorbed():
     np.testing.assert_allclose(statistics.std**2, statistics.variance + 1e-8, rtol=1e-5)
 
 
+def test_statistics_of_very_long_runs_stay_those_of_the_values():
+    statistics = Statistics(jnp.float32(2**24), jnp.zeros(()), jnp.ones(()), jnp.ones(()))
+    for value in (1.0, -1.0) * 200:
+        statistics = statistics.absorb(jnp.array([value]))
+    assert float(statistics.total) == 1e6
+    np.testing.assert_allclose(statistics.variance, 1.0, rtol=1e-4)
+
+
 def test_what_never_varies_is_centred_and_stays_so():
     statistics = Statistics.create((4,))
     values = jnp.tile(jnp.array([0.1, -1234.567, 3e6, 0.0]), (77, 1))

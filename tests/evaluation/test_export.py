@@ -131,6 +131,8 @@ def test_a_seed_that_failed_says_so_and_counts_in_no_mean(tmp_path):
     assert (origin["failure"], origin["all_seeds"]["mean_return"]) == (None, 4.0)  # of seed 1 alone: 3, 4 and 5
     exported = export_run(run.path, seed=0, episodes=1)
     assert exported.fields["provenance"]["failure"] == "step 120: its reward is nan"
+    card = export_run(run.path, seed=0, place=tmp_path / "card", episodes=0, card=True).place / "README.md"
+    assert "failed** at step 120" in card.read_text()
     failed, perturbed = exported.notes
     assert "seed 0 failed at step 120" in failed
     assert "action_noise=0.1@100" in perturbed
@@ -146,6 +148,16 @@ def test_weights_that_are_learnt_come_with_what_they_had_become(tmp_path):
     card = (export_run(run.path, seed=0, episodes=0, card=True).place / "README.md").read_text()
     assert "| entropy_weight | `auto`, at last 0.2 |" in card
     assert "| relative_entropy_weight | `0.5` |" in card
+    run = make_run(tmp_path / "sac", algorithm="sac", hyperparameters={"entropy_weight": "auto"})
+    run.run(0).append("metrics", [{"seed": 0, "step": 200, "temperature": 0.3}])
+    assert provenance(run, run.run(0), load(run, 0), "last")["learnt_weights"] == {"entropy_weight": 0.3}
+
+
+def test_a_card_that_may_have_been_edited_is_not_lost(tmp_path):
+    run = make_run(tmp_path / "run")
+    export_run(run.path, episodes=0, card=True)
+    with pytest.raises(InputError, match="--card"):
+        export_run(run.path, episodes=0)
 
 
 def test_infinite_arguments_of_a_task_stand_in_its_contract_as_text(tmp_path):
@@ -208,6 +220,11 @@ def test_the_control_rate_is_that_of_the_time_step_or_of_the_pictures():
     assert control_rate(task) is None
     task.metadata = {"render_fps": 30}
     assert control_rate(task) == 30.0
+    task.dt = np.float32(0.25)
+    assert control_rate(task) == 4.0
+    repeating = gymnasium.Wrapper(task)
+    repeating.dt = 0.2  # pyright: ignore[reportAttributeAccessIssue]
+    assert control_rate(repeating) == 5.0
 
 
 def test_the_card_has_the_header_of_the_hub_and_the_numbers_of_the_run(tmp_path):

@@ -72,6 +72,14 @@ def test_the_same_seed_twice_is_told_apart_by_its_place(tmp_path):
     assert [label for label, *_ in labels(tmp_path)] == [f"SAC, {tmp_path / name}" for name in "ab"]
 
 
+def test_a_folder_with_a_seed_twice_keeps_its_others(tmp_path):
+    one, two = tmp_path / "one", tmp_path / "two"
+    for path in (one / "seed-0", two / "seed-0", two / "seed-1"):
+        write_run(path, config(seed=int(path.name[-1])))
+    arms = read_arms([one, two])
+    assert [[run.path for run in arm.runs] for arm in arms] == [[one / "seed-0"], [two / "seed-0", two / "seed-1"]]
+
+
 def test_labels_of_ones_own(tmp_path):
     for seed, folder in enumerate("abc"):
         write_run(tmp_path / folder, config(seed=seed, discount=0.9 + seed / 100))

@@ -97,6 +97,10 @@ def test_what_is_searched_are_hyperparameters_and_every_value_can_be(name):
             replace(algorithm, **{hyperparameter: value})
 
 
+def test_a_default_of_ones_own_is_a_choice_too():
+    assert 100 in space_of(CSAC(batch_size=100))["batch_size"]
+
+
 def test_what_does_nothing_is_not_searched():
     paper = {"reference_policy": "periodic", "reference_period": 1}
     assert "relative_entropy_weight" not in space_of(CSAC(**paper, relative_entropy_estimator="closed_form"))

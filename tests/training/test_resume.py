@@ -169,11 +169,13 @@ def test_a_resume_of_a_task_whose_sizes_have_changed_names_them(tmp_path):
 
 
 def test_a_run_with_a_learning_rate_schedule_is_neither_extended_nor_forked_without(tmp_path):
-    scheduled = SAC(**SMALL, learning_rate_schedule="cosine")
-    run(tmp_path / "run", scheduled, steps=30)
+    scheduled = SAC(**{**SMALL, "warmup_steps": 10}, learning_rate_schedule="cosine")
+    run(tmp_path / "run", scheduled, steps=30, checkpoint_interval=20)
     with pytest.raises(InputError, match="schedule that ends there"):
         csac.resume(tmp_path / "run", steps=60)
-    for changes in ({"learning_rate_schedule": "constant"}, {"normalise_rewards": True}):
+    with pytest.raises(InputError, match="its schedule is of"):
+        run(tmp_path / "fork", replace(scheduled, updates_per_step=2.0), steps=30, start_from=f"{tmp_path}/run@20")
+    for changes in ({"learning_rate_schedule": "constant"}, {"critic_normalisation": "batch"}):
         learnt_with = next(f"{name} {getattr(scheduled, name)}" for name in changes)
         with pytest.raises(InputError, match=f"learnt with {learnt_with}"):
             run(tmp_path / "fork", replace(scheduled, **changes), steps=60, start_from=tmp_path / "run")

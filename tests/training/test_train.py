@@ -95,6 +95,20 @@ def test_a_failing_environment_fails_its_seed(tmp_path, task):
     assert "Traceback" in (one.path / "log.txt").read_text()
 
 
+def test_a_robot_that_is_taken_meanwhile_leaves_its_run_interrupted(tmp_path):
+    made = []
+
+    def robot():
+        made.append(0)
+        if len(made) == 2:
+            raise RuntimeError("the robot is in use")
+        return Probe()
+
+    with pytest.raises(InputError, match="in use"):
+        run(tmp_path / "d", LEARNERS[1], 64, robot)
+    assert RunSet.open(tmp_path / "d").runs[0].state == "interrupted"
+
+
 def test_a_failed_evaluation_ends_nothing(tmp_path):
     made: list[int] = []
 
