@@ -220,7 +220,7 @@ def test_the_control_rate_is_that_of_the_time_step_or_of_the_pictures():
     assert control_rate(task) is None
     task.metadata = {"render_fps": 30}
     assert control_rate(task) == 30.0
-    task.dt = np.float32(0.25)
+    task.dt = np.float32(0.25)  # pyright: ignore[reportAttributeAccessIssue]
     assert control_rate(task) == 4.0
     repeating = gymnasium.Wrapper(task)
     repeating.dt = 0.2  # pyright: ignore[reportAttributeAccessIssue]
