@@ -79,7 +79,7 @@ class OffPolicy(Architecture):
     updates_per_step: Annotated[float, UPDATES] = 1.0
     """Updates per environment step, as a fraction: 0.25 is one every 4 steps, 0.33 a round of 33 every 100 steps."""
     update_interval: Annotated[int, COUNT] = 1
-    """Environment steps between rounds of updates, if whole numbers of turns and updates fit; 1 is strict order."""
+    """Environment steps between rounds of updates, rounded up to whole turns and whole updates; 1 is strict order."""
     exploration_noise: Noise = "white"
     """Correlation of exploration noise over steps: none (white), on all time scales (pink), over about 7 steps (ou)."""
     adam_momentum: Annotated[float, DISCOUNT] = 0.9

@@ -175,7 +175,11 @@ def test_a_run_with_a_learning_rate_schedule_is_neither_extended_nor_forked_with
         csac.resume(tmp_path / "run", steps=60)
     with pytest.raises(InputError, match="its schedule is of"):
         run(tmp_path / "fork", replace(scheduled, updates_per_step=2.0), steps=30, start_from=f"{tmp_path}/run@20")
-    for changes in ({"learning_rate_schedule": "constant"}, {"critic_normalisation": "batch"}):
+    for changes in (
+        {"learning_rate_schedule": "constant"},
+        {"normalise_rewards": True},
+        {"critic_normalisation": "batch"},
+    ):
         learnt_with = next(f"{name} {getattr(scheduled, name)}" for name in changes)
         with pytest.raises(InputError, match=f"learnt with {learnt_with}"):
             run(tmp_path / "fork", replace(scheduled, **changes), steps=60, start_from=tmp_path / "run")
