@@ -121,6 +121,9 @@ def overview(arms: Sequence[Arm]) -> Iterator[Part]:
         if arm.incomplete:
             incomplete = ", ".join(f"seed {seed} at step {step:,}" for seed, step in arm.incomplete.items())
             yield f"Incomplete, in no number below: {arm.label} on {arm.place}, {incomplete}."
+        end, is_over = arm.rows["step"].max(initial=0), all(run.state in ("finished", "failed") for run in arm.runs)
+        if not is_over and 0 < end < min(arm.config.steps, arm.until or arm.config.steps):
+            yield f"Not finished: {arm.label} on {arm.place}, its numbers are of step {end:,} of {arm.config.steps:,}."
 
 
 def curves(arms: Sequence[Arm]) -> Iterator[Part]:

@@ -175,7 +175,6 @@ class SeedEnvironments:
         if self.spec.environments == 1:
             return next(iter(saved.values()))
         joined, all_values = Snapshot.joined(saved), [one.values for one in saved.values()]
-        joined.values["alive"] = bool(self.alive[index])
         joined.values["exact"] = all(values["exact"] for values in all_values)
         joined.values["problem"] = next(filter(None, (values["problem"] for values in all_values)), "")
         return joined
@@ -183,12 +182,11 @@ class SeedEnvironments:
     def _save(self, place: Place) -> Snapshot:
         snapshot, problem = None, ""
         try:
-            snapshot = self._by_place[place].snapshot() if self.alive[place[0]] else None
+            snapshot = self._by_place[place].snapshot()
         except EnvironmentFailure as error:
             problem = str(error)
         arrays = {"observation": self.observations[place].copy(), **(snapshot.arrays if snapshot else {})}
         values = {
-            "alive": bool(self.alive[place[0]]),
             "reward": float(self._reward[place]),
             "episodes_begun": self._episodes_begun[place],
             "episode_return": self._returns[place],
@@ -227,9 +225,6 @@ class SeedEnvironments:
         self._episodes_begun[place] = values["episodes_begun"]
         self.observations, self._reward = self.observations.copy(), self._reward.copy()
         self.observations[place], self._reward[place] = arrays.pop("observation"), values["reward"]
-        if not values["alive"]:
-            self.stop(place[0])
-            return True
         seed = training_seed(self.seeds[place[0]], self._episodes_begun[place] - 1, *place[1:])
         try:
             if is_exact:

@@ -112,20 +112,20 @@ class Loop:
         self.has_returned = True
 
     def save(self) -> None:
-        """Write a checkpoint of every run, failed seeds included, unless this step already has one. Raises OSError."""
+        """Write a checkpoint of each run that goes on, unless this step already has one. Raises OSError."""
         self.evaluations.finish()
         self._stop_diverged()
-        if self.step == self._saved_at or not self.environments.alive.any():
+        if self.step == self._saved_at:
             return
-        for index, run in enumerate(self.runs):
+        for index in np.flatnonzero(self.environments.alive).tolist():
+            run = self.runs[index]
             self.recorders[index].sync()
             saved = self._snapshot(index)
-            restarts = bool(saved.values["environment"]["alive"]) and not saved.values["environment"]["exact"]
+            restarts = not saved.values["environment"]["exact"]
             if restarts and not run.manifest.restarts_episode:
                 problem = saved.values["environment"]["problem"] or "its environment cannot be saved"
                 self.watcher.note_of(run, f"seed {run.seed}: {problem}: a resume restarts the episode in progress")
-            done = {"steps_done": self.step} if self.environments.alive[index] else {}
-            run.update_manifest(**done, restarts_episode=restarts, last_checkpoint=self.step)
+            run.update_manifest(steps_done=self.step, restarts_episode=restarts, last_checkpoint=self.step)
             self._writers[index].write(self.step, saved, self.learner.memory(index, self.step), _tables_and_policy(run))
         self._saved_at, self._saved_time = self.step, time.monotonic()
 

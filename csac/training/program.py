@@ -59,19 +59,24 @@ def choose_groups(
 ) -> list[list[int]]:
     """Return the seeds of each program: as recorded in existing runs, as requested, or as is fastest here.
 
-    By default all seeds train together if one of `sent`, the task and the algorithm, cannot be sent to a process.
+    Seeds that failed are behind the others of their program: each is tried again alone. By default all new seeds train
+    together if one of `sent`, the task and the algorithm, cannot be sent to a process; then failed seeds wait for a
+    call of their own.
     """
-    known = {existing[seed].manifest.program for seed in seeds if seed in existing}
-    together = [[seed for seed in group if seed in seeds] for group in sorted(known) if len(group) > 1]
-    rest = [seed for seed in seeds if not any(seed in group for group in together)]
-    size = seeds_per_process
+    known = {seed: existing[seed].manifest.program or (seed,) for seed in seeds if seed in existing}
+    failed = [seed for seed in known if existing[seed].manifest.state == "failed"]
+    sound = {seed: program for seed, program in known.items() if seed not in failed}
+    groups = [[seed for seed in sound if sound[seed] == program] for program in sorted(set(sound.values()))]
+    rest = [seed for seed in seeds if seed not in known]
+    is_sendable, size = all(map(can_be_sent, sent)), seeds_per_process
     if size is None:
-        size = len(rest) if not all(map(can_be_sent, sent)) else 1
+        size = 1 if is_sendable else len(rest)
         if device == "gpu":
             processes = max(1, min(len(rest) // SEEDS_PER_GPU_PROCESS, len(usable_cores()) // 2, PROCESSES_PER_GPU))
             size = max(1, -(-len(rest) // (1 if preallocates() else processes)))
     check_whole("seeds_per_process", size, min(len(rest), 1), max(len(seeds), 1))
-    return together + [rest[i : i + size] for i in range(0, len(rest), max(size, 1))]
+    groups += [rest[i : i + size] for i in range(0, len(rest), max(size, 1))]
+    return groups + [[seed] for seed in failed if is_sendable or not groups]
 
 
 def programs_of(

@@ -41,6 +41,7 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
         seed_globals(runs[0].seed)
         points = roll_back(runs)
         current = provenance(program.task, program.command, program.threads)
+        current["program"] = tuple(run.seed for run in runs)
         for run, point in zip(runs, points, strict=True):
             _note_begin(run, point, current, watcher)
         try:
@@ -72,9 +73,7 @@ def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], 
         for line in lines:
             run.log(line)
             watcher.note(f"seed {run.seed}: {line}")
-    stays_failed = before.state == "failed" and point.checkpoint and not point.checkpoint.values["environment"]["alive"]
-    state = {} if stays_failed else {"state": "running", "failure": ""}
-    run.update_manifest(**current, **state, history=history, steps_done=point.step)
+    run.update_manifest(**current, state="running", failure="", history=history, steps_done=point.step)
 
 
 def begin_with(threads: int) -> None:

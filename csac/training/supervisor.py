@@ -44,7 +44,7 @@ def supervise(
     StorageFailure if a run directory can no longer be written; the other programs are stopped and saved.
     """
     waiting, running, over = deque(programs), {}, []
-    restarted: set[tuple[Path, ...]] = set()
+    restarted: set[Path] = set()
     errors: list[Exception] = []
     try:
         while running or (waiting and not errors and not should_stop()):
@@ -92,9 +92,7 @@ def _give_turns(workers: Iterable[_Worker], turns: int | None) -> None:
         worker.tell(("turn", None))
 
 
-def _replace(
-    worker: _Worker, watcher: Watcher, restarted: set[tuple[Path, ...]], errors: list[Exception]
-) -> list[Program]:
+def _replace(worker: _Worker, watcher: Watcher, restarted: set[Path], errors: list[Exception]) -> list[Program]:
     """Return the program if it is to restart, or record how its runs failed."""
     try:
         reason = worker.cause_of_death()
@@ -104,14 +102,15 @@ def _replace(
     if worker.is_stopping:  # `resume` continues its runs from their newest checkpoint
         return []
     runs = [RunDirectory.open(path) for path in worker.program.directories]
-    if worker.program.directories not in restarted:
-        restarted.add(worker.program.directories)
-        for run in runs:
+    sound = [run for run in runs if run.manifest.state != "failed"]
+    if sound and restarted.isdisjoint(worker.program.directories):
+        restarted.update(worker.program.directories)
+        for run in sound:
             run.log(f"{reason}; its process is restarted")
-        watcher.note(f"{name_seeds([run.seed for run in runs])}: {reason}; restarting from the newest checkpoint")
-        return [worker.program]
-    for run in runs:
-        if run.manifest.state != "failed" and run.manifest.steps_done < run.config.steps:
+        watcher.note(f"{name_seeds([run.seed for run in sound])}: {reason}; restarting from the newest checkpoint")
+        return [worker.program._replace(directories=tuple(run.path for run in sound))]
+    for run in sound:
+        if run.manifest.steps_done < run.config.steps:
             step = run.manifest.steps_done
             run.log(f"stopped at step {step}: {reason}")
             run.update_manifest(state="failed", failure=f"step {step}: {reason}")

@@ -120,6 +120,9 @@ def test_what_failed_and_what_is_incomplete_is_said(tmp_path):
     told = " ".join(part for part in parts if isinstance(part, str))
     assert "Failed: SAC on Ant-v4, seed 1: step 5: reward is not finite" in told
     assert "SAC on Ant-v4, seed 2 at step 400" in told
+    assert "Not finished" not in told
+    write_run(tmp_path / "early", config(discount=0.9), state="interrupted", points=4)
+    assert "step 400 of 1,000" in str(list(overview(read_arms([tmp_path / "early"]))))
 
 
 def test_runs_without_evaluations_have_a_report_too(tmp_path):

@@ -178,14 +178,3 @@ def test_an_episode_that_cannot_be_saved_says_why_and_begins_anew(gives, problem
     assert saved.values["problem"].startswith(problem)
     assert second.restore(0, saved) is False
     np.testing.assert_array_equal(second.observations, SeedEnvironments(probes.Unsavable, {}, [3]).reset())
-
-
-def test_a_seed_that_has_failed_stays_so():
-    first, second = (SeedEnvironments("Hopper-v4", None, (4, 9)) for _ in range(2))
-    first.reset()
-    steps_of(first, 3)
-    first.stop(1)
-    for index in range(2):
-        second.restore(index, first.save(index))
-    assert second.alive.tolist() == [True, False]
-    assert steps_of(second, 5) == steps_of(first, 5)

@@ -21,7 +21,8 @@ import csac
 from csac import InputError
 from csac.algorithms import SAC
 from csac.record.sets import RunSet
-from csac.training.program import can_be_sent
+from csac.training.checkpoint import steps_in
+from csac.training.program import can_be_sent, choose_groups
 
 
 class Falling(Probe):
@@ -93,6 +94,29 @@ def test_a_failing_environment_fails_its_seed(tmp_path, task):
     assert one.manifest.failure.startswith("step 60:")
     assert runs.failures == {0: one.manifest.failure}
     assert "Traceback" in (one.path / "log.txt").read_text()
+
+
+def test_a_failed_seed_keeps_its_checkpoint_and_is_resumed_alone(tmp_path):
+    made = []
+
+    def task():
+        made.append(0)
+        return Falling() if len(made) == 2 else Probe()  # the first one made for training: seed 0's
+
+    given: dict[str, Any] = {"task": task, "checkpoint_interval": 40, "steps": 200}
+    with pytest.warns(RuntimeWarning, match="seed 0 failed"):
+        runs = run(tmp_path / "set", **given, seeds=3, seeds_per_process=3)
+    assert [steps_in(one.checkpoints)[-1] for one in runs.runs] == [40, 200, 200]
+    before = contents(runs.runs[1])
+    existing = {one.seed: one for one in runs.runs}
+    assert choose_groups(runs.seeds, existing, None, "cpu", "Hopper-v5") == [[1, 2], [0]]
+    assert choose_groups(runs.seeds, existing, None, "cpu", task) == [[1, 2]]  # the task cannot be sent to a process
+    run(tmp_path / "set", **given, resume=True)
+    runs = RunSet.open(tmp_path / "set")
+    assert [one.manifest.state for one in runs.runs] == ["finished"] * 3
+    assert [one.manifest.program for one in runs.runs] == [(0,), (0, 1, 2), (0, 1, 2)]
+    assert [entry.step for entry in runs.runs[0].manifest.history] == [40]
+    assert contents(runs.runs[1]) == before
 
 
 def test_a_robot_that_is_taken_meanwhile_leaves_its_run_interrupted(tmp_path):
