@@ -287,6 +287,8 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
 
     source, preset = _source(words), value_of(words, "--preset")
     name, kind = chosen_algorithm(words, source.config.algorithm if source else None)
+    if taken := options_of(base) & options_of(kind):
+        raise InputError(f"{', '.join(sorted(taken))} of {name}: give the field another name, csac has such an option")
     defaults: dict[str, Any] = {"algorithm": name, "preset": preset}
     learner = kind(**(hyperparameters(preset, name, task) if preset else {}))
     if source:

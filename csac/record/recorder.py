@@ -27,9 +27,7 @@ class Recorder:
     def __init__(self, run: RunDirectory, begin: int, tensorboard: bool, wandb: bool | str = False) -> None:
         self.run = run
         self._queued: dict[Table, list[dict[str, Any]]] = defaultdict(list)
-        origin, rows = run.manifest.forked_from, run.evaluations
-        if origin and origin.changed("task ", "environment_arguments"):  # earlier returns are of another task
-            rows = rows[rows["step"] > origin.step]
+        rows = run.evaluations
         self.best = best_return(rows) if run.policy_file("best").exists() else -np.inf
         self._log = self._wandb = None
         if tensorboard or wandb:

@@ -173,8 +173,11 @@ class RunDirectory:
 
     @property
     def evaluations(self) -> np.ndarray:
-        """The rows of evaluations.csv: one per evaluation episode."""
-        return self.rows("evaluations")
+        """The rows of evaluations.csv, one per evaluation episode, without those on the task before a fork changed it."""
+        rows, origin = self.rows("evaluations"), self.manifest.forked_from
+        if origin and origin.changed("task ", "environment_arguments"):
+            rows = rows[rows["step"] > origin.step]
+        return rows
 
     def log(self, line: str) -> None:
         """Append a line to log.txt, with a timestamp."""

@@ -83,12 +83,12 @@ class RunSet:
 
     @property
     def evaluations(self) -> np.ndarray:
-        """The rows of evaluations.csv of all runs."""
-        return self.rows("evaluations")
+        """The `evaluations` of all runs."""
+        return joined("evaluations", (run.evaluations for run in self.runs))
 
     @property
     def sound_evaluations(self) -> np.ndarray:
-        """The rows of evaluations.csv of the runs that did not fail."""
+        """The `evaluations` of the runs that did not fail."""
         rows = self.evaluations
         return rows[~np.isin(rows["seed"], list(self.failures))]
 

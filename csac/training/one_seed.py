@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from csac.algorithms.exploration import keys_of, uniform_of
 from csac.training.packing import Packing
-from csac.types import Transition
+from csac.types import InputError, Transition
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,6 +52,8 @@ class OneSeed:
         self._update = jax.jit(lambda *arguments: algorithm.update(*arguments), inline=True)
         self.state, memory = jax.eval_shape(lambda data: self._init(jax.random.wrap_key_data(data)), KEY_DATA)
         self.metrics = tuple(jax.eval_shape(self._first_metrics, self.state, memory, KEY_DATA))
+        if taken := {"seed", "step"} & {*self.metrics}:
+            raise InputError(f"{algorithm.name} has a metric called {taken.pop()!r}: give it another name")
         # An algorithm that acts more often than it updates packs nothing: each action would unpack the policy again.
         self.packing = Packing(self.state, SMALL if self.cadence.update_interval == spec.environments else 0)
 

@@ -36,6 +36,7 @@ OPTIONS = shlex.split(
 )
 BROKEN = """
 from dataclasses import dataclass
+from csac.algorithms import SAC
 
 @dataclass(frozen=True)
 class Half:
@@ -49,6 +50,10 @@ class Required(Half):
 @dataclass
 class Melting:
     def update(self): ...
+
+@dataclass(frozen=True)
+class Several(SAC):
+    seeds: int = 1
 """
 
 
@@ -165,6 +170,7 @@ def test_one_that_no_module_can_give_is_resumed_with_the_class_given(tmp_path, o
         ("broken:Half", "Half has no memory or init or act or policy"),
         ("broken:Melting", "Melting must be a frozen dataclass"),
         ("broken:Required", "width of broken:Required has no default"),
+        ("broken:Several", "--seeds of broken:Several"),
         ("nowhere:SAC", "the module nowhere cannot be imported"),
         ("calm", "no algorithm is called 'calm': choose csac or sac"),
     ],
@@ -174,6 +180,16 @@ def test_what_is_no_algorithm_is_told_in_one_line(own, name, message):
     done = command(own.folder, "train", "Pendulum-v1", "--algorithm", name)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert message in done.stderr
+
+
+def test_a_metric_that_would_be_a_column_twice_is_refused(tmp_path):
+    class Counting(SAC):
+        def update(self, *given):
+            state, metrics = super().update(*given)
+            return state, {**metrics, "step": metrics["critic_loss"]}
+
+    with pytest.raises(InputError, match="metric called 'step'"):
+        run(tmp_path / "run", Counting(**SMALL))
 
 
 def test_what_a_manifest_cannot_keep_is_refused(tmp_path, own):

@@ -260,6 +260,11 @@ def test_a_fork_starts_with_the_checkpoint_and_leaves_its_source_unchanged(tmp_p
     assert (origin.step, origin.changes) == (360, ())
 
 
+def test_returns_on_the_task_before_are_in_no_number_of_a_fork(tmp_path, made):
+    fork = run(tmp_path / "fork", task="Hopper-v5", start_from=f"{made.path}@360").runs[0]
+    assert 0 < fork.rows("evaluations")["step"].min() < 360 < fork.evaluations["step"].min()
+
+
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
