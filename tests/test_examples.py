@@ -101,7 +101,7 @@ def parsed(name: str, words: list[str]) -> object:
 
 def test_the_front_page_is_read_in_minutes():
     page = (ROOT / "README.md").read_text()
-    assert len(re.findall(r"\S*\w\S*", page)) <= 1_100  # words
+    assert len(re.findall(r"\S*\w\S*", page)) <= 1_000  # words
     assert len(re.findall(r"\d\.\d", page)) <= 25
     assert (ROOT / "results" / "film.gif").stat().st_size < 3e6
 

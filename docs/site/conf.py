@@ -37,7 +37,8 @@ autodoc_default_options = {"members": True}
 # The side of each page. What stands in docs/ and in no list comes last, so that a new page is seen at once.
 NAVIGATION = {
     "Tutorials": [
-        f"docs/tutorials/{name}" for name in ("first-controller", "your-own-environment", "from-training-to-a-robot")
+        "docs/README",
+        *[f"docs/tutorials/{name}" for name in ("first-controller", "your-own-environment", "from-training-to-a-robot")],
     ],
     "How to": [
         "docs/choosing-an-algorithm",
