@@ -130,12 +130,12 @@ class CSAC(MaximumEntropy):
     def actor_loss(
         self, actor: MLP, observation: Observation, noise: Action, *, reference: MLP, critics: Critics, sigma: Any
     ) -> tuple[Scalar, Metrics]:
-        """Return J(φ) = σ log π + τ D - min Q at ã(s, ξ), and the metrics; with `sampled` it is Eq. actor_update_2."""
+        """Return J(φ) = σ log π - min Q + τ D at ã(s, ξ), and the metrics; with `sampled` it is Eq. actor_update_2."""
         q_value, log_prob, relative_entropy = self.soft_value_terms(
             observation, noise, actor=actor, reference=reference, critics=critics
         )
         relative_entropy = bounded(relative_entropy, self.relative_entropy_bound)
-        loss = -(q_value - sigma * log_prob - self.relative_entropy_weight * relative_entropy)
+        loss = sigma * log_prob - q_value + self.relative_entropy_weight * relative_entropy
         return loss, {"actor_loss": loss, "entropy": -log_prob, "relative_entropy": relative_entropy}
 
     def reference_before(self, reference: MLP, actor: MLP, step: Count) -> MLP:

@@ -70,7 +70,7 @@ class Loop:
             copies = self.config.hindsight
             self.hindsight = Hindsight(copies, self.environments, self.learner) if copies else None
             self._perturbations = perturbations_of(self.config.perturbations)
-            self._changes = dict(by_step(self._perturbations))
+            self._changes = by_step(self._perturbations)
             self._begin(points)
             self.recorders = [Recorder(run, self.step, program.tensorboard, program.wandb) for run in runs]
             recorded = self.runs, self.recorders
@@ -184,7 +184,7 @@ class Loop:
 
     def _advance(self) -> bool:
         """Step each environment once and learn from it; return whether a callback ends the runs."""
-        for change in [self._changes[step] for step in self._changes if 0 <= self.step - step < self._stride]:
+        for change in [text for step, text in self._changes if 0 <= self.step - step < self._stride]:
             self._perturb(self.step)
             text = f"perturbed from step {self.step + 1:,} on: {change}"
             for run in self.runs:
