@@ -52,7 +52,7 @@ def measure(
     paced = rate * seconds
     if not (1 <= calls <= MOST_CALLS and rate > 0 and seconds >= 0 and (paced == 0 or 1 <= paced <= MOST_CALLS)):
         raise InputError(
-            f"{calls} calls, and {seconds:g} seconds at {rate:g} Hz: both take from 1 to {MOST_CALLS:,} calls"
+            f"calls {calls}, and seconds {seconds:g} at rate {rate:g}: both make from 1 to {MOST_CALLS:,} calls"
         )
     size = artefact.contract.spec.observation_size
     observations = list(np.random.default_rng(0).standard_normal((_OBSERVATIONS, size), np.float32))
