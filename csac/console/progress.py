@@ -113,7 +113,7 @@ class Reporter:
         self._print(Text())
         self._print(Text(_outcome(runs, duration(self._clock() - self._started)), "bold"))
         has_curve = bool(len(runs.evaluations))
-        for table in result_tables(runs) if has_curve else [Text("no evaluations yet")]:
+        for table in result_tables(runs) if has_curve else [Text("no evaluations")]:
             self._print(table)
         for seed, reason in runs.failures.items():
             if seed not in self._seeds or not self._seeds[seed].failure:

@@ -22,10 +22,18 @@ class Recorder:
     """Write the rows of one run, in batches of a few hundred steps.
 
     `begin` is the step that the run continues from; `wandb` may name the W&B project that gets TensorBoard's values.
+    `note` receives a line if W&B fails.
     """
 
-    def __init__(self, run: RunDirectory, begin: int, tensorboard: bool, wandb: bool | str = False) -> None:
-        self.run = run
+    def __init__(
+        self,
+        run: RunDirectory,
+        begin: int,
+        tensorboard: bool,
+        wandb: bool | str = False,
+        note: Callable[[str], None] | None = None,
+    ) -> None:
+        self.run, self._note = run, note or run.log
         self._queued: dict[Table, list[dict[str, Any]]] = defaultdict(list)
         rows = run.evaluations
         self.best = best_return(rows) if run.policy_file("best").exists() else -np.inf
@@ -73,7 +81,8 @@ class Recorder:
             return call(*arguments)
         except Exception as error:
             self._wandb = None
-            self.run.log(f"W&B gets no more of this run: {type(error).__name__}: {error}")
+            reason = " ".join(str(error).split())
+            self._note(f"warning: W&B gets no more of seed {self.run.seed}: {type(error).__name__}: {reason}")
 
 
 def _merged_by_step(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

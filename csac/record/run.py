@@ -173,7 +173,7 @@ class RunDirectory:
 
     @property
     def evaluations(self) -> np.ndarray:
-        """The rows of evaluations.csv, one per evaluation episode, without those on the task before a fork changed it."""
+        """The rows of evaluations.csv, one per evaluation episode; of a fork to another task those on it alone."""
         rows, origin = self.rows("evaluations"), self.manifest.forked_from
         if origin and origin.changed("task ", "environment_arguments"):
             rows = rows[rows["step"] > origin.step]

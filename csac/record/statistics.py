@@ -179,7 +179,7 @@ class Recovery(NamedTuple):
     final: float
     """Mean return of the last three evaluations after the perturbation, or of the curve if none is after it."""
     worst_drawdown: float
-    """Largest fall from the highest return so far, over the whole curve, before and after the perturbation."""
+    """Largest fall from the highest return so far, from the beginning of the curve on."""
 
 
 def recovery(rows: np.ndarray, step: int, until: int | None = None, since: int = -1) -> dict[int, Recovery]:

@@ -89,7 +89,7 @@ class StopOnReturn(Callback):
     """Ends a run once the mean return of an evaluation is at least `threshold`."""
 
     def __init__(self, threshold: float) -> None:
-        self.threshold = threshold
+        self.threshold = float(threshold)
 
     def on_evaluation(self, moment: Moment, episodes: Sequence[EvaluationEpisode]) -> bool:
         """Compare the mean with the threshold."""

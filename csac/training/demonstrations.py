@@ -102,8 +102,8 @@ def _of_file(path: Path) -> dict[str, Any]:
             return {name: file[name] for name in file.files}
     except OSError as error:
         raise InputError(f"demonstrations: cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, AttributeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"demonstrations: {path} is no .npz file of arrays ({error})") from None
+    except (ValueError, AttributeError, EOFError, zipfile.BadZipFile):
+        raise InputError(f"demonstrations: {path} is no .npz file of arrays of numbers") from None
 
 
 def _of_minari(name: str, contract: Contract) -> dict[str, Any]:
@@ -145,7 +145,7 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
             raise InputError(f"demonstrations: {name}: {message(error)}") from None
         if flat.shape[:1] != (number,) or flat.size != number * size:
             wanted = (number, size)[: 1 + (size > 1 or flat.ndim > 1)]
-            raise InputError(f"demonstrations: {name} has shape {flat.shape}, not {wanted}")
+            raise InputError(f"demonstrations: {name} has shape {flat.shape}, not {wanted} as for {number:,} rewards")
         if not np.isfinite(flat).all():
             raise InputError(f"demonstrations: {name} holds what is not finite")
         return flat.reshape(number, size)

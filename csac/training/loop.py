@@ -72,7 +72,8 @@ class Loop:
             self._perturbations = perturbations_of(self.config.perturbations)
             self._changes = by_step(self._perturbations)
             self._begin(points)
-            self.recorders = [Recorder(run, self.step, program.tensorboard, program.wandb) for run in runs]
+            logs = self.step, program.tensorboard, program.wandb
+            self.recorders = [Recorder(run, *logs, partial(watcher.note_of, run)) for run in runs]
             recorded = self.runs, self.recorders
             self.notifier = Notifier(
                 program.interests, watcher.call, *recorded, self.learner.metric_names, self._policy

@@ -38,7 +38,9 @@ autodoc_default_options = {"members": True}
 NAVIGATION = {
     "Tutorials": [
         "docs/README",
-        *[f"docs/tutorials/{name}" for name in ("first-controller", "your-own-environment", "from-training-to-a-robot")],
+        "docs/tutorials/first-controller",
+        "docs/tutorials/your-own-environment",
+        "docs/tutorials/from-training-to-a-robot",
     ],
     "How to": [
         "docs/choosing-an-algorithm",

@@ -157,7 +157,7 @@ def test_a_run_that_failed_at_once_points_at_its_log_alone(plain, tmp_path):
     runs.runs[0].log("stopped at step 1: reset raised ValueError: no map\nTraceback (most recent call last):\n  ...")
     Reporter(plain).finish(runs)
     assert lines(plain)[-3:] == [
-        "no evaluations yet",
+        "no evaluations",
         "seed 0 failed at step 20: reward is nan",
         f"why      see {tmp_path}/seed-0/log.txt",
     ]

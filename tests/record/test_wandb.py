@@ -53,7 +53,7 @@ def test_what_fails_in_wandb_ends_no_run(tmp_path, monkeypatch):
     recorder.close()
     assert len(run.rows("episodes")) == 3
     assert Broken.calls == 2
-    assert "W&B gets no more of this run: OSError: no more room" in (run.path / "log.txt").read_text()
+    assert "W&B gets no more of seed 0: OSError: no more room" in (run.path / "log.txt").read_text()
 
 
 def test_a_wandb_that_is_not_there_is_named(monkeypatch):

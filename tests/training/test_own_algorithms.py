@@ -184,8 +184,8 @@ def test_what_is_no_algorithm_is_told_in_one_line(own, name, message):
 
 def test_a_metric_that_would_be_a_column_twice_is_refused(tmp_path):
     class Counting(SAC):
-        def update(self, *given):
-            state, metrics = super().update(*given)
+        def update(self, state, batch, key, step):
+            state, metrics = super().update(state, batch, key, step)
             return state, {**metrics, "step": metrics["critic_loss"]}
 
     with pytest.raises(InputError, match="metric called 'step'"):
