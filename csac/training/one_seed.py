@@ -53,7 +53,7 @@ class OneSeed:
         self.state, memory = jax.eval_shape(lambda data: self._init(jax.random.wrap_key_data(data)), KEY_DATA)
         self.metrics = tuple(jax.eval_shape(self._first_metrics, self.state, memory, KEY_DATA))
         if taken := {"seed", "step"} & {*self.metrics}:
-            raise InputError(f"{algorithm.name} has a metric called {taken.pop()!r}: give it another name")
+            raise InputError(f"{type(algorithm).__name__} has a metric called {taken.pop()!r}: give it another name")
         # An algorithm that acts more often than it updates packs nothing: each action would unpack the policy again.
         self.packing = Packing(self.state, SMALL if self.cadence.update_interval == spec.environments else 0)
 
