@@ -23,12 +23,28 @@ PAPER_TABLE = {
 }
 
 
-@pytest.mark.parametrize("algorithm", ["csac", "sac"])
-def test_paper_gives_the_papers_table(algorithm):
-    given = presets.hyperparameters("paper", algorithm, "Walker2d-v4")
+PAPER_OWN = {
+    "csac": {
+        "entropy_weight": 0.2,
+        "reference_policy": "periodic",
+        "reference_period": 1,
+        "relative_entropy_estimator": "sampled",
+    },
+    "sac": {"entropy_weight": 0.2},
+    "td3": {"exploration_std": 0.1, "target_noise": 0.2, "target_noise_clip": 0.5, "policy_delay": 2},
+    "sd3": {
+        "actor_learning_rate": 1e-3,
+        "critic_learning_rate": 1e-3,
+        "noise_samples": 50,
+        "importance_sampling": False,
+    },
+}
 
-    assert {name: given[name] for name in PAPER_TABLE} == PAPER_TABLE
-    assert given["entropy_weight"] == 0.2
+
+@pytest.mark.parametrize(("algorithm", "own"), PAPER_OWN.items(), ids=PAPER_OWN)
+def test_paper_gives_the_papers_table(algorithm, own):
+    given = presets.hyperparameters("paper", algorithm, "Walker2d-v4")
+    assert {name: given[name] for name in PAPER_TABLE | own} == PAPER_TABLE | own
 
 
 @pytest.mark.parametrize(
@@ -42,55 +58,21 @@ def test_an_algorithm_takes_what_its_preset_gives(preset, algorithm):
     assert {name: value for name, value in dataclasses.asdict(made).items() if name in given} == given
 
 
-def test_paper_csac_is_algorithm_1_with_the_sampled_log_ratio():
-    given = presets.hyperparameters("paper", "csac", "HalfCheetah-v4")
-
-    assert (given["reference_policy"], given["reference_period"]) == ("periodic", 1)
-    assert given["relative_entropy_estimator"] == "sampled"
-
-
 @pytest.mark.parametrize(
-    ("task", "tau"),
+    ("task", "tau", "beta"),
     [
-        ("HalfCheetah-v4", 0.5),
-        ("PandaReach-v3", 0.5),
-        ("PyFlyt/QuadX-Waypoints-v1", 0.1),
-        ("PyFlyt.gym_envs:PyFlyt/QuadX-Waypoints-v1", 0.1),
+        ("Ant-v4", 0.5, 0.001),
+        ("HalfCheetah-v4", 0.5, 0.005),
+        ("Hopper-v4", 0.5, 0.05),
+        ("Walker2d-v4", 0.5, 0.1),
+        ("Walker2d-v5", 0.5, 0.1),
+        ("PandaReach-v3", 0.5, 0.05),
+        ("PyFlyt/QuadX-Waypoints-v1", 0.1, 0.05),
+        ("PyFlyt.gym_envs:PyFlyt/QuadX-Waypoints-v1", 0.1, 0.05),
     ],
 )
-def test_paper_tau_depends_on_the_task(task, tau):
+def test_papers_tau_and_beta_depend_on_the_task(task, tau, beta):
     assert presets.hyperparameters("paper", "csac", task)["relative_entropy_weight"] == tau
-
-
-def test_paper_td3_has_the_papers_table_and_its_own_noise():
-    given = presets.hyperparameters("paper", "td3", "Walker2d-v4")
-
-    assert {name: given[name] for name in PAPER_TABLE} == PAPER_TABLE
-    assert (given["exploration_std"], given["target_noise"], given["target_noise_clip"]) == (0.1, 0.2, 0.5)
-    assert given["policy_delay"] == 2
-
-
-def test_paper_sd3_learns_faster():
-    given = presets.hyperparameters("paper", "sd3", "Walker2d-v4")
-
-    learning_rates = {"actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3}
-    assert {name: given[name] for name in PAPER_TABLE} == PAPER_TABLE | learning_rates
-    assert (given["noise_samples"], given["importance_sampling"]) == (50, False)
-
-
-@pytest.mark.parametrize(
-    ("task", "beta"),
-    [
-        ("Ant-v4", 0.001),
-        ("HalfCheetah-v4", 0.005),
-        ("Hopper-v4", 0.05),
-        ("Walker2d-v4", 0.1),
-        ("Walker2d-v5", 0.1),
-        ("PandaReach-v3", 0.05),
-        ("PyFlyt.gym_envs:PyFlyt/QuadX-Waypoints-v1", 0.05),
-    ],
-)
-def test_paper_beta_depends_on_the_task(task, beta):
     assert presets.hyperparameters("paper", "sd3", task)["inverse_temperature"] == beta
 
 
@@ -143,22 +125,15 @@ def test_changing_what_was_given_changes_no_preset():
     assert presets.hyperparameters("paper", "csac", "Ant-v4")["discount"] == 0.99
 
 
-def test_an_unknown_preset_is_named_with_those_there():
-    with pytest.raises(InputError, match=r"no preset is called 'papre': choose paper or strong"):
-        presets.hyperparameters("papre", "csac", "Ant-v4")
-
-
-def test_an_algorithm_without_the_preset_is_named():
-    with pytest.raises(InputError, match=r"'paper' has no 'dqn': it has csac and sac"):
-        presets.hyperparameters("paper", "dqn", "Ant-v4")
-
-
-def test_strong_is_of_csac_and_sac_alone():
-    with pytest.raises(InputError, match=r"'strong' has no 'td3': it has csac and sac"):
-        presets.hyperparameters("strong", "td3", "Ant-v4")
-
-
-def test_a_task_that_is_no_text_is_refused():
-    given: Any = None
-    with pytest.raises(InputError, match=r"task is a Gymnasium id such as 'Hopper-v4', not None"):
-        presets.hyperparameters("paper", "csac", given)
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (("papre", "csac", "Ant-v4"), "no preset is called 'papre': choose paper or strong"),
+        (("paper", "dqn", "Ant-v4"), "'paper' has no 'dqn': it has csac and sac"),
+        (("strong", "td3", "Ant-v4"), "'strong' has no 'td3': it has csac and sac"),
+        (("paper", "csac", None), "task is a Gymnasium id such as 'Hopper-v4', not None"),
+    ],
+)
+def test_what_no_preset_has_is_named(given: Any, told):
+    with pytest.raises(InputError, match=told):
+        presets.hyperparameters(*given)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equations import batch_of, transition
+from equations import batch_of, transition, update
 
 from csac.algorithms import CSAC, SAC, TD3
 from csac.algorithms.statistics import Statistics, normalise, normalise_batch
@@ -27,11 +27,6 @@ FAR = batch_of(  # mean 4, standard deviation 2
 NEAR = FAR._replace(
     observation=np.array([[-1.0], [1.0]], np.float32), next_observation=np.array([[0.5], [10.0]], np.float32)
 )
-
-
-@partial(jax.jit, static_argnums=0)
-def update(algorithm, state, batch, step: int = 0):
-    return algorithm.update(state, batch, jax.random.key(step), step)
 
 
 def test_a_batch_is_seen_by_statistics_that_have_absorbed_it():

@@ -3,33 +3,21 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equations import LINEAR, ONE, batch_of, linear, transition
+from equations import LINEAR, ONE, always, batch_of, linear, transition, update
 
 from csac.algorithms import sd3 as file
-from csac.algorithms.networks import MLP
 from csac.algorithms.sd3 import SD3, Pair, State, actor_loss, critic_loss, log_density, softmax_operator
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.types import Spec, Transition
+from csac.types import Spec
 
 SETTINGS: dict[str, Any] = {**LINEAR, "noise_samples": 3}
-
-
-def always(action: float) -> MLP:
-    """An actor whose action is this one everywhere."""
-    return linear([[0.0]], [math.atanh(action)])
-
-
-@partial(jax.jit, static_argnums=0)
-def update(algorithm, state: State, batch: Transition):
-    return algorithm.update(state, batch, jax.random.key(0), 0)
 
 
 def operator(values, beta: float, weights=None) -> float:

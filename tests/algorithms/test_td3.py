@@ -3,28 +3,14 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equations import LINEAR, ONE, batch_of, linear, transition
+from equations import LINEAR, ONE, always, batch_of, linear, transition, update
 
-from csac.algorithms.networks import MLP
 from csac.algorithms.td3 import TD3
-from csac.types import Transition
-
-
-def always(action: float) -> MLP:
-    """An actor whose action is this one everywhere."""
-    return linear([[0.0]], [math.atanh(action)])
-
-
-@partial(jax.jit, static_argnums=0)
-def update(algorithm, state, batch: Transition, step: int):
-    return algorithm.update(state, batch, jax.random.key(0), step)
-
 
 # The target actor's action is 0.3. Q₁' = s + 2a and Q₂' = 3 - a at s = 1 cross at a = 2/3.
 TARGET_CRITICS = (linear([[1.0], [2.0]], [0.0]), linear([[0.0], [-1.0]], [3.0]))

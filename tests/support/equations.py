@@ -26,6 +26,11 @@ def gaussian(mean: float, std: float) -> MLP:
     return linear([[0.0, 0.0]], [mean, math.log(std)])
 
 
+def always(action: float) -> MLP:
+    """An actor whose action is this one everywhere."""
+    return linear([[0.0]], [math.atanh(action)])
+
+
 def transition(observation=1.0, action=0.5, reward=2.0, next_observation=1.0, terminated=0.0, truncated=0.0):
     observation, action, next_observation = (np.array([x], np.float32) for x in (observation, action, next_observation))
     reward, terminated, truncated = (np.array(x, np.float32) for x in (reward, terminated, truncated))
