@@ -53,7 +53,7 @@ EXPECTED = sorted(
 )
 
 
-@pytest.mark.parametrize(("seeds", "together"), [(1, 1), (2, 1), (2, 2)])
+@pytest.mark.parametrize(("seeds", "together"), [(2, 1), (2, 2)])
 def test_a_callback_hears_everything_of_every_seed_in_its_own_process(tmp_path, seeds, together):
     diary = Diary()
     runs = run(tmp_path / "set", LEARNER, 200, **ENDLESS, seeds=seeds, seeds_per_process=together, callbacks=[diary])
@@ -107,16 +107,15 @@ def whole(tmp_path_factory):
     return contents(run(tmp_path_factory.mktemp("whole") / "set", LEARNER, 300, **ENDLESS).runs[0])
 
 
-@pytest.mark.parametrize(
-    ("method", "step", "expected"), [("on_step", 125, 130), ("on_episode", 141, 150), ("on_evaluation", 60, 100)]
-)
-def test_false_ends_a_run_as_finished_and_it_goes_on_without_the_callback(tmp_path, whole, method, step, expected):
-    runs = run(tmp_path / "set", LEARNER, 300, **ENDLESS, callbacks=[StopAt(method, step)])
-    manifest = runs.runs[0].manifest
-    assert (manifest.state, manifest.steps_done) == ("finished", expected)
-    assert f"stopped early at step {expected} (StopAt)" in (runs.runs[0].path / "log.txt").read_text()
-    again = run(tmp_path / "set", LEARNER, 300, **ENDLESS, callbacks=[StopAt("on_evaluation", 60)], resume=True)
-    assert again.runs[0].manifest.steps_done == expected  # the last evaluation would end it as well
+def test_false_ends_a_run_as_finished_and_it_goes_on_without_the_callback(tmp_path, whole):
+    stops = [("on_evaluation", 60, 100), ("on_step", 125, 130), ("on_episode", 141, 150)]
+    for method, step, expected in stops:  # each goes on from where the one before has ended it
+        runs = run(tmp_path / "set", LEARNER, 300, **ENDLESS, callbacks=[StopAt(method, step)], resume=True)
+        manifest = runs.runs[0].manifest
+        assert (manifest.state, manifest.steps_done) == ("finished", expected)
+        assert f"stopped early at step {expected} (StopAt)" in (runs.runs[0].path / "log.txt").read_text()
+        again = run(tmp_path / "set", LEARNER, 300, **ENDLESS, callbacks=[StopAt("on_evaluation", 60)], resume=True)
+        assert again.runs[0].manifest.steps_done == expected  # the last evaluation would end it as well
     resumed = run(tmp_path / "set", LEARNER, 300, **ENDLESS, resume=True)
     assert contents(resumed.runs[0]) == whole
 

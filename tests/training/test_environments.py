@@ -5,23 +5,20 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
-import jax
-import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
 from resuming import ROLLOUT, SMALL, Crash, contents, crash_at, run_with_copies
 from resuming import run as train
-from test_memory import RolloutWatcher, Watcher
+from test_memory import RolloutWatcher, Watcher, check_story
 from trainer import run
 
 from csac import InputError, resume
 from csac.algorithms import PPO, SAC
-from csac.algorithms.memory import unpack
 from csac.seeds import training_seed
 from csac.tasks import workers
 from csac.tasks.vector import SeedEnvironments
-from csac.types import Cadence, Spec
+from csac.types import Cadence
 
 SEEDS = (4, 9)
 FOUR: dict[str, Any] = {
@@ -30,21 +27,6 @@ FOUR: dict[str, Any] = {
     "perturbations": ("friction=1.5@150", "observation_noise=0.01@330"),
     "keep_checkpoints": 0,
 }
-
-
-def check_story(rows: np.ndarray, seed: int, environment: int) -> None:
-    """Check that packed rows of one environment of `IdEncoded` follow each other as its steps do."""
-    step = jax.vmap(unpack, in_axes=(0, None))(jnp.asarray(rows), Spec(4, 1))
-    reset_seed, episode, number, last_action = step.observation.T
-    assert episode.max() > 5
-    np.testing.assert_array_equal(reset_seed, [training_seed(seed, int(e), environment) % 65536 for e in episode])
-    after = np.stack([reset_seed, episode, number + 1, step.action[:, 0]], axis=1)
-    np.testing.assert_allclose(step.next_observation, after, atol=1e-6)  # never the observation of a reset
-    is_last = number + 1 == 2 + episode % 3
-    np.testing.assert_array_equal(step.terminated, is_last & (episode % 3 != 1))
-    np.testing.assert_array_equal(step.truncated, is_last & (episode % 3 != 0))
-    np.testing.assert_allclose(step.observation[1:][~is_last[:-1]], step.next_observation[:-1][~is_last[:-1]])
-    np.testing.assert_array_equal(last_action[number == 0], 0)
 
 
 @pytest.mark.parametrize("processes", [0, 2])
@@ -86,12 +68,6 @@ def test_the_ratio_of_updates_to_steps_is_kept_whatever_the_number_of_environmen
     assert Cadence(0, 10, 5, 8).side_by_side(4)[1:3] == (12, 6)  # rounded up to whole turns
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """A run of SAC that was never stopped."""
-    return train(tmp_path_factory.mktemp("whole") / "run", **FOUR)
-
-
 def test_a_resumed_ppo_run_equals_one_that_was_never_stopped(tmp_path):
     whole = run_with_copies(tmp_path / "whole", 300, **{**FOUR, "algorithm": ROLLOUT})
     again = resume(tmp_path / "whole-300")
@@ -100,20 +76,14 @@ def test_a_resumed_ppo_run_equals_one_that_was_never_stopped(tmp_path):
     assert again.runs[0].manifest.history[-1].exact
 
 
-def test_processes_change_no_number_and_their_episodes_are_resumed(tmp_path, whole):
+def test_processes_change_no_number_and_their_episodes_are_resumed(tmp_path):
+    whole = train(tmp_path / "whole", **FOUR)
     with pytest.raises(Crash):
         train(tmp_path / "there", on_evaluation=crash_at(300), environment_processes=2, **FOUR)
     there = train(tmp_path / "there", resume=True, environment_processes=2, **FOUR)
     assert contents(there.runs[0]) == contents(whole.runs[0])
     assert there.runs[0].manifest.history[-1].step == 240
     assert there.runs[0].manifest.history[-1].exact
-
-
-def test_a_fork_has_as_many_environments_as_the_run(tmp_path, whole):
-    with pytest.raises(InputError, match="environments is 4, not "):
-        train(tmp_path / "fork", SAC(**SMALL), start_from=f"{whole.path}@360")
-    fork = train(tmp_path / "fork", SAC(**SMALL), start_from=f"{whole.path}@360", environments=4)
-    assert contents(fork.runs[0]) == contents(whole.runs[0])
 
 
 @pytest.mark.parametrize("processes", [0, 2])

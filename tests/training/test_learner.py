@@ -58,26 +58,6 @@ def test_a_checkpoint_of_the_schema_before_is_refused_in_one_line(tmp_path, monk
         Checkpoint.open(tmp_path, 5)
 
 
-@pytest.mark.parametrize("seeds", [[5], [5, 6]])
-def test_what_was_saved_of_each_seed_is_taken_back(seeds):
-    learner, again = (
-        Learner(CSAC(reference_policy="periodic", reference_period=3, **TINY), SPEC, labels, 100)
-        for labels in (seeds, [9] * len(seeds))
-    )
-    advance(learner, len(seeds), 1, 10)
-    saved = [learner.save(index) for index in range(len(seeds))]
-    rows = [learner.memory(index, 10).rows.copy() for index in range(len(seeds))]
-    again.restore(saved, [lambda given, own=own: np.copyto(given, own) for own in rows])
-
-    for index in range(len(seeds)):
-        for ours, theirs in zip(
-            jax.tree.leaves(again.carry(index)), jax.tree.leaves(learner.carry(index)), strict=True
-        ):
-            np.testing.assert_array_equal(ours, theirs)
-    assert again.metrics() == learner.metrics()
-    np.testing.assert_array_equal(advance(again, len(seeds), 11, 14), advance(learner, len(seeds), 11, 14))
-
-
 def test_the_memory_that_a_learner_begins_with_is_gone_before_the_saved_one_is_read():
     """A replay may take half of a machine's memory: three at a time took a run along that had been trained there."""
     learner = Learner(SAC(**TINY), SPEC, [0], 100)

@@ -134,23 +134,28 @@ def watched():
     return run(Watcher(), probes.IdEncoded, 30, SEEDS)
 
 
+def check_story(rows: np.ndarray, seed: int, environment: int = 0) -> None:
+    """Check that packed rows of one environment follow each other as its steps do."""
+    step = jax.vmap(unpack, in_axes=(0, None))(jnp.asarray(rows), Spec(4, 1))
+    reset_seed, episode, number, last_action = step.observation.T
+    assert episode.max() > 5
+    np.testing.assert_array_equal(reset_seed, [training_seed(seed, int(e), environment) % 65536 for e in episode])
+    after = np.stack([reset_seed, episode, number + 1, step.action[:, 0]], axis=1)
+    np.testing.assert_allclose(step.next_observation, after, atol=1e-6)  # never the observation of a reset
+    np.testing.assert_array_equal(step.reward, number + 1)
+    is_last = number + 1 == 2 + episode % 3
+    np.testing.assert_array_equal(step.terminated, is_last & (episode % 3 != 1))
+    np.testing.assert_array_equal(step.truncated, is_last & (episode % 3 != 0))
+    # The next row starts where this one ended, or with a reset.
+    np.testing.assert_allclose(step.observation[1:][~is_last[:-1]], step.next_observation[:-1][~is_last[:-1]])
+    np.testing.assert_array_equal(number[1:][is_last[:-1]], 0)
+    np.testing.assert_array_equal(episode[1:] - episode[:-1], is_last[:-1])
+    np.testing.assert_array_equal(last_action[number == 0], 0)
+
+
 def test_the_loop_remembers_what_happened(watched):
     for seed, rows in zip(SEEDS, watched.memories, strict=True):
-        step = jax.vmap(unpack, in_axes=(0, None))(rows, Spec(4, 1))
-        reset_seed, episode, number, last_action = step.observation.T
-        assert episode.max() > 5
-        np.testing.assert_array_equal(reset_seed, [training_seed(seed, int(e)) % 65536 for e in episode])
-        after = np.stack([reset_seed, episode, number + 1, step.action[:, 0]], axis=1)
-        np.testing.assert_allclose(step.next_observation, after, atol=1e-6)  # never the observation of a reset
-        np.testing.assert_array_equal(step.reward, number + 1)
-        is_last = number + 1 == 2 + episode % 3
-        np.testing.assert_array_equal(step.terminated, is_last & (episode % 3 != 1))
-        np.testing.assert_array_equal(step.truncated, is_last & (episode % 3 != 0))
-        # The next row starts where this one ended, or with a reset.
-        np.testing.assert_allclose(step.observation[1:][~is_last[:-1]], step.next_observation[:-1][~is_last[:-1]])
-        np.testing.assert_array_equal(number[1:][is_last[:-1]], 0)
-        np.testing.assert_array_equal(episode[1:] - episode[:-1], is_last[:-1])
-        np.testing.assert_array_equal(last_action[number == 0], 0)
+        check_story(rows, seed)
 
 
 def actions_of(rows) -> np.ndarray:

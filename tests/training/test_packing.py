@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from csac.training.packing import Packing, Parcel, SeedAxis, by_name
+from csac.training.packing import Packing, Parcel
 
 
 class Tree(NamedTuple):
@@ -31,47 +30,11 @@ def test_only_small_floats_are_in_the_row():
     np.testing.assert_array_equal(hidden, tree().hidden)
 
 
-def test_seeds_side_by_side_are_unpacked_by_seed():
-    packing, seeds = Packing(tree(), 100), [tree(), tree(10.0)]
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *seeds)
-    packed = jax.vmap(packing.pack)(stacked)
-    assert packed[0].shape == (2, 7)
-    for given, again in zip(stacked, packing.unpack(packed), strict=True):
-        assert given.dtype == again.dtype
-        np.testing.assert_array_equal(again, given)
-
-
 def test_a_tree_without_small_floats_has_an_empty_row():
     packing = Packing({"count": np.int32(3)}, 100)
     row, count = packing.pack({"count": np.int32(3)})
     assert row.shape == (0,)
     assert int(packing.unpack([row, count])["count"]) == 3
-
-
-def test_leaves_are_named_by_fields_keys_and_places():
-    given = {"state": tree(), "moments": [np.zeros(1), (np.ones(2),)]}
-    named = by_name(given)
-    assert set(named) == {
-        *("state.bias", "state.count", "state.hidden", "state.number"),
-        *("moments.0", "moments.1.0"),
-    }
-    assert named["moments.1.0"] is given["moments"][1][0]
-    assert list(named.values()) == jax.tree.leaves(given)
-
-
-@pytest.mark.parametrize(("seeds", "inside"), [(1, ()), (3, (3,))])
-def test_a_seed_that_is_alone_has_no_axis(seeds, inside):
-    axis, given = SeedAxis(seeds), np.arange(seeds * 2, dtype=np.float32).reshape(seeds, 2)
-    program = axis.map(lambda row, offset: 2.0 * row.reshape(2) + offset, (0, None))
-    out = program(axis.strip(given), 1.0)
-    assert out.shape == (*inside, 2)
-    np.testing.assert_array_equal(axis.restore(out), 2.0 * given + 1.0)
-    stacked = axis.stack([row.copy() for row in given])
-    assert stacked.shape == (*inside, 2)
-    for index, row in enumerate(given):
-        np.testing.assert_array_equal(axis.of({"row": stacked}, index)["row"], row)
-        axis.of(stacked, index)[:] = -1.0  # a view
-    np.testing.assert_array_equal(stacked, np.full((*inside, 2), -1.0))
 
 
 def test_a_parcel_arrives_to_the_last_bit():
