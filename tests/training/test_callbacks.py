@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from manifests import manifest
 from resuming import SMALL, contents, run
 from scalars import scalars
 
@@ -14,13 +15,11 @@ from csac import InputError
 from csac.algorithms import SAC
 from csac.evaluation.episode import EvaluationEpisode
 from csac.record.run import RunDirectory
-from csac.record.tables import append_rows, continues
+from csac.record.tables import continues
 from csac.training.callbacks import Callback, CallbackFailure, Moment, SaveEvery, StopAfterNoImprovement, StopOnReturn
 
 LEARNER = SAC(**SMALL)
 ENDLESS: dict[str, Any] = {"task": "probes:Endless-v0", "evaluation_episodes": 1}  # episodes of ten steps, return 10
-
-NEITHER = {"evaluation_interval": 0, "checkpoint_interval": 0}
 
 
 class Diary(Callback):
@@ -69,15 +68,14 @@ def test_a_callback_hears_everything_of_every_seed_in_its_own_process(tmp_path, 
         assert np.isfinite(last["critic_loss"])
 
 
-def test_what_callbacks_log_changes_nothing_that_is_learnt_and_is_in_tensorboard(tmp_path):
-    plain = run(tmp_path / "plain", LEARNER, 200, **ENDLESS)
-    logged = run(tmp_path / "logged", LEARNER, 200, **ENDLESS, callbacks=[Diary()], tensorboard=True)
-    before, after = contents(plain.runs[0]), contents(logged.runs[0])
+def test_what_callbacks_log_changes_nothing_that_is_learnt_and_is_in_tensorboard(tmp_path, whole):
+    logged = run(tmp_path / "logged", LEARNER, 300, **ENDLESS, callbacks=[Diary()], tensorboard=True)
+    before, after = dict(whole), contents(logged.runs[0])
     assert before.pop("metrics.csv") != after.pop("metrics.csv")
     assert before == after
     curves = scalars(logged.runs[0].path / "tensorboard")
-    assert curves["train/episodes"] == [(70, 7.0), (140, 14.0)]
-    assert curves["own/evaluations"] == [(100, 1.0), (200, 2.0)]
+    assert curves["train/episodes"] == [(70, 7.0), (140, 14.0), (210, 21.0), (280, 28.0)]
+    assert curves["own/evaluations"] == [(100, 1.0), (200, 2.0), (300, 3.0)]
 
 
 class StopAt(Callback):
@@ -128,19 +126,17 @@ def test_ready_made_callbacks(tmp_path):
     observation = np.ones(1, np.float32)
     np.testing.assert_array_equal(saved.predict(observation)[0], csac.load(runs).predict(observation)[0])
     assert csac.load(runs.runs[0].path / "policies" / "step_50").step == 50
-    endless = run(tmp_path / "other", LEARNER, 300, **ENDLESS, callbacks=[StopOnReturn(10.5)])
-    assert endless.runs[0].manifest.steps_done == 300
 
 
 def test_no_improvement_counts_evaluations_since_the_best(tmp_path):
     means = [1.0, 3.0, 2.0, 3.0, 4.0, 3.5, 3.9]  # the best is new at steps 2 and 5; as good is not better
-    one = run(tmp_path / "set", LEARNER, 10, **{**ENDLESS, **NEITHER}).runs[0]
+    one = RunDirectory.create(tmp_path / "run", manifest())
     rows = [
         {"seed": 0, "step": step, "episode": j, "return": mean + sign, "length": 1, "success": None}
         for step, mean in enumerate(means, start=1)
         for j, sign in enumerate((-1.0, 1.0))
     ]
-    append_rows(one.path / "evaluations.csv", list(rows[0]), rows)
+    one.append("evaluations", rows)
     for patience, after, expected in ((2, 0, [4, 7]), (2, 5, [7]), (3, 0, [])):
         callback = StopAfterNoImprovement(patience, after)
         stops = [step for step in range(1, 8) if not callback.on_evaluation(Moment(0, step, one.path), [])]
