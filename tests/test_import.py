@@ -1,8 +1,10 @@
+import shutil
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
+import drawn
 import pytest
 from manifests import manifest
 from policies import contract, random_policy
@@ -11,36 +13,11 @@ import csac
 from csac.algorithms import ALGORITHMS
 from csac.record.run import RunDirectory
 
-DRAWN = """
-import gymnasium
-import numpy as np
-
-class Drawn(gymnasium.Env):
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
-    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-
-    def __init__(self, render_mode=None):
-        self.render_mode = render_mode
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(2, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(2, np.float32), 1.0, True, False, {}
-
-    def render(self):
-        return np.zeros((32, 32, 3), np.uint8)
-
-gymnasium.register("Drawn-v0", entry_point=Drawn)
-"""
-
 
 @pytest.fixture
 def tiny_run(tmp_path):
     """A folder with a finished run, a policy that has learnt nothing, and its task, which can be drawn."""
-    (tmp_path / "drawn.py").write_text(DRAWN)
+    shutil.copy(drawn.__file__, tmp_path)
     run = RunDirectory.create(tmp_path / "run", manifest(task="drawn:Drawn-v0", steps=9))
     run.append("evaluations", [{"seed": 0, "step": 9, "episode": 0, "return": 1.0, "length": 5, "success": None}])
     random_policy(contract()).write(run.policy_file())

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import drawn
 import gymnasium
 import pytest
 from manifests import make_set
@@ -19,33 +20,6 @@ from csac.cli import main
 from csac.tasks import trust
 from csac.types import InputError
 
-TASK = """
-from pathlib import Path
-import gymnasium, numpy as np
-
-Path({marker!r}).write_text("this code was run")
-
-class Stranger(gymnasium.Env):
-    metadata = {{"render_modes": ["rgb_array"]}}
-    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-
-    def __init__(self, render_mode=None):
-        self.render_mode = render_mode
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(2, np.float32), {{}}
-
-    def step(self, action):
-        return np.zeros(2, np.float32), 1.0, True, False, {{}}
-
-    def render(self):
-        return np.zeros((32, 32, 3), np.uint8)
-
-gymnasium.register("Stranger-v0", entry_point=Stranger)
-"""
-
 
 @pytest.fixture
 def stranger(tmp_path, monkeypatch):
@@ -54,9 +28,10 @@ def stranger(tmp_path, monkeypatch):
     folder = tmp_path / "downloaded"
     (folder / "package").mkdir(parents=True)
     marker = tmp_path / "marker"
-    (folder / "stranger.py").write_text(TASK.format(marker=str(marker)))
+    code = f"open({str(marker)!r}, 'w').close()\n" + Path(drawn.__file__).read_text().replace("Drawn", "Stranger")
+    (folder / "stranger.py").write_text(code)
     (folder / "package" / "__init__.py").write_text(f"open({str(marker)!r}, 'w')")
-    (folder / "package" / "stranger.py").write_text(TASK.format(marker=str(marker)))
+    (folder / "package" / "stranger.py").write_text(code)
 
     def make_run(task: str) -> Path:
         path = folder / "run"
