@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from benchmarks import checkpoint, gpu
 from benchmarks.__main__ import PARTS, SUITES, main, named
-from benchmarks.measuring import ROOT, Launch, ProcessFailure, answers, usable_cores
+from benchmarks.measuring import ROOT, Launch, ProcessFailure, answers, machine, usable_cores
 from benchmarks.part import RESULTS, Options, Part
 from csac.types import InputError
 
@@ -137,13 +138,15 @@ def test_the_help_lists_everything(capsys):
     assert all(f"  {name} " in listed for name in [*SUITES, *(part.name for part in PARTS)])
 
 
+MACHINE = cache(machine)
 QUICK = [["peers", "--only", "one seed, 1 core: csac SAC"], *([name] for name in SUITES if name != "peers")]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", QUICK, ids=lambda arguments: arguments[0])
-def test_every_benchmark_runs(arguments, capsys):
-    """Quickly, so that nothing is written, but a table is printed with the machine below."""
+def test_every_benchmark_runs(arguments, monkeypatch, capsys):
+    """Quickly, so that nothing is written, but a table is printed with the machine below, which is measured once."""
+    monkeypatch.setattr("benchmarks.part.machine", MACHINE)
     assert main([*arguments, "--quick", "--device", "cpu", "--write"]) == 0
     printed = capsys.readouterr().out
     assert "| --- |" in printed
