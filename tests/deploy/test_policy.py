@@ -106,16 +106,6 @@ def test_predict_has_the_shapes_of_stable_baselines3(observation_shape, action_s
     np.testing.assert_allclose(single, together[2], rtol=1e-5, atol=1e-6)
 
 
-def test_a_dict_is_flattened_in_the_order_of_its_names():
-    agreement = contract(DICT_PARTS)
-    observation = {"speed": 5.0, "position": [[3, 4]], "achieved": np.array([1.0, 2.0])}
-    flat = agreement.flatten(observation)
-    np.testing.assert_array_equal(flat, np.array([1, 2, 3, 4, 5], np.float32))
-    assert flat.dtype == np.float32
-    batch = {key: np.stack([value, np.multiply(value, 10)]) for key, value in observation.items()}
-    np.testing.assert_array_equal(agreement.flatten(batch), [[1, 2, 3, 4, 5], [10, 20, 30, 40, 50]])
-
-
 def test_predict_takes_dicts_dicts_of_batches_and_flat_observations():
     policy = random_policy(contract(DICT_PARTS, (2,)))
     observation = {"speed": 0.5, "position": [[0.3, 0.4]], "achieved": [0.1, 0.2]}

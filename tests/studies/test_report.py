@@ -97,7 +97,6 @@ def test_a_table_is_escaped_and_says_what_a_row_is(tmp_path):
     ("words", "named"),
     [
         ([], "run directories"),
-        (["nowhere"], "nowhere"),
         (["{}", "--out", "page.pdf"], "page.html"),
         (["{}", "--label", "ours"], "NAME=DIR"),
         (["{}", "--until", "0"], "--until"),

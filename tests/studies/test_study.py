@@ -98,10 +98,6 @@ def test_the_studies_that_csac_brings(name):
     assert all(method.algorithm in ALGORITHMS for method in study.methods)
 
 
-def test_the_study_that_is_running_can_be_read():
-    assert len(find("paper").runs()) == 40
-
-
 @pytest.mark.parametrize(
     ("text", "named"),
     [

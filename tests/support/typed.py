@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import inspect
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
 import numpy as np
+from policies import contract
 from shown import make_set
 
 from csac.cli import main
-from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
 from csac.types import Layer, PolicyNetwork, PolicyParameters
 
@@ -66,25 +67,16 @@ def calls_of(monkeypatch, module, name, result=()):
     return calls
 
 
-def make_runs(path, task="Pictures-v0", size=3, low=(-2.0,), high=(2.0,), **values):
+def make_runs(path, task="Pictures-v0", size=3, low=-2.0, high=2.0, **values):
     """Two finished runs, each with a random linear policy; the second has the better return."""
     runs = make_set(Path(path), [[0.0], [1.0]], task=task, steps_done=100, **{"steps": 100, **values})
-    contract = Contract(
-        task=task,
-        algorithm="csac",
-        activation="relu",
-        head="tanh_gaussian",
-        observation_parts=((None, (size,)),),
-        action_shape=(len(low),),
-        action_low=np.array(low, np.float32),
-        action_high=np.array(high, np.float32),
-    )
+    agreement = replace(contract(((None, (size,)),), (1,), low, high), task=task)
     generator = np.random.default_rng(0)
     for run in runs.runs:
-        weight = generator.normal(size=(size, 2 * len(low))).astype(np.float32)
-        network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * len(low), np.float32)),),)))
+        weight = generator.normal(size=(size, 2)).astype(np.float32)
+        network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2, np.float32)),),)))
         for which in ("last", "best"):
-            Policy(network, contract, step=100).write(run.policy_file(which))
+            Policy(network, agreement, step=100).write(run.policy_file(which))
     return runs
 
 

@@ -12,13 +12,10 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
-from policies import contract, random_policy
+from played import policy_for
 from trajectories import steps_of
 
-from csac.deploy.contract import Contract
-from csac.deploy.policy import Policy
-from csac.evaluation.evaluator import EvaluationFailure, Evaluator, evaluate
-from csac.seeds import EVALUATION_SEED
+from csac.evaluation.evaluator import Evaluator, evaluate
 from csac.tasks.environment import Environment
 from csac.tasks.failures import EnvironmentFailure
 from csac.tasks.perturbations import (
@@ -32,7 +29,7 @@ from csac.tasks.perturbations import (
 )
 from csac.tasks.snapshots import _mujoco_arrays
 from csac.tasks.vector import SeedEnvironments
-from csac.types import InputError, Layer, PolicyNetwork, PolicyParameters, Snapshot
+from csac.types import InputError, Snapshot
 
 # What is written, and what is refused.
 
@@ -342,21 +339,6 @@ def test_a_task_that_sets_other_physics_at_reset_or_is_not_perturbed_goes_on(tmp
     environment.reset(0)
 
 
-def test_an_evaluation_that_cannot_be_perturbed_fails_in_one_line(tmp_path):
-    path = tmp_path / "block.xml"
-    path.write_text(BLOCK.format(actuator=MOTOR))
-    evaluator = Evaluator(Randomised, {"path": str(path), "what": "friction"}, 1, EVALUATION_SEED)
-    evaluator.perturb({"friction": 2.0})
-    with pytest.raises(EvaluationFailure, match=r"sets its own physics at reset.*cannot be perturbed") as failure:
-        evaluator.run(random_policy(contract(((None, (3,)),), (1,))))
-    assert "\n" not in str(failure.value)
-
-
-def test_a_task_without_mujoco_has_no_such_physics():
-    with pytest.raises(InputError, match="Pendulum-v1 is no MuJoCo task"):
-        Environment("Pendulum-v1").perturb({"gravity": 2.0})
-
-
 # Noise.
 
 
@@ -477,16 +459,6 @@ def test_noise_that_begins_after_a_snapshot_is_the_same_as_without_one():
 
 
 # Evaluation.
-
-
-def policy_for(task: Any) -> Policy:
-    """A linear policy of which the actions depend on the observations."""
-    environment = Environment(task)
-    size, actions = environment.spec[:2]
-    weight = np.random.default_rng(1).normal(0, 0.3, (size, 2 * actions)).astype(np.float32)
-    network = PolicyNetwork(PolicyParameters(((Layer(weight, np.zeros(2 * actions, np.float32)),),)))
-    name, parts = environment.task_name, environment.contract_parts
-    return Policy(network, Contract(name, "csac", "relu", "tanh_gaussian", *parts))
 
 
 def test_an_evaluation_with_noise_depends_on_the_episode_alone():
