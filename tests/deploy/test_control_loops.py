@@ -48,7 +48,8 @@ def test_the_loop_in_c(tmp_path):
 def test_the_loop_in_python(tmp_path):
     policy = algorithm_policy("csac")
     folder = left(tmp_path / "numpy", policy, "numpy")
-    alone = [sys.executable, "-I", "-c", "import sys, runpy; sys.modules['csac'] = sys.modules['jax'] = None; "]
+    alone = [sys.executable, "-I", "-c", "import sys, runpy; "]
+    alone[-1] += "sys.modules.update(dict.fromkeys(['csac', 'jax', 'gymnasium', 'safetensors'])); "
     alone[-1] += f"sys.argv = ['control_loop.py', {str(folder)!r}]; "
     alone[-1] += f"runpy.run_path({str(EXAMPLES / 'control_loop.py')!r}, run_name='__main__')"
     check_loop(alone, policy)

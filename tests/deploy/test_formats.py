@@ -93,14 +93,6 @@ def run_loader(folder, code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", refuse + code], cwd=folder, capture_output=True, text=True)
 
 
-def test_the_loader_runs_without_csac(tmp_path):
-    policy = algorithm_policy("sd3")
-    result = run_loader(leave(tmp_path, policy, "numpy"), "print(Policy().act([0.1, 0.2, 0.3, 0.4, 0.5]).tolist())")
-    assert not result.stderr
-    expected = policy.predict(np.array([0.1, 0.2, 0.3, 0.4, 0.5]))[0]
-    np.testing.assert_allclose(json.loads(result.stdout), expected, atol=1e-5)
-
-
 def test_the_loader_refuses_a_flipped_bit_another_policy_and_a_batch(tmp_path):
     folder = leave(tmp_path / "one", algorithm_policy("csac"), "numpy")
     assert "has the shape (5,), one at a time, not (2, 5)" in run_loader(folder, "Policy().act([[0] * 5] * 2)").stderr

@@ -291,29 +291,14 @@ def test_a_run_is_trained_exported_and_described(tmp_path, monkeypatch, capsys):
         assert {"README.md", "curve.png"} <= {path.name for path in Path("run/export", name).iterdir()}
 
 
-def test_a_changed_policy_is_not_evaluated_and_not_exported(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    run, other = make_run(Path("run")), make_run(Path("other"), "td3")
-    run.run(1).policy_file().write_bytes(other.run(1).policy_file().read_bytes())
-    for command in ("evaluate run --episodes 1", "export run"):
-        assert csac(command) == 2
-        said = capsys.readouterr().err
-        assert "run/seed-1/policy/last.safetensors does not match its checksum" in said
-        assert said.count("\n") == 1
-
-
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
-        ("export", "DIR"),
-        ("export nowhere", "nowhere does not exist"),
         ("export run --format torch", "--format"),
         ("export run --seed 7", "no seed 7"),
         ("export run --seed worst", "--seed"),
         ("export run --episodes -1", "--episodes -1"),
         ("export run --out run", "run holds something else than an artefact"),
-        ("export run --rate-limit 2", "--rate-limit 2.0"),
-        ("export run --fallback 1,2", "--fallback 1,2"),
     ],
 )
 def test_what_is_typed_wrong_is_told_in_one_line(tmp_path, monkeypatch, capsys, line, complaint):
