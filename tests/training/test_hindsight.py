@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict
 from resuming import ROLLOUT, SMALL, Crash, contents, crash_at, run
-from typed import csac as typed
 
 import csac
 from csac import InputError
@@ -207,13 +206,4 @@ def test_what_has_no_use_for_it_is_refused(tmp_path, task, algorithm, arguments,
     with pytest.raises(InputError, match=told) as error:
         run(tmp_path / "run", algorithm, 64, task=task, environment_arguments=arguments, hindsight=4)
     assert "\n" not in str(error.value)
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("options", ["--hindsight 4", "--algorithm ppo --hindsight 4", "--hindsight -1"])
-def test_the_command_line_refuses_it_in_one_line(tmp_path, monkeypatch, capsys, options):
-    monkeypatch.chdir(tmp_path)
-    assert typed(f"train Pendulum-v1 --steps 100 --directory run {options}") == 2
-    error = capsys.readouterr().err
-    assert (error.count("\n"), "hindsight" in error) == (1, True)
     assert not (tmp_path / "run").exists()

@@ -44,7 +44,7 @@ def mean_return(algorithm, steps: int = 3000, seed: int = 0) -> float:
         (SAC(weight_learning_rate=2e-3, **SETTINGS), 3000),
         # Its actor moves at every second update.
         (TD3(exploration_std=0.3, **SETTINGS), 4500),
-        (SD3(exploration_std=0.3, noise_samples=8, **SETTINGS), 3000),
+        (SD3(exploration_std=0.3, noise_samples=4, **SETTINGS), 3000),
     ],
     ids=["csac", "sac", "td3", "sd3"],
 )

@@ -273,6 +273,8 @@ def test_returns_on_the_task_before_are_in_no_number_of_a_fork(tmp_path, made):
         ({"steps": 300}, "steps"),
         ({"first_seed": 7}, "seed 7"),
         ({"start_from": "@17"}, "step 17"),
+        ({"environments": 4}, "environments is 1, not 4"),
+        ({"perturbations": "friction=2@359"}, "friction=2@359 lies before step 360"),
     ],
 )
 def test_a_fork_that_does_not_fit_is_refused_and_leaves_nothing(tmp_path, made, changes, name):
@@ -280,15 +282,3 @@ def test_a_fork_that_does_not_fit_is_refused_and_leaves_nothing(tmp_path, made, 
     with pytest.raises(InputError, match=name):
         run(tmp_path / "fork", **{**given, "start_from": f"{made.path}{given['start_from']}"})
     assert not (tmp_path / "fork").exists()
-
-
-@pytest.mark.parametrize("name", ["log.txt", "checkpoint", "tensorboard", ".lock"])
-def test_a_symbolic_link_in_a_run_is_not_followed(tmp_path, stopped, name):
-    target = tmp_path / "mine"
-    target.write_text("mine")
-    place = stopped.path / name
-    shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
-    place.symlink_to(target)
-    with pytest.raises(InputError):
-        csac.resume(stopped.path)
-    assert target.read_text() == "mine"
