@@ -25,4 +25,4 @@ class Drawn(gymnasium.Env):
         return np.zeros((32, 32, 3), np.uint8)
 
 
-gymnasium.register("Drawn-v0", entry_point=Drawn)
+gymnasium.register("Drawn-v0", entry_point=f"{__name__}:Drawn")
