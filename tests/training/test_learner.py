@@ -102,9 +102,7 @@ def test_means_begin_anew_where_other_things_are_told():
     assert again.metrics()[0].keys() == alone.metrics()[0].keys()
 
 
-SETTINGS = [(name, {}) for name in ALGORITHMS] + [
-    ("csac", {"reference_policy": "periodic", "reference_period": period}) for period in (1, 1000)
-]
+SETTINGS = [(name, {}) for name in ALGORITHMS] + [("csac", {"reference_policy": "periodic", "reference_period": 1})]
 
 
 @pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=str)
