@@ -64,7 +64,7 @@ class Evaluations:
         self._algorithm = config.algorithm
         self._perturbations = perturbations_of(config.perturbations)
         self._pending: tuple[int, list[int], list[Policy], Any] | None = None
-        self.step = int(runs[0].evaluations["step"].max(initial=0))  # of the newest evaluation
+        self.step = int(runs[0].rows("evaluations")["step"].max(initial=0))  # of the newest evaluation
         self.wants_stop = False  # whether a callback ends the runs, or an evaluation was broken off
         self.broken_off: int | None = None  # the step of the evaluation that was broken off
         self.should_stop: Callable[[], bool] = lambda: False

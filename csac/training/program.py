@@ -59,14 +59,17 @@ def choose_groups(
 ) -> list[list[int]]:
     """Return the seeds of each program: as recorded in existing runs, as requested, or as is fastest here.
 
-    Seeds that failed are behind the others of their program: each is tried again alone. By default all new seeds train
-    together if one of `sent`, the task and the algorithm, cannot be sent to a process; then failed seeds wait for a
-    call of their own.
+    A seed that failed is behind the others of its program: it is tried again with those that failed at the same
+    checkpoint. By default all new seeds train together if one of `sent`, the task and the algorithm, cannot be sent to
+    a process; then failed seeds wait for a call of their own.
     """
-    known = {seed: existing[seed].manifest.program or (seed,) for seed in seeds if seed in existing}
-    failed = [seed for seed in known if existing[seed].manifest.state == "failed"]
-    sound = {seed: program for seed, program in known.items() if seed not in failed}
-    groups = [[seed for seed in sound if sound[seed] == program] for program in sorted(set(sound.values()))]
+    known = {seed: existing[seed].manifest for seed in seeds if seed in existing}
+    together: dict[tuple[int | None, tuple[int, ...]], list[int]] = {}
+    for seed, manifest in known.items():
+        failed_at = manifest.last_checkpoint if manifest.state == "failed" else None
+        together.setdefault((failed_at, manifest.program or (seed,)), []).append(seed)
+    groups = [group for (failed_at, _), group in together.items() if failed_at is None]
+    retried = [group for (failed_at, _), group in together.items() if failed_at is not None]
     rest = [seed for seed in seeds if seed not in known]
     is_sendable, size = all(map(can_be_sent, sent)), seeds_per_process
     if size is None:
@@ -76,7 +79,7 @@ def choose_groups(
             size = max(1, -(-len(rest) // (1 if preallocates() else processes)))
     check_whole("seeds_per_process", size, min(len(rest), 1), max(len(seeds), 1))
     groups += [rest[i : i + size] for i in range(0, len(rest), max(size, 1))]
-    return groups + [[seed] for seed in failed if is_sendable or not groups]
+    return groups + (retried if is_sendable or not groups else [])
 
 
 def programs_of(

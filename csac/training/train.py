@@ -131,7 +131,7 @@ def train(
     template = Program((), algorithm, task, 1, *settings)
     directories = [[run_path(place, seed) for seed in group] for group in groups]
     programs = programs_of(template, directories, existing, configs[0])
-    notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_notes(algorithm, configs[0])]
+    notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
     if watch.callbacks.interests.evaluations and not configs[0].evaluation_interval:
         notes.append("note: evaluation_interval is 0: no callback receives evaluations, and none ends a run by them")
 
@@ -304,7 +304,7 @@ def _workers() -> int:
     return PROCESSES_PER_CORE * cores_to_use()
 
 
-def _notes(algorithm: Algorithm, config: RunConfig) -> list[str]:
+def _warmup_note(algorithm: Algorithm, config: RunConfig) -> list[str]:
     first = algorithm.cadence.side_by_side(config.environments).first_update
     if config.steps >= first:
         return []

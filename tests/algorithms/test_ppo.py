@@ -183,7 +183,10 @@ def test_linear_learning_rate():
     rates = [float(SMALL.learning_rate_at(jnp.int32(k), state.total_updates)) for k in (0, 5, 9)]
     assert rates == pytest.approx([3e-4, 1.5e-4, 3e-5], rel=1e-6)
     assert float(update(SMALL, state, rollout(range(8)), 5)[1]["learning_rate"]) == pytest.approx(1.5e-4)
+    constant = replace(SMALL, learning_rate_schedule="constant")
+    assert float(constant.learning_rate_at(jnp.int32(9), state.total_updates)) == pytest.approx(3e-4)
     assert float(begin(SMALL, 3).total_updates) == 1.0  # a run shorter than a rollout
+    assert (SMALL.cadence.has_schedule, constant.cadence.has_schedule) == (True, False)
 
 
 def test_the_first_minibatch_sees_the_policy_that_acted():

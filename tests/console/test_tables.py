@@ -22,7 +22,14 @@ def test_results_are_of_training_cases_and_perturbations(tmp_path):
         tmp_path, [[0.0, 5.0, 9.0, 2.0], [8.0, 5.0, 3.0, 4.0]], perturbations=("friction=1.5@10", "gain=2@900")
     )
     results, recovery = map(text_of, result_tables(runs))
-    assert results[1:4] == ["0 2.00 5.33 9.00 30 2", "1 4.00 4.00 8.00 10 2", "mean 3.00 4.67 6.00 30"]
+    assert results == [
+        "seed last return last three best at step episodes",
+        "0 2.00 5.33 9.00 30 2",
+        "1 4.00 4.00 8.00 10 2",
+        "mean 3.00 4.67 6.00 30",
+        "± std 1.41 0.94 4.24",
+        "2 seeds: no interval",
+    ]
     assert recovery[0] == "friction x 1.5 after step 10"
 
 

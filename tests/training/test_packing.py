@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac.training.packing import Packing, Parcel
+from csac.training.packing import Packing, Parcel, by_name
 
 
 class Tree(NamedTuple):
@@ -49,3 +49,14 @@ def test_a_parcel_arrives_to_the_last_bit():
     np.testing.assert_array_equal(np.asarray(observed).view(np.int32), observation.view(np.int32))
     assert number.dtype == jnp.int32
     assert int(number) == 2**24 + 1  # which no float32 is
+
+
+def test_leaves_are_named_by_fields_keys_and_places():
+    given = {"state": tree(), "moments": [np.zeros(1), (np.ones(2),)]}
+    named = by_name(given)
+    assert set(named) == {
+        *("state.bias", "state.count", "state.hidden", "state.number"),
+        *("moments.0", "moments.1.0"),
+    }
+    assert named["moments.1.0"] is given["moments"][1][0]
+    assert list(named.values()) == jax.tree.leaves(given)

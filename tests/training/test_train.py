@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import sys
@@ -105,6 +106,9 @@ def test_a_failed_seed_keeps_its_checkpoint_and_is_resumed_alone(tmp_path):
     existing = {one.seed: one for one in runs.runs}
     assert choose_groups(runs.seeds, existing, None, "cpu", "Hopper-v5") == [[1, 2], [0]]
     assert choose_groups(runs.seeds, existing, None, "cpu", task) == [[1, 2]]  # the task cannot be sent to a process
+    for one in runs.runs[1:]:  # as if their process had died twice: they go on together
+        one.manifest = dataclasses.replace(one.manifest, state="failed")
+    assert choose_groups(runs.seeds, existing, None, "cpu", "Hopper-v5") == [[0], [1, 2]]
     run(tmp_path / "set", **given, resume=True)
     runs = RunSet.open(tmp_path / "set")
     assert [one.manifest.state for one in runs.runs] == ["finished"] * 3
