@@ -8,7 +8,7 @@ from contextlib import nullcontext, suppress
 from typing import TYPE_CHECKING, Any
 
 from csac.checks import did_you_mean
-from csac.cli.exits import complain, interrupted
+from csac.cli.exits import complain, interrupted, leave
 from csac.cli.options import Evaluate, Export, Latency, List, Play, Resume, Train, Tune, learner_of, parse_training
 from csac.cli.parsing import HelpShown, parse
 from csac.types import InputError
@@ -67,7 +67,7 @@ def _run_training(training: Callable[..., RunSet], *arguments: Any, **options: A
         line = f"; to go on, type: {program()} resume {shlex.quote(str(stop.runs.path))}" if stop.can_resume else ""
         return complain(f"{stop}{line}", 128 + stop.signal_number)
     except KeyboardInterrupt as second:
-        return complain("stopped at once: what came after the last checkpoint is lost", interrupted(second))
+        return leave(complain("stopped at once: what came after the last checkpoint is lost", interrupted(second)))
     return 3 if runs.failures else 0
 
 

@@ -38,6 +38,12 @@ class Table(NamedTuple):
         """Return whether every cell of a column has a value."""
         return all(row.cells[column].value is not None for row in self.rows)
 
+    def without_empty_columns(self) -> Table:
+        """Return the table without the columns in which every cell is empty."""
+        kept = [i for i in range(len(self.headings)) if any(row.cells[i].text for row in self.rows)]
+        rows = tuple(row._replace(cells=tuple(row.cells[i] for i in kept)) for row in self.rows)
+        return self._replace(headings=tuple(self.headings[i] for i in kept), rows=rows)
+
 
 SMALL = 0.1  # returns below this get three significant digits instead of two decimals
 

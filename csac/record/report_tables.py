@@ -80,7 +80,7 @@ def comparison_table(runs: Sequence[tuple[str, np.ndarray, int]]) -> Table:
     first, body = over_seeds(scores[0]).mean, []
     for (label, rows, failed), seed_means, share in zip(runs, scores, shares, strict=True):
         over = over_seeds(seed_means)
-        ratio = over.mean / first if first > 0 else math.nan
+        ratio = over.mean / first if first > 0 and len(runs) > 1 else math.nan
         count = Cell(str(over.seeds) + f" ({failed} failed)" * bool(failed), over.seeds)
         cells = [Cell(label), count, _whole(int(rows["step"].max(initial=0))), plus_minus(over), interval(over)]
         cells += [numeric(ratio, f"{ratio:.2f}"), _maximum(rows)]

@@ -64,6 +64,7 @@ def report_of(arms: Sequence[Arm], commands: Sequence[str], analyses: Sequence[s
             parts += section(shown)
     if shown:
         parts += [*over_tasks(shown), *paper_claims(shown)]
+    parts = [part.without_empty_columns() if isinstance(part, Table) else part for part in parts]
     return [*parts, *hyperparameters(arms), *provenance(arms, commands)]
 
 
@@ -309,7 +310,7 @@ def provenance(arms: Sequence[Arm], commands: Sequence[str]) -> Iterator[Part]:
         commits = {one.commit or "unknown" for one in manifests}
         yield f"Versions: {', '.join(sorted(versions))}; commit {', '.join(sorted(commits))}."
         machines = {one.machine.gpu or one.machine.processor or "unknown" for one in manifests}
-        time = f", {duration(sum(times))} in {len(times)} runs, one after another" if times else ""
+        time = f", {duration(sum(times))} in all" if times else ""
         yield f"Machines: {', '.join(sorted(machines))}{time}."
     yield Heading("Commands")
     yield Commands(tuple(commands))

@@ -139,6 +139,7 @@ def test_what_ends_training_has_an_exit_code_and_a_line(monkeypatch, capsys, rai
         raise error
 
     monkeypatch.setattr(training, "train", train)
+    monkeypatch.setattr("csac.cli.commands.leave", lambda code: code)
     assert csac("train Hopper-v4") == code
     output = capsys.readouterr().err
     assert told in output
