@@ -33,8 +33,7 @@ UNGUARDED = 97
 _PR_SET_PDEATHSIG = 1
 _SAFE_PATH = "PYTHONSAFEPATH"  # keeps a child from importing files of the working directory
 
-# Windows has no SIGHUP.
-_BLOCKED_SIGNALS = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)}
+_BLOCKED_SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 
 def usable_cores() -> list[int]:
@@ -109,8 +108,6 @@ def outlive_termination() -> None:
     a task would send its simulator a SIGTERM without effect, and wait for it for ever. What a terminal sends to all its
     processes, a Ctrl-C or a hang-up, stays blocked: simulators live until their seeds are saved.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows: nothing was blocked
-        return
     before = signal.signal(signal.SIGTERM, _ignore_signal)
     signal.siginterrupt(signal.SIGTERM, False)  # native code may not expect interrupted system calls
     block, unblock = (
@@ -243,14 +240,12 @@ def worker_settings() -> Iterator[None]:
     """
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
     resource_tracker.ensure_running()  # would otherwise start at the first spawn and unblock the signals
-    has_masks = hasattr(signal, "pthread_sigmask")  # not on Windows, where a Ctrl-C reaches the workers too
     with _environment(dict.fromkeys(names, "1")):
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _BLOCKED_SIGNALS) if has_masks else set()
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _BLOCKED_SIGNALS)
         try:
             yield
         finally:
-            if has_masks:
-                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 @contextmanager

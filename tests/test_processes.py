@@ -33,7 +33,6 @@ def end_as_told(_: Connection, how: str) -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
-@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_a_process_that_ended_is_not_said_to_have_been_killed():
     """Its pipe closes before it is gone: who ends it then would find the cause in himself."""
     exits, faults = (Child(end_as_told, how) for how in ("sys.exit", "fault"))
@@ -129,7 +128,6 @@ def end_what_a_task_starts(connection: Connection) -> None:
     connection.send(ends)
 
 
-@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_a_worker_outlives_what_ends_what_its_task_starts():
     """They were blocked, and so in the task's simulator too: to end it was to wait for it for ever."""
     worker = Child(end_what_a_task_starts)
@@ -152,7 +150,6 @@ def stay(connection: Connection) -> None:
         signal.pause()
 
 
-@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_who_is_to_end_has_a_moment_and_no_more(tmp_path):
     closing, staying = Child(say_when_it_is_over, tmp_path / "said"), Child(stay)
     assert [child.connection.recv() for child in (closing, staying)] == ["there", "there"]
@@ -177,7 +174,6 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_an_interpreter_that_ends_waits_for_no_process_that_was_forgotten(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(FORGETFUL)

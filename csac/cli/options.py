@@ -292,7 +292,9 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
     defaults: dict[str, Any] = {"algorithm": name, "preset": preset}
     learner = kind(**(hyperparameters(preset, name, task) if preset else {}))
     if source:
-        kept = ("steps", "environments", "hindsight", "evaluation_interval", "evaluation_episodes", "evaluation_seed")
+        evaluation = ("interval", "episodes", "environments", "seed")
+        kept = ("steps", "environments", "hindsight", "device", "checkpoint_interval", "keep_checkpoints")
+        kept = (*kept, *(f"evaluation_{item}" for item in evaluation))
         defaults |= {item: getattr(source.config, item) for item in kept}
         defaults |= {"seeds": len(source.seeds), "first_seed": source.seeds[0]}
         defaults["environment_arguments"] = source.config.environment_arguments
@@ -320,12 +322,11 @@ def _source(words: list[str]) -> RunSet | None:
     where, directory = value_of(words, "--from"), value_of(words, "--directory")
     if where is None:
         return None
-    from csac.record.sets import RunSet
+    from csac.record.sets import RunSet, split_step
 
-    if "--resume" in words and directory and Path(directory).exists():
+    if "--resume" in words and directory and any(Path(directory).glob("seed-*")):
         return RunSet.open(directory)
-    name, at, _ = where.rpartition("@")
-    return RunSet.open(name if at and not Path(where).exists() else where)
+    return RunSet.open(split_step(where)[0])
 
 
 def _other_algorithms_hint(option: str) -> str:

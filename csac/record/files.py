@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import secrets
 import time
@@ -14,11 +15,6 @@ from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-try:
-    import fcntl
-except ImportError:  # Windows: two processes are not kept apart
-    fcntl = None
 
 SECONDS_FOR_LOCK = 0.2  # `is_locked` in another process holds a lock for an instant
 
@@ -68,14 +64,11 @@ def _close_held_locks() -> None:
         file.close()
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_close_held_locks)
+os.register_at_fork(after_in_child=_close_held_locks)
 
 
 def take(file: IO[str], path: Path) -> None:
     """Take a run's lock. Raises InputError if another process holds it and does not release it."""
-    if fcntl is None:
-        return
     deadline = time.monotonic() + SECONDS_FOR_LOCK
     while True:
         try:
@@ -91,12 +84,7 @@ def take(file: IO[str], path: Path) -> None:
 
 
 def is_locked(path: str | Path) -> bool:
-    """Return whether a process holds the lock of this file, on this machine or one that shares the folder.
-
-    Where the system has no locks, return True for every file: no process is known to have died.
-    """
-    if fcntl is None:
-        return True
+    """Return whether a process holds the lock of this file, on this machine or one that shares the folder."""
     try:
         with open(path) as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -190,7 +190,7 @@ class RunDirectory:
         for path in [*self.path.iterdir(), *self.checkpoints.glob("*")]:
             if path.is_symlink():  # what it points to would be overwritten
                 raise InputError(f"{path} is a link: replace it by what it points to")
-        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
         try:
             file = closed_in_children(os.fdopen(os.open(self.path / LOCK, flags, 0o666), "r+"))
         except OSError as error:

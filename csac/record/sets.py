@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,16 @@ if TYPE_CHECKING:
 
     from csac.record.config import RunConfig
     from csac.record.run import Table
+
+
+def split_step(where: str | os.PathLike[str]) -> tuple[str, int | None]:
+    """Split `DIRECTORY@STEP`; the step of `DIRECTORY` is None. Raises InputError if the step is no number."""
+    name, at, text = str(where).rpartition("@")
+    if not at or os.path.exists(where):
+        return str(where), None
+    if not re.fullmatch(r"[0-9]+(_[0-9]+)*", text):
+        raise InputError(f"{where}: {text!r} is not a step; write DIRECTORY@STEP")
+    return name, int(text)
 
 
 class RunSet:

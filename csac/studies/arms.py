@@ -216,7 +216,7 @@ def train_command(config: RunConfig, seeds: Sequence[int]) -> str:
     words = ["csac", "train", config.task, "--algorithm", config.algorithm, "--steps", str(config.steps)]
     words += ["--seeds", str(seeds[-1] - seeds[0] + 1), *(["--first-seed", str(seeds[0])] if seeds[0] else [])]
     default = RunConfig(task=config.task)
-    evaluated = ("evaluation_interval", "evaluation_episodes", "evaluation_environments")
+    evaluated = ("evaluation_interval", "evaluation_episodes", "evaluation_environments", "evaluation_seed")
     for name in ("environments", *evaluated, "device", "hindsight"):
         words += option(name, getattr(config, name)) if getattr(config, name) != getattr(default, name) else []
     words += [word for change in config.perturbations for word in ("--perturb", change)]

@@ -314,7 +314,15 @@ def provenance(arms: Sequence[Arm], commands: Sequence[str]) -> Iterator[Part]:
         yield f"Machines: {', '.join(sorted(machines))}{time}."
     yield Heading("Commands")
     yield Commands(tuple(commands))
-    trained = [train_command(arm.config, sorted(run.seed for run in arm.runs)) for arm in arms if arm.runs]
+    trained = [command for arm in arms if arm.runs and (command := _command_of(arm))]
     if trained:
         yield "Each method by itself:"
         yield Commands(tuple(dict.fromkeys(trained)))
+
+
+def _command_of(arm: Arm) -> str | None:
+    """Return the command that trains an arm; of what no such command names, the one typed, if any."""
+    config, manifest = arm.config, arm.runs[0].manifest
+    if config.task_is_callable or config.demonstrations or manifest.forked_from:
+        return manifest.command
+    return train_command(config, sorted(run.seed for run in arm.runs))

@@ -86,12 +86,12 @@ def try_tasks(configs: Iterable[RunConfig]) -> None:
 
 
 def _program(path: Path, run: StudyRun, execution: Execution) -> Program:
-    """Return the program that trains a run, after creating its directory or raising its number of steps."""
+    """Return the program that trains a run, after creating its directory or updating its configuration."""
     cores = execution.cluster.cores if execution.cluster else cores_to_use()
     threads = cores if execution.cluster else max(1, cores // execution.workers)
     if is_run(path):
         existing = RunDirectory.open(path)
-        if run.config.steps > existing.config.steps:
+        if run.config != existing.config:
             with existing.locked():
                 existing.update_manifest(config=run.config)
         threads = threads_of([existing], cores, threads)

@@ -230,7 +230,7 @@ class Callbacks:
 
     def would_stop_again(self, run: RunDirectory) -> bool:
         """Return whether the callbacks would end a run at its last evaluation, as they did before."""
-        if run.manifest.state != "finished" or not self.interests.evaluations or not len(run.evaluations):
+        if not self.interests.evaluations or not len(run.evaluations):
             return False
         rows, names = run.evaluations, run.evaluations.dtype.names or ()
         episodes = [
@@ -239,7 +239,8 @@ class Callbacks:
         ]
         callbacks = Callbacks([c for c in self.callbacks if not c.needs_policy], None, self.stop_when)
         moment = Moment(run.seed, int(rows["step"][-1]), run.path)
-        return bool(callbacks.call(Event("on_evaluation", [moment], [(episodes,)])).stopped_by)
+        answer = callbacks.call(Event("on_evaluation", [moment], [(episodes,)]))
+        return bool(answer.stopped_by) and not answer.failed
 
     def _guarded(self, name: str, function: Callable[..., Any] | None, *arguments: Any) -> Any:
         """Return what a caller's function returns, or None if it raises or another has raised before."""

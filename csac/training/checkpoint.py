@@ -102,8 +102,11 @@ class Checkpoint(NamedTuple):
         is left.
         """
         first, last = self.transitions
+        first = max(first, last - len(rows))  # a fork's memory may be smaller
         known, lost = np.zeros(last - first, bool), []
         for begin, end, name in shards(self.files):
+            if end <= first:
+                continue
             try:
                 shard = safetensors.numpy.load(self.read(name))["rows"]
                 if shard.shape != (end - begin, rows.shape[1]) or shard.dtype != rows.dtype:
@@ -173,11 +176,10 @@ def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:
     for name, content in contents.items():
         write_atomically(aside / name, content)
     aside.rename(path)
-    if hasattr(os, "O_DIRECTORY"):
-        for folder in (path, path.parent, path.parent / REPLAY):
-            descriptor = os.open(folder, os.O_DIRECTORY)
-            os.fsync(descriptor)
-            os.close(descriptor)
+    for folder in (path, path.parent, path.parent / REPLAY):
+        descriptor = os.open(folder, os.O_DIRECTORY)
+        os.fsync(descriptor)
+        os.close(descriptor)
 
 
 def prune(folder: Path, keep: int, newest: int | None = None) -> None:

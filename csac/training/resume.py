@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from csac.record.config import differences
 from csac.record.files import write_atomically
 from csac.record.manifest import Continuation, Manifest, Origin
 from csac.record.run import TABLES, RunDirectory, now
-from csac.record.sets import RunSet
+from csac.record.sets import RunSet, split_step
 from csac.record.tables import continues
 from csac.tasks.perturbations import continued, perturbations_of
 from csac.training.checkpoint import (
@@ -211,13 +210,11 @@ class Source(NamedTuple):
 
         Raises InputError if there is no such run, seed or checkpoint, or if it is damaged.
         """
-        name, at, text = str(where).rpartition("@")
-        has_step = bool(at) and not os.path.exists(where)
-        if has_step and not re.fullmatch(r"[0-9][0-9_]*", text):
-            raise InputError(f"{where}: {text!r} is not a step; write DIRECTORY@STEP")
-        found = RunSet.open(name if has_step else where)
+        name, step = split_step(where)
+        found = RunSet.open(name)
         runs = {seed: found.run(seed) for seed in seeds}
-        step = int(text) if has_step else min(max(steps_in(run.checkpoints), default=0) for run in runs.values())
+        if step is None:
+            step = min(max(steps_in(run.checkpoints), default=0) for run in runs.values())
         checkpoints = {seed: checkpoint_of(run.checkpoints, step) for seed, run in runs.items()}
         return cls(found.path, runs, checkpoints, step)
 

@@ -69,7 +69,7 @@ def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], 
     after = dataclasses.replace(before, **current)
     if before.process is not None:
         entry, lines = continuation(before, after, point)
-        history = (*history, entry)
+        history, current = (*history, entry), {**current, "command": before.command}
         for line in lines:
             run.log(line)
             watcher.note(f"seed {run.seed}: {line}")

@@ -85,10 +85,8 @@ class Watch(Watcher):
 
     def is_over(self, run: RunDirectory) -> bool:
         """Return whether a run needs no more training: all its steps are made, or a callback would still end it."""
-        manifest = run.manifest
-        if manifest.state not in ("finished", "failed") or manifest.steps_done < run.config.steps:
-            return self.callbacks.would_stop_again(run)
-        return manifest.state == "finished"
+        is_complete = run.manifest.steps_done >= run.config.steps
+        return run.manifest.state == "finished" and (is_complete or self.callbacks.would_stop_again(run))
 
 
 def draw_curve(runs: RunSet, note: Callable[[str], None]) -> None:

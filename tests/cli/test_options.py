@@ -165,6 +165,7 @@ def test_export_passes_its_options_on(monkeypatch):
 )
 def test_a_fork_is_as_its_source_unless_told_otherwise(train_call, options, perturbations):
     config = {"algorithm": "sac", "hyperparameters": {"discount": 0.5}, "evaluation_interval": 10, "evaluation_seed": 3}
+    config |= {"evaluation_environments": 0, "checkpoint_interval": 7}
     make_set(Path("source"), [[1.0], [2.0]], steps=500, environment_arguments={"a": 1}, **config)
     call = train_call(f"Hopper-v4 --from source@50 --evaluation-episodes 3 {options}")
     assert call.pop("command")
@@ -177,6 +178,8 @@ def test_a_fork_is_as_its_source_unless_told_otherwise(train_call, options, pert
         "evaluation_interval": 10,
         "evaluation_episodes": 3,
         "evaluation_seed": 3,
+        "evaluation_environments": 0,
+        "checkpoint_interval": 7,
         "environment_arguments": {"a": 1},
         "perturbations": perturbations,
         "start_from": "source@50",
@@ -185,6 +188,9 @@ def test_a_fork_is_as_its_source_unless_told_otherwise(train_call, options, pert
 
 def test_a_fork_that_has_begun_needs_its_source_no_more(train_call):
     """A scheduler types the same line again; meanwhile the source is gone."""
+    make_set(Path("source"), [[1.0]], steps=55)
+    Path("fork").mkdir()
+    assert train_call("Hopper-v4 --from source@5 --directory fork --resume")["steps"] == 55
     RunDirectory.create(Path("fork/seed-4"), manifest(seed=4, steps=77, algorithm="csac"))
     call = train_call("Hopper-v4 --from gone@400 --directory fork --resume")
     assert (call["steps"], call["first_seed"], call["start_from"]) == (77, 4, "gone@400")

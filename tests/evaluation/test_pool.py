@@ -145,7 +145,6 @@ def test_processes_are_chosen_by_the_work_and_at_least_one_is_asked_for(monkeypa
         EvaluationPool(Evaluator(lambda: probes.Cases()), processes=2)
 
 
-@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_a_task_may_have_processes_and_ends_them_when_the_pool_is_closed(tmp_path, pool_of):
     """A daemon may start none; and killed with its environments open, it left their simulators behind."""
     pool = pool_of(Helped, {"folder": str(tmp_path)}, TWO_BATCHES)

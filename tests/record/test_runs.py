@@ -51,7 +51,6 @@ def test_a_strangers_folder_and_header_move_no_terminal(tmp_path):
     assert "\x1b" not in str(damaged[0])
 
 
-@pytest.mark.skipif(os.name != "posix", reason="links")
 @pytest.mark.parametrize("name", ["log.txt", ".lock", "checkpoint", "checkpoint/replay"])
 def test_a_strangers_link_is_not_followed(tmp_path, name):
     run = RunDirectory.create(tmp_path / "run", manifest())

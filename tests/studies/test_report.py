@@ -9,15 +9,18 @@ from studying import tiny_study, write_run
 from test_arms import config
 
 from csac.cli import main
+from csac.record.manifest import Origin
 from csac.record.rendering import EMPTY, Cell, Row, Table
 from csac.studies import paper
 from csac.studies.arms import Arm, gather, read_arms
 from csac.studies.report import (
+    Commands,
     Heading,
     Picture,
     efficiency,
     over_tasks,
     overview,
+    provenance,
     report_of,
     robustness,
     success,
@@ -129,6 +132,13 @@ def test_runs_without_evaluations_have_a_report_too(tmp_path):
     parts = report_of(read_arms([tmp_path]), ["csac report"], ["curves", "returns"])
     write(tmp_path / "report.html", "Nothing yet", parts)
     assert not [part for part in parts if isinstance(part, Picture)]
+
+
+def test_a_fork_is_repeated_by_the_command_that_made_it(tmp_path):
+    origin = Origin("a/seed-0", 500, ())
+    write_run(tmp_path / "seed-0", config()).update_manifest(forked_from=origin, command="csac train Ant-v4 --from a")
+    commands = [part.lines for part in provenance(read_arms([tmp_path]), ["csac report"]) if isinstance(part, Commands)]
+    assert commands == [("csac report",), ("csac train Ant-v4 --from a",)]
 
 
 def test_methods_are_compared_over_all_tasks_with_common_seeds(mujoco, tmp_path):

@@ -150,6 +150,21 @@ class Broken(Callback):
         raise ZeroDivisionError("by\nzero")
 
 
+class Forgetful(Callback):
+    interval = 10
+
+    def on_step(self, moment):
+        self.last = moment.step
+
+    def on_evaluation(self, moment, episodes):
+        return self.last > 0
+
+
+def test_a_callback_that_cannot_judge_the_last_evaluation_ends_nothing(tmp_path):
+    run(tmp_path / "set", LEARNER, 100, **ENDLESS, callbacks=[Forgetful()])
+    assert run(tmp_path / "set", LEARNER, 150, **ENDLESS, callbacks=[Forgetful()], resume=True).steps_done == 150
+
+
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_a_broken_callback_is_one_line_and_loses_nothing(tmp_path, whole, seeds):
     with pytest.raises(CallbackFailure, match=r"Broken.on_step raised ZeroDivisionError: by zero") as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import time
 
@@ -12,7 +11,7 @@ from chaos import CASES, TRAIN, make_wholes, one_run, reached, start, strike, wo
 
 from csac.record.sets import RunSet
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="POSIX signals")]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from csac.record.config import EVALUATION_SEED
 from csac.record.run import RunDirectory
 from csac.record.sets import find_sets
 from csac.training import evaluations
-from csac.training.checkpoint import steps_in
+from csac.training.checkpoint import newest_sound, steps_in
 from csac.training.signals import Interrupted
 
 CHANGES = ("friction=1.5@150", "action_noise=0.05@210", "observation_noise=0.01@330")
@@ -230,11 +230,25 @@ def test_a_lost_manifest_is_taken_from_the_newest_checkpoint(tmp_path, stopped, 
 def test_lost_transitions_are_replaced_by_others_with_a_warning(tmp_path, stopped):
     shard = sorted((stopped.checkpoints / "replay").glob("*.safetensors"))[-1]
     damage(shard, "cut")
+    stopped.update_manifest(command="csac train it")
     again = csac.resume(tmp_path / "run").runs[0]
     assert again.manifest.state == "finished"
     assert "transitions are lost" in (again.path / "log.txt").read_text()
     entry = again.manifest.history[-1]
     assert (entry.exact, "transitions are lost" in entry.notes[-1]) == (False, True)
+    assert (again.manifest.command, entry.command) == ("csac train it", None)
+
+
+def test_a_smaller_memory_misses_no_older_transitions(stopped):
+    """A fork may have one; those that it would have overwritten may be lost."""
+    checkpoint, _ = newest_sound(stopped.checkpoints)
+    assert checkpoint is not None
+    (_, last), width = checkpoint.transitions, checkpoint.state().arrays["learner.waiting"].shape[-1]
+    whole, small = np.zeros((last, width), np.float32), np.zeros((20, width), np.float32)
+    assert checkpoint.fill(whole) == []
+    damage(min(stopped.checkpoints.glob("replay/0-*.safetensors")), "missing")
+    assert checkpoint.fill(small) == []
+    np.testing.assert_array_equal(small[np.arange(last - 20, last) % 20], whole[-20:])
 
 
 def test_a_run_without_a_sound_checkpoint_is_refused_and_unchanged(stopped, finished, whole):

@@ -1,7 +1,6 @@
 """Signals to what a task has forked."""
 
 import multiprocessing
-import os
 import signal
 
 import pytest
@@ -15,7 +14,6 @@ def wait_for_signal(connection):
         pass
 
 
-@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")
 @pytest.mark.parametrize("handled", [leaving_at_once, stop_requested])
 def test_a_forked_helper_ends_by_the_signal_whose_handler_it_inherited(handled):

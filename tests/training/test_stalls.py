@@ -6,7 +6,6 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-import pytest
 from probes import Probe
 
 from csac.tasks.environment import Environment
@@ -52,7 +51,6 @@ class Held(Probe):
         return super().step(action)
 
 
-@pytest.mark.skipif(os.name != "posix", reason="named pipes")
 def test_an_environment_in_a_process_of_its_own_is_told_without_a_place(monkeypatch, tmp_path):
     monkeypatch.setattr(stalls, "SECONDS", 0.01)
     os.mkfifo(tmp_path / "pipe")
