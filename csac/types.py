@@ -14,8 +14,10 @@ Metrics: TypeAlias = dict[str, Any]  # name -> scalar JAX array
 # gelu is the tanh form of its paper. A new activation goes into algorithms/networks.py, and for exported policies into
 # deploy/policy.py, deploy/onnx.py and both of deploy/templates/policy.*.
 Activation: TypeAlias = Literal["relu", "tanh", "elu", "silu", "gelu"]
+Head: TypeAlias = Literal["tanh_gaussian", "tanh", "clipped_gaussian"]
 
 LAYER_NORM_EPSILON = 1e-5  # added to variances, as by PyTorch
+LOG_STD_RANGE = (-20.0, 2.0)  # the bounds of PARL, which the paper builds on; SB3 and the authors of SAC use the same
 
 
 class InputError(ValueError):
@@ -96,7 +98,7 @@ class PolicyNetwork(NamedTuple):
 
     parameters: PolicyParameters
     activation: Activation = "relu"
-    head: Literal["tanh_gaussian", "tanh", "clipped_gaussian"] = "tanh_gaussian"
+    head: Head = "tanh_gaussian"
     critic_activation: Activation = "relu"
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from csac.algorithms.shapes import Action, Observation, Scalar
+from csac.types import LOG_STD_RANGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -16,9 +17,6 @@ if TYPE_CHECKING:
 LOG_TWO = 0.6931471805599453
 HALF_LOG_TWO_PI = 0.9189385332046727
 GAUSSIAN_ENTROPY = 1.4189385332046727  # of N(0, 1), log(2πe) / 2
-
-# The clipping bounds of PARL, which the paper builds on; SB3 and the authors of SAC use the same.
-MINIMUM_LOG_STD, MAXIMUM_LOG_STD = -20.0, 2.0
 
 
 class Gaussian(NamedTuple):
@@ -55,7 +53,7 @@ class TanhGaussian(NamedTuple):
     def from_output(cls, output: Float[Array, " twice_action"]) -> TanhGaussian:
         """Split a network's output [2 action] into mean and log standard deviation, and clip the latter."""
         mean, log_std = jnp.split(output, 2)
-        return cls(mean, jnp.clip(log_std, MINIMUM_LOG_STD, MAXIMUM_LOG_STD))
+        return cls(mean, jnp.clip(log_std, *LOG_STD_RANGE))
 
     def pre_tanh(self, noise: Action) -> Action:
         """Return the reparameterised sample u = mean + std ξ."""

@@ -71,7 +71,7 @@ class Replay:
         steps = jax.vmap(unpack, in_axes=(0, None))(rows, spec)
         return replace(self, returns=self.returns.absorb(steps, self.discount))
 
-    def draw(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
+    def sample(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
         """Return a batch drawn uniformly with replacement from the `count` rows added, or the newest `capacity`."""
         indices = jax.random.randint(key, (batch_size,), 0, jnp.minimum(count, self.rows.shape[0]))
         batch = self.at(indices, count, spec)
@@ -124,7 +124,7 @@ class Rollout(NamedTuple):
         """Return the rollout that consists of these packed rows [steps, width]."""
         return Rollout(jnp.reshape(rows, self.rows.shape))
 
-    def draw(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
+    def sample(self, key: Key, count: Count, batch_size: int, spec: Spec) -> Transition:
         """Return the whole rollout: transitions with a leading time axis."""
         return jax.vmap(unpack, in_axes=(0, None))(self.rows, spec)
 

@@ -194,14 +194,14 @@ def _tune(options: Any, command: str) -> int:
     from csac.seeds import TUNING_EVALUATION_SEED
     from csac.studies.search import Search, space_of
     from csac.studies.tune import tune
-    from csac.training.config import labels
+    from csac.training.config import seed_range
 
     learner = learner_of(options)
     typed = [word.partition("=")[0][2:].replace("-", "_") for word in shlex.split(command) if word.startswith("--")]
     wanted = [name.replace("-", "_") for name in options.search] or None
     settings = {item.name: getattr(options, item.name) for item in dataclasses.fields(RunConfig)}
     config = RunConfig(**{**settings, "seed": options.first_seed, "evaluation_seed": TUNING_EVALUATION_SEED})
-    labels(options.seeds, options.first_seed)
+    seed_range(options.seeds, options.first_seed)
     search = Search(config=config, seeds=options.seeds, algorithm=learner, space=space_of(learner, wanted, typed))
     return tune(search, options.home(), options.trials, command, make_console())
 

@@ -9,13 +9,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from csac.checks import without_controls
 from csac.record.files import write_atomically
-from csac.types import Activation, InputError, Spec
+from csac.types import Activation, Head, InputError, Spec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,8 +24,6 @@ CONTRACT = "contract.json"
 SCHEMA_VERSION = 2
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 BOUNDS_ROUNDING = 1e-6  # relative to the bound: a few times float32's rounding error
-
-Head = Literal["tanh_gaussian", "tanh", "clipped_gaussian"]
 
 
 class ActionBounds:

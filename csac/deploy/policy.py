@@ -13,7 +13,7 @@ from csac.checks import check_flag, check_path
 from csac.deploy.contract import CONTRACT, Contract, check_checksum, read_json, write_with_checksum
 from csac.deploy.parameters import copied, from_tensors, to_tensors
 from csac.record.files import writing
-from csac.types import LAYER_NORM_EPSILON, InputError, Layer, PolicyNetwork
+from csac.types import LAYER_NORM_EPSILON, LOG_STD_RANGE, InputError, Layer, PolicyNetwork
 
 if TYPE_CHECKING:
     from csac.types import Activation
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 POLICY = "policy.safetensors"  # file name in the folder of an artefact, or of a policy saved on its own
 # Any of these files shows that a folder is a run, a run's policies or an artefact.
 OCCUPIED = {"manifest.json", "last.safetensors", "best.safetensors", "policy.py", "policy.onnx", "policy.h"}
-LOG_STD_RANGE = (-20.0, 2.0)
 GELU_SCALE, GELU_CUBE = (2 / math.pi) ** 0.5, 0.044715  # Hendrycks and Gimpel 2016, section 2
 
 _STREAM = 0x706F6C69  # far from the spawn keys of a task's own generators: 0, 1, 2, ...

@@ -13,6 +13,7 @@ from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy
 from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, RunningEpisode, start
 from csac.evaluation.pool import EvaluationStopped, Pending
+from csac.record.config import SEED_LIMIT
 from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
 from csac.tasks.environment import Environment
 from csac.tasks.perturbations import constant_perturbations, values_at
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 
 EPISODES_AT_ONCE = 10  # rows of every observation batch: fixed, since rounding depends on the batch shape
 LONGEST_EPISODE = 100_000  # steps; otherwise a task whose episodes never end would block training
-
-_SEED_LIMIT = 2**32
 
 
 class Evaluator:
@@ -57,8 +56,8 @@ class Evaluator:
         environments: int = EPISODES_AT_ONCE,
         lent: Environment | None = None,
     ) -> None:
-        check_whole("episodes", episodes, 1, _SEED_LIMIT)
-        check_whole("first_seed", first_seed, 0, _SEED_LIMIT - episodes)
+        check_whole("episodes", episodes, 1, SEED_LIMIT)
+        check_whole("first_seed", first_seed, 0, SEED_LIMIT - episodes)
         self._task, self._environment_arguments = task, environment_arguments
         self.episodes, self._first_seed, self._events = episodes, first_seed, tuple(events)
         self._lent, self._batch_size = lent, min(environments, EPISODES_AT_ONCE, episodes)

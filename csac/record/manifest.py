@@ -86,7 +86,7 @@ class Manifest:
             raise InputError(f"steps_done is {self.steps_done}")
 
 
-class NewerError(InputError):
+class SchemaError(InputError):
     """A manifest has another schema version."""
 
 
@@ -98,8 +98,8 @@ def read(content: bytes) -> Manifest:
     except (ValueError, RecursionError, AttributeError, TypeError):
         raise InputError("it is not a JSON object") from None
     if version != SCHEMA_VERSION:
-        raise NewerError(f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}")
-    return value(Manifest, fields, "")
+        raise SchemaError(f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}")
+    return parsed(Manifest, fields, "")
 
 
 def written(manifest: Manifest) -> bytes:
@@ -111,7 +111,7 @@ def written(manifest: Manifest) -> bytes:
 _TYPE_NAMES = {int: "a whole number", str: "a text", bool: "true or false", tuple: "a list"}
 
 
-def value(kind: Any, given: Any, name: str) -> Any:
+def parsed(kind: Any, given: Any, name: str) -> Any:
     """Return a JSON value as a value of type `kind`. Raises InputError, naming `name`, if it has another type."""
     origin, arguments = get_origin(kind), get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(given, dict):
@@ -119,13 +119,13 @@ def value(kind: Any, given: Any, name: str) -> Any:
     if kind is Any:
         return given
     if origin in (Union, types.UnionType):
-        return None if given is None else value(arguments[0], given, name)
+        return None if given is None else parsed(arguments[0], given, name)
     if origin is Literal and isinstance(given, str) and given in arguments:
         return given
     if origin is tuple and isinstance(given, list):
-        return tuple(value(arguments[0], item, name) for item in given)
+        return tuple(parsed(arguments[0], item, name) for item in given)
     if origin is dict and isinstance(given, dict):
-        return {key: value(arguments[1], item, name) for key, item in given.items()}
+        return {key: parsed(arguments[1], item, name) for key, item in given.items()}
     if kind in (int, str, bool) and type(given) is kind:
         return given
     expected = " or ".join(map(repr, arguments)) if origin is Literal else _TYPE_NAMES.get(origin or kind, "a table")
@@ -137,7 +137,7 @@ def _dataclass(kind: Any, given: dict[str, Any], name: str) -> Any:
     for item in dataclasses.fields(kind):
         path = f"{name}.{item.name}".lstrip(".")
         if item.name in given:
-            values[item.name] = value(hints[item.name], given[item.name], path)
+            values[item.name] = parsed(hints[item.name], given[item.name], path)
         elif item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING:
             raise InputError(f"{path!r} is missing")
     return kind(**values)

@@ -94,7 +94,7 @@ class RunDirectory:
                 reason = "holds no run" if path.exists() else reason
             except OSError as error:
                 raise InputError(f"cannot read {place}: {error.strerror}; check its permissions") from None
-            except manifests.NewerError as error:
+            except manifests.SchemaError as error:
                 raise InputError(f"{place}: {error}; use the csac that wrote it") from None
             except InputError as error:
                 reason = f"has a damaged {MANIFEST}: {error}"

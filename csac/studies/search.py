@@ -59,7 +59,7 @@ SPACES: Mapping[str, Space] = {
 }
 
 
-def draw(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
+def sample(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
     """Let a trial choose a value; for "below 1", the distance to 1 is drawn on a logarithmic scale."""
     scale, *ends = dimension
     if scale == "one of":

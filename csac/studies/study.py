@@ -19,7 +19,7 @@ from csac.record.run import RunDirectory, is_run
 from csac.studies import paper
 from csac.tasks.perturbations import perturbations_of, refuse_late
 from csac.tasks.registry import check_events, events_of
-from csac.training.config import algorithm_of, labels
+from csac.training.config import algorithm_of
 from csac.training.resume import refuse_differences
 from csac.types import InputError
 
@@ -161,7 +161,7 @@ class Study:
 
     def runs(self) -> list[StudyRun]:
         """Return every run, seed by seed, so that an unfinished study compares all methods on fewer seeds."""
-        seeds = labels(self.seeds, self.first_seed)
+        seeds = seed_range(self.seeds, self.first_seed)
         parts = itertools.product(self.tasks, self.conditions, self.methods)
         firsts = [self._run(task, condition, method, seeds[0]) for task, condition, method in parts]
         if len({run.folder for run in firsts}) < len(firsts):
@@ -230,9 +230,9 @@ def read_study(path: Path) -> Study:
     try:
         fields = tomllib.loads(without_controls(path.read_bytes()).decode("utf-8-sig"))
         _refuse_unknown(fields, _names(Study), "a study has no")
-        for method in manifests.value(tuple[dict[str, Any], ...], fields.get("methods", []), "methods"):
+        for method in manifests.parsed(tuple[dict[str, Any], ...], fields.get("methods", []), "methods"):
             _refuse_unknown(method, _names(Method), "a method has no")
-        study = manifests.value(Study, {**fields, "name": path.stem}, "")
+        study = manifests.parsed(Study, {**fields, "name": path.stem}, "")
         _refuse_unknown(study.common, [one.algorithm for one in study.methods], "common: no method has the algorithm")
         study.runs()
     except OSError as error:

@@ -25,7 +25,7 @@ from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
 from csac.studies.arms import plain
 from csac.studies.run import try_tasks
-from csac.studies.search import Search, draw
+from csac.studies.search import Search, sample
 from csac.training.config import RUN_OPTIONS
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.train import train
@@ -125,7 +125,7 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
         lock = closed_in_children(open(folder / ".lock", "a+"))  # noqa: SIM115  held for as long as the trial runs
         take(lock, folder)
         with warnings.catch_warnings(action="ignore"):  # the first trial may lie outside the space
-            values = {name: draw(trial, name, dimension) for name, dimension in search.space.items()}
+            values = {name: sample(trial, name, dimension) for name, dimension in search.space.items()}
         trial.set_user_attr("values", values)
         return trial, lock
 

@@ -115,7 +115,7 @@ def make_configs(
     return configs, demonstrations, spec, [f"note: {line}" for line in notes]
 
 
-def labels(seeds: int, first_seed: int) -> list[int]:
+def seed_range(seeds: int, first_seed: int) -> list[int]:
     """Return the seeds from `first_seed` on. Raises InputError if there are none or too many."""
     check_whole("seeds", seeds, 1, MOST_SEEDS)
     check_whole("first_seed", first_seed, 0, SEED_LIMIT - seeds)

@@ -95,7 +95,7 @@ class OneSeed:
 
         def update(i: jax.Array, state_and_sums: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
             state, sums = state_and_sums
-            batch = self._draw(memory, jax.random.fold_in(draw_key, i), count)
+            batch = self._sample(memory, jax.random.fold_in(draw_key, i), count)
             state, metrics = self._update(state, batch, jax.random.fold_in(update_key, i), first + i)
             return state, sums + jnp.stack([metrics[name] for name in self.metrics])
 
@@ -122,10 +122,10 @@ class OneSeed:
 
     def _first_metrics(self, state: Any, memory: Any, key_data: jax.Array) -> dict[str, jax.Array]:
         key = jax.random.wrap_key_data(key_data)
-        return self._update(state, self._draw(memory, key, jnp.int32(1)), key, jnp.int32(0))[1]
+        return self._update(state, self._sample(memory, key, jnp.int32(1)), key, jnp.int32(0))[1]
 
-    def _draw(self, memory: Any, key: jax.Array, count: jax.Array) -> Transition:
-        return memory.draw(key, count, self.cadence.transitions_per_update, self.spec)
+    def _sample(self, memory: Any, key: jax.Array, count: jax.Array) -> Transition:
+        return memory.sample(key, count, self.cadence.transitions_per_update, self.spec)
 
     def _act(self, state: Any, key_data: jax.Array, observation: jax.Array, step: jax.Array) -> jax.Array:
         keys = self._act_keys(key_data, observation, step)

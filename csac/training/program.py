@@ -13,6 +13,7 @@ from csac.checks import check_whole
 from csac.processes import cores_to_use, may_be_imported, memory_left, script, usable_cores
 from csac.training.callbacks import Interests
 from csac.training.devices import preallocates
+from csac.training.one_seed import KEY_DATA
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -160,9 +161,8 @@ def _bytes_per_seed(algorithm: Algorithm, config: RunConfig, spec: Spec) -> int:
     as many units as columns.
     """
     steps, transitions = config.steps, config.steps + config.extra_transitions
-    key = jax.ShapeDtypeStruct((2,), "uint32")
     state, memory = jax.eval_shape(
-        lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, transitions)), key
+        lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, transitions)), KEY_DATA
     )
     jax.eval_shape(lambda state: algorithm.policy(state).parameters, state)  # refuses networks that cannot be exported
     units = sum(leaf.shape[-1] for leaf in jax.tree.leaves(state) if len(leaf.shape) == 2)

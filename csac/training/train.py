@@ -20,7 +20,7 @@ from csac.record.wandb import import_wandb
 from csac.tasks.trust import named_task
 from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
-from csac.training.config import algorithm_of, check_algorithm, labels, make_configs
+from csac.training.config import algorithm_of, check_algorithm, make_configs, seed_range
 from csac.training.devices import choose_device
 from csac.training.program import Program, choose_groups, memory_needed, programs_of
 from csac.training.resume import Source, fork_options, refuse_differences, refuse_lost
@@ -112,7 +112,7 @@ def train(
     watch = Watch(progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(options.get("device", "cpu"))
     place = None if directory is None else Path(os.path.abspath(directory))  # the task may chdir
-    wanted = labels(seeds, first_seed)
+    wanted = seed_range(seeds, first_seed)
 
     source = None
     if start_from is not None and resume and place and all(is_run(run_path(place, seed)) for seed in wanted):

@@ -97,7 +97,7 @@ def test_what_follows_m_steps_is_discounted_m_times(algorithm):
 
 def test_one_step_draws_are_as_they_were():
     ring = replay([(i, i, i + 1, {}) for i in range(4)], 1)
-    batch = ring.draw(jax.random.key(0), jnp.int32(4), 16, Spec(1, 1))
+    batch = ring.sample(jax.random.key(0), jnp.int32(4), 16, Spec(1, 1))
     assert isinstance(batch, Transition)
     assert batch.steps is None
 

@@ -27,7 +27,7 @@ def test_rewards_are_divided_by_the_spread_of_the_returns_of_each_environment():
     np.testing.assert_allclose([ring.returns.statistics.mean, ring.returns.statistics.variance], [3.0, 1.0])
     np.testing.assert_allclose(ring.returns.running, [4.0, 2.0])
     scaled = ring.returns._replace(statistics=ring.returns.statistics._replace(std=jnp.float32(4.0)))
-    drawn = Replay(ring.rows, returns=scaled).draw(jax.random.key(0), jnp.int32(4), 64, spec)
+    drawn = Replay(ring.rows, returns=scaled).sample(jax.random.key(0), jnp.int32(4), 64, spec)
     assert set(np.asarray(drawn.reward).tolist()) == {0.5, 0.75, 1.0}
 
 

@@ -19,7 +19,7 @@ from csac.record.run import is_run
 from csac.record.sets import RunSet
 from csac.seeds import TUNING_EVALUATION_SEED
 from csac.studies import tune as module
-from csac.studies.search import SPACES, Search, draw, space_of
+from csac.studies.search import SPACES, Search, sample, space_of
 from csac.studies.tune import tune
 from csac.training.signals import Interrupted
 from csac.types import InputError
@@ -130,9 +130,9 @@ def test_values_are_short_and_within_their_ends():
     for _ in range(20):
         trial = study.ask()
         for name, dimension in SPACES["ppo"].items():
-            value = draw(trial, name, dimension)
+            value = sample(trial, name, dimension)
             assert min(dimension[1:]) <= value <= max(dimension[1:])
-        digits = draw(trial, "clip_range", SPACES["ppo"]["clip_range"])
+        digits = sample(trial, "clip_range", SPACES["ppo"]["clip_range"])
         assert float(f"{digits:.3g}") == digits
 
 

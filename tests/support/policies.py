@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from csac.deploy.contract import Contract, Head
+from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.types import Activation, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
+from csac.types import Activation, Head, Layer, Normaliser, PolicyNetwork, PolicyParameters, Spec
 
 Parts = tuple[tuple[str | None, tuple[int, ...]], ...]
 

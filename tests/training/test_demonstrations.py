@@ -54,7 +54,7 @@ def test_any_number_of_rows_is_written_over_the_oldest_wherever_they_begin():
         )
         held = {i % 5: float(i) for i in story}
         assert replay.rows[:, 0].tolist() == [held.get(place, 0.0) for place in range(5)]
-    drawn = replay.draw(jax.random.key(0), jnp.int32(15), 200, Spec(1, 1))
+    drawn = replay.sample(jax.random.key(0), jnp.int32(15), 200, Spec(1, 1))
     assert sorted(set(drawn.reward.tolist())) == [10, 11, 12, 13, 14]
 
 

@@ -58,7 +58,7 @@ def test_a_row_holds_the_fields_in_their_order():
     [(1, [0]), (3, [0, 1, 2]), (5, [0, 1, 2, 3, 4]), (6, [1, 2, 3, 4, 5]), (13, [8, 9, 10, 11, 12])],
 )
 def test_a_ring_of_five_holds_the_newest_five(count, held):
-    batch = filled(5, count).draw(jax.random.key(0), jnp.int32(count), 300, SPEC)
+    batch = filled(5, count).sample(jax.random.key(0), jnp.int32(count), 300, SPEC)
     numbers = np.floor(batch.reward)
     assert sorted(set(numbers.tolist())) == held
     jax.tree.map(np.testing.assert_array_equal, batch, numbered(numbers))
@@ -68,12 +68,12 @@ def test_a_rollout_gives_the_newest_steps_whole_and_in_order():
     rollout = Rollout.create(3, SPEC)
     for first in (0, 3):
         rollout = rollout.add(jnp.asarray(pack(numbered(range(first, first + 3)))), jnp.int32(first))
-    batch = rollout.draw(jax.random.key(0), jnp.int32(6), 3, SPEC)
+    batch = rollout.sample(jax.random.key(0), jnp.int32(6), 3, SPEC)
     jax.tree.map(np.testing.assert_array_equal, batch, numbered([3, 4, 5]))
 
 
 def test_draws_are_uniform():
-    batch = filled(10, 17).draw(jax.random.key(1), jnp.int32(17), 20_000, SPEC)
+    batch = filled(10, 17).sample(jax.random.key(1), jnp.int32(17), 20_000, SPEC)
     drawn = np.bincount(np.floor(batch.reward).astype(int), minlength=17)[7:]
     assert drawn.sum() == 20_000
     assert chisquare(drawn).pvalue > 0.001
