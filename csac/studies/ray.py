@@ -112,7 +112,8 @@ def _train(program: Program, index: int, messages: Any) -> None:
     import ray
 
     watcher = _QueueWatcher(index, messages)
-    from csac.training.running import begin_with, train_program  # imports JAX
+    from csac.training.devices import begin_with  # imports JAX
+    from csac.training.running import train_program
 
     begin_with(program.threads)
     for path in program.directories:  # the lock of a lost node becomes free; another process may keep it

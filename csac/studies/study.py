@@ -19,7 +19,7 @@ from csac.record.run import RunDirectory, is_run
 from csac.studies import paper
 from csac.tasks.perturbations import perturbations_of, refuse_late
 from csac.tasks.registry import check_events, events_of
-from csac.training.config import algorithm_of
+from csac.training.config import algorithm_of, seed_range
 from csac.training.resume import refuse_differences
 from csac.types import InputError
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import jax
 
-from csac.processes import usable_cores
+from csac.training.devices import threads_in_use
 
 MOST_BYTES = 256 * 2**20  # for all programs; those of one algorithm, task and preset take half a MiB
 SECONDS_WORTH_KEEPING = 0.1  # of compile time; loading takes a tenth of it or less
@@ -36,7 +36,7 @@ def keep_programs() -> None:
     """
     with suppress(OSError):
         if not _is_users_choice():
-            folder = _make_home() / f"{_processor()}-{len(usable_cores())}"
+            folder = _make_home() / f"{_processor()}-{threads_in_use()}"
             jax.config.update("jax_compilation_cache_dir", str(folder))
             jax.config.update("jax_persistent_cache_min_compile_time_secs", SECONDS_WORTH_KEEPING)
 

@@ -1,4 +1,4 @@
-"""Choose the device that a process computes on. JAX fixes it at its first computation."""
+"""Choose the device that a process computes on, and the cores. JAX fixes both at its first computation."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
+from csac.processes import move_to, usable_cores
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -50,7 +51,8 @@ def choose_device(device: str) -> None:
         os.environ[FLAGS] = with_exact_kernels(os.environ.get(FLAGS, ""))
         os.environ[PREALLOCATE] = os.environ.get(PREALLOCATE) or "false"
     try:
-        chosen = jax.default_backend()
+        # A CPU needs no test, and `begin_with` is to come before JAX looks for devices.
+        chosen = jax.default_backend() if device == "gpu" or _has_looked_for_devices() else device
     except Exception as error:  # its type depends on what is missing, and on JAX's version
         _restore_settings(*before)
         hint = "pip install '.[cuda]' in a clone of csac, or choose the cpu"
@@ -69,6 +71,31 @@ def choose_device(device: str) -> None:
             )
     if config.jax_default_matmul_precision:
         os.environ["JAX_DEFAULT_MATMUL_PRECISION"] = config.jax_default_matmul_precision  # for the workers
+
+
+_threads: int | None = None
+
+
+def begin_with(threads: int) -> None:
+    """Have XLA divide its work for this many cores, while this process may run on every core.
+
+    XLA sizes its thread pool by the cores that it sees when JAX first looks for devices; later this has no effect.
+    """
+    global _threads
+    cores = usable_cores()
+    if threads >= len(cores) or _has_looked_for_devices():
+        return
+    move_to(cores[os.getpid() % (len(cores) - threads + 1) :][:threads])
+    try:
+        jax.devices()
+    finally:
+        move_to(cores)
+    _threads = threads
+
+
+def threads_in_use() -> int:
+    """Return for how many cores XLA divides the work of this process."""
+    return _threads or len(usable_cores())
 
 
 def in_use() -> dict[str, str]:
@@ -100,7 +127,7 @@ def preallocates() -> bool:
 
 def _has_looked_for_devices() -> bool:
     """Return whether JAX has, after which it ignores the GPU variables. It has no public function for this."""
-    from jax._src import xla_bridge  # here, so that a CPU never needs the private module
+    from jax._src import xla_bridge
 
     return xla_bridge.backends_are_initialized()
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from csac.processes import move_to, usable_cores
 from csac.record.run import RunDirectory
 from csac.seeds import name_seeds
 from csac.tasks.preflight import seed_globals
-from csac.training.devices import choose_device
+from csac.training.devices import choose_device, threads_in_use
 from csac.training.loop import Loop
 from csac.training.provenance import provenance
 from csac.training.resume import continuation, roll_back
@@ -40,7 +38,7 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
         choose_device(runs[0].config.device)
         seed_globals(runs[0].seed)
         points = roll_back(runs)
-        current = provenance(program.task, program.command, program.threads)
+        current = provenance(program.task, program.command, threads_in_use())
         current["program"] = tuple(run.seed for run in runs)
         for run, point in zip(runs, points, strict=True):
             _note_begin(run, point, current, watcher)
@@ -74,20 +72,3 @@ def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], 
             run.log(line)
             watcher.note(f"seed {run.seed}: {line}")
     run.update_manifest(**current, state="running", failure="", history=history, steps_done=point.step)
-
-
-def begin_with(threads: int) -> None:
-    """Have XLA divide its work for this many cores, while this process may run on every core.
-
-    XLA sizes its thread pool by the cores that it sees when JAX first looks for devices; later this has no effect.
-    """
-    import jax
-
-    cores = usable_cores()
-    if threads >= len(cores):
-        return
-    move_to(cores[os.getpid() % (len(cores) - threads + 1) :][:threads])
-    try:
-        jax.devices()
-    finally:
-        move_to(cores)

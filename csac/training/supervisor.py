@@ -143,7 +143,8 @@ class _Worker(Child):
 
 def _work(connection: Connection, program: Program) -> None:
     """Train a program; runs in the child process."""
-    from csac.training.running import begin_with, train_program  # JAX
+    from csac.training.devices import begin_with  # JAX
+    from csac.training.running import train_program
 
     begin_with(program.threads)
 

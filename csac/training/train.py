@@ -21,10 +21,10 @@ from csac.tasks.trust import named_task
 from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, make_configs, seed_range
-from csac.training.devices import choose_device
+from csac.training.devices import begin_with, choose_device
 from csac.training.program import Program, choose_groups, memory_needed, programs_of
 from csac.training.resume import Source, fork_options, refuse_differences, refuse_lost
-from csac.training.running import begin_with, train_program
+from csac.training.running import train_program
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.supervisor import supervise
 from csac.training.watch import Watch, draw_curve

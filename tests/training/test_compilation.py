@@ -89,7 +89,7 @@ def test_programs_are_kept_and_change_no_bit(tmp_path):
 def test_each_number_of_cores_has_its_own_programs(tmp_path, choices, monkeypatch):
     folders = set()
     for cores in (1, 2):
-        monkeypatch.setattr(compilation, "usable_cores", lambda cores=cores: list(range(cores)))
+        monkeypatch.setattr(compilation, "threads_in_use", lambda cores=cores: cores)
         compilation.keep_programs()
         folders.add(SETTINGS.jax_compilation_cache_dir)
 
