@@ -169,8 +169,9 @@ def _learnt_weights(run: RunDirectory, steps: int) -> dict[str, float]:
     rows = rows[rows["step"] <= steps]
     learnt = [name for name, value in run.config.hyperparameters.items() if value == "auto"]
     columns = {name: "temperature" if run.config.algorithm == "sac" else name for name in learnt}
-    known = rows.dtype.names or ()
-    return {name: float(rows[column][-1]) for name, column in columns.items() if len(rows) and column in known}
+    values = {name: rows[column] for name, column in columns.items() if column in (rows.dtype.names or ())}
+    known = {name: of[~np.isnan(of)] for name, of in values.items()}  # a callback's rows have no such value
+    return {name: float(of[-1]) for name, of in known.items() if len(of)}
 
 
 def summary(returns: np.ndarray) -> dict[str, Any]:

@@ -139,7 +139,7 @@ class Writer:
         self._shards = {name: facts for name, facts in (known or {}).items() if name.startswith(f"{REPLAY}/")}
 
     def write(self, step: int, saved: Snapshot, memory: Ring, others: Mapping[str, bytes]) -> None:
-        """Write a checkpoint, then remove the files that no kept one needs. Raises OSError."""
+        """Write a checkpoint. Raises OSError."""
         (self.folder / REPLAY).mkdir(parents=True, exist_ok=True)
         oldest = max(memory.added - len(memory.rows), 0)
         self._write_new_rows(memory, oldest)
@@ -156,6 +156,9 @@ class Writer:
         fields = json.loads(json.dumps(fields))  # the checksum covers the fields as they will be read
         contents[LIST] = json.dumps({**fields, "sha256": _checksum(fields)}, indent=1).encode()
         write_folder(self.folder / f"step_{step}", contents)
+
+    def prune(self) -> None:
+        """Remove the files that no kept checkpoint needs."""
         prune(self.folder, self.keep)
 
     def _write_new_rows(self, memory: Ring, oldest: int) -> None:

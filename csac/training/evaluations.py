@@ -66,7 +66,7 @@ class Evaluations:
         self._pending: tuple[int, list[int], list[Policy], Any] | None = None
         self.step = int(runs[0].rows("evaluations")["step"].max(initial=0))  # of the newest evaluation
         self.wants_stop = False  # whether a callback ends the runs, or an evaluation was broken off
-        self.broken_off: int | None = None  # the step of the evaluation that was broken off
+        self.broken_off: list[int] = []  # the steps of evaluations that were broken off, or not begun after one
         self.should_stop: Callable[[], bool] = lambda: False
         self._deadline = 0.0  # of the evaluation in progress, once a stop was requested
         self._missing_events = [] if len(runs[0].evaluations) else sorted(config.events)
@@ -78,15 +78,18 @@ class Evaluations:
 
     def policy(self, network: PolicyNetwork, step: int) -> Policy:
         """Return the policy for deployment that has this network."""
+        return Policy(network, self.contract(network), step=step)
+
+    def contract(self, network: PolicyNetwork) -> Contract:
+        """Return the contract of policies with such a network."""
         names = self.environments.task_name, self._algorithm, network.activation, network.head
-        contract = Contract(*names, *self.environments.contract_parts, critic_activation=network.critic_activation)
-        return Policy(network, contract, step=step)
+        return Contract(*names, *self.environments.contract_parts, critic_activation=network.critic_activation)
 
     def begin(self, step: int, networks: Sequence[PolicyNetwork], task_step: int) -> None:
         """Begin to evaluate each seed's network of `step`, on the task as perturbed after `task_step`."""
         self.finish()
-        if self.broken_off is not None:  # a resume makes this evaluation
-            self.broken_off = step
+        if self.broken_off:  # a resume makes this evaluation
+            self.broken_off.append(step)
             return
         self.step = step
         indices = [i for i in np.flatnonzero(self.environments.alive).tolist() if is_finite(networks[i])]
@@ -104,7 +107,7 @@ class Evaluations:
         try:
             answers = pending.results(self._should_break_off)
         except EvaluationStopped:
-            self.broken_off, self.wants_stop = step, True
+            self.broken_off, self.wants_stop = [step], True
             self.watcher.note_of(
                 self.runs[0], f"the evaluation at step {step:,} is broken off, as a stop was asked for"
             )

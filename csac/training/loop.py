@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from csac.deploy.contract import write_with_checksum
 from csac.record.manifest import written
 from csac.record.recorder import Recorder
 from csac.record.run import MANIFEST, TABLES
@@ -79,6 +80,7 @@ class Loop:
                 program.interests, watcher.call, *recorded, self.learner.metric_names, self._policy
             )
             self.evaluations = Evaluations(program, *recorded, self.environments, watcher, self.notifier, stack)
+            self._register_best()
             self._saved_at, self._saved_time = self.step, time.monotonic()
             self.has_returned = False
             self._resources = stack.pop_all()
@@ -118,7 +120,8 @@ class Loop:
         self._stop_diverged()
         if self.step == self._saved_at:
             return
-        for index in np.flatnonzero(self.environments.alive).tolist():
+        alive = np.flatnonzero(self.environments.alive).tolist()
+        for index in alive:
             run = self.runs[index]
             self.recorders[index].sync()
             saved = self._snapshot(index)
@@ -128,6 +131,8 @@ class Loop:
                 self.watcher.note_of(run, f"seed {run.seed}: {problem}: a resume restarts the episode in progress")
             run.update_manifest(steps_done=self.step, restarts_episode=restarts, last_checkpoint=self.step)
             self._writers[index].write(self.step, saved, self.learner.memory(index, self.step), _tables_and_policy(run))
+        for index in alive:  # once all have this checkpoint: they resume from a common one
+            self._writers[index].prune()
         self._saved_at, self._saved_time = self.step, time.monotonic()
 
     def close(self) -> None:
@@ -158,6 +163,8 @@ class Loop:
             environment = saved.part("environment")
             self.environments.refuse_incompatible(environment, saved.arrays["actions"])
             self._evaluation_pending = self._evaluation_pending or saved.values.get("evaluation_owed", False)
+            for step in saved.values.get("evaluations_lost", []):
+                self._note_inexact(run, f"seed {run.seed}: the evaluation at step {step:,} was broken off")
             learner_snapshots.append(saved.part("learner"))
             self._actions[index] = saved.arrays["actions"]
             # Forked here from a run of another task: its saved episode does not fit (changes read "task is X, not Y").
@@ -182,6 +189,13 @@ class Loop:
         for text in lost:
             self._note_inexact(run, f"warning: {text}")
         self._writers[index] = Writer(run.checkpoints, self.config.keep_checkpoints, {} if lost else checkpoint.files)
+
+    def _register_best(self) -> None:
+        """Put the checksums of best policies into their contracts: a rollback or a fork restores only the files."""
+        fields = self.evaluations.contract(self.learner.network).fields()
+        for best in (run.policy_file("best") for run in self.runs):
+            if best.exists():
+                write_with_checksum(best, best.read_bytes(), fields)
 
     def _advance(self) -> bool:
         """Step each environment once and learn from it; return whether a callback ends the runs."""
@@ -260,8 +274,9 @@ class Loop:
         parts = {"learner": self.learner.save(index), "environment": self.environments.save(index)}
         saved = Snapshot.joined(parts | ({"hindsight": self.hindsight.save(index)} if self.hindsight else {}))
         saved.arrays["actions"] = self._actions[index]
-        if self.evaluations.broken_off == self.step:
-            saved.values["evaluation_owed"] = True
+        broken_off = self.evaluations.broken_off
+        saved.values["evaluation_owed"] = self.step in broken_off
+        saved.values["evaluations_lost"] = [step for step in broken_off if step != self.step]
         return saved
 
     def _policy(self, index: int) -> Policy:

@@ -54,7 +54,7 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
         try:
             loop.run(should_stop)
         finally:
-            is_incomplete = loop.step < loop.steps or loop.evaluations.broken_off is not None
+            is_incomplete = loop.step < loop.steps or bool(loop.evaluations.broken_off)
             stopped = not loop.has_returned or (is_incomplete and should_stop())
             for run in runs:
                 if run.manifest.state == "running":

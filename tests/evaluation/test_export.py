@@ -143,6 +143,7 @@ def test_weights_that_are_learnt_come_with_what_they_had_become(tmp_path):
     run = make_run(tmp_path / "run", hyperparameters={"entropy_weight": "auto", "relative_entropy_weight": 0.5})
     rows = [(0, 100, 0.4), (0, 200, 0.2)]
     run.run(0).append("metrics", [{"seed": seed, "step": step, "entropy_weight": value} for seed, step, value in rows])
+    run.run(0).append("metrics", [{"seed": 0, "step": 200, "score": 1.0}])  # a callback's
     assert provenance(run, run.run(0), load(run, 0), "last")["learnt_weights"] == {"entropy_weight": 0.2}
     assert provenance(run, run.run(0), load(run, 0, "best"), "best")["learnt_weights"] == {"entropy_weight": 0.4}
     card = (export_run(run.path, seed=0, episodes=0, card=True).place / "README.md").read_text()

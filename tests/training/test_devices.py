@@ -15,6 +15,8 @@ import jax
 import pytest
 
 from csac.algorithms import SAC
+from csac.processes import cores_to_use
+from csac.record.run import RunDirectory
 from csac.training import devices
 from csac.training import provenance as provenance_module
 from csac.training.devices import choose_device, in_use, preallocates
@@ -168,6 +170,16 @@ def test_other_numbers_than_csac_s_are_refused_before_a_run_begins(tmp_path, nam
         assert not (tmp_path / "run").exists()
     finally:
         config.update(name, before)
+
+
+@pytest.mark.slow
+def test_a_seed_that_is_resumed_alone_has_the_threads_that_it_began_with(tmp_path):
+    """Two seeds train with half of the cores each; of these depend the last bits."""
+    small = "--actor-hidden-sizes 8 --critic-hidden-sizes 8 --batch-size 8 --warmup-steps 20 --evaluation-interval 50"
+    for line in (f"train Pendulum-v1 --seeds 2 --steps 50 {small} --directory runs", "resume runs/seed-0 --steps 100"):
+        subprocess.run([sys.executable, "-m", "csac", *line.split()], cwd=tmp_path, check=True)
+    before, after = (RunDirectory.open(tmp_path / "runs" / f"seed-{seed}").manifest.machine for seed in (1, 0))
+    assert after.cores == before.cores == max(1, cores_to_use() // 2)
 
 
 FIRST_THE_GPU = """

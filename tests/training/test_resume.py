@@ -22,7 +22,7 @@ from csac.record.config import EVALUATION_SEED
 from csac.record.run import RunDirectory
 from csac.record.sets import find_sets
 from csac.training import evaluations
-from csac.training.checkpoint import newest_sound, steps_in
+from csac.training.checkpoint import Writer, newest_sound, steps_in
 from csac.training.signals import Interrupted
 
 CHANGES = ("friction=1.5@150", "action_noise=0.05@210", "observation_noise=0.01@330")
@@ -148,6 +148,46 @@ def test_an_interrupt_breaks_off_a_long_evaluation_and_the_resume_repeats_it(tmp
         stopped = RunDirectory.open(tmp_path / "run" / "seed-0")
         assert (stopped.manifest.steps_done, stopped.evaluations["step"].max()) == (step, step - 100)
     assert contents(run(tmp_path / "run", resume=True).runs[0]) == whole
+
+
+def test_an_evaluation_that_cannot_be_repeated_makes_a_resume_inexact(tmp_path, monkeypatch):
+    """In the training environment an evaluation comes after its step, once the episode has ended."""
+    reset, begun = HopperEnv.reset, []
+
+    def interrupting(self, *, seed=None, options=None):
+        begun.extend([seed] * (seed == EVALUATION_SEED))
+        if seed == EVALUATION_SEED and len(begun) == 1:
+            signal.raise_signal(signal.SIGINT)
+        return reset(self, seed=seed, options=options)
+
+    monkeypatch.setattr(evaluations, "SECONDS_TO_FINISH", 0.0)
+    monkeypatch.setattr(HopperEnv, "reset", interrupting)
+    with pytest.raises(Interrupted):
+        run(tmp_path / "run", evaluation_environments=0, steps=300)
+    entry = run(tmp_path / "run", evaluation_environments=0, steps=300, resume=True).runs[0].manifest.history[-1]
+    assert (entry.exact, "step 100 was broken off" in entry.notes[-1]) == (False, True)
+
+
+def test_the_best_policy_of_a_fork_that_is_not_better_can_be_loaded(tmp_path, stopped):
+    run(tmp_path / "fork", start_from=f"{stopped.path}@240", steps=245, evaluation_interval=0)
+    assert csac.load(tmp_path / "fork", which="best").step in (100, 200)
+
+
+def test_a_kill_between_the_checkpoints_of_two_seeds_leaves_them_a_common_one(tmp_path, monkeypatch):
+    together: dict[str, Any] = {"steps": 150, "seeds": 2, "seeds_per_process": 2, "keep_checkpoints": 1}
+    write = Writer.write
+
+    def dying(self, step, *rest):
+        if step == 100 and "seed-1" in str(self.folder):
+            raise Crash
+        write(self, step, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Writer, "write", dying)
+        with pytest.raises(Crash):
+            run(tmp_path / "set", checkpoint_interval=50, **together)
+    resumed = run(tmp_path / "set", checkpoint_interval=50, resume=True, **together)
+    assert [one.manifest.history[-1].step for one in resumed.runs] == [50, 50]
 
 
 def sized(observations: int, actions: int) -> type[Probe]:
