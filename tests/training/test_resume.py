@@ -286,7 +286,7 @@ def test_a_smaller_memory_misses_no_older_transitions(stopped):
     (_, last), width = checkpoint.transitions, checkpoint.state().arrays["learner.waiting"].shape[-1]
     whole, small = np.zeros((last, width), np.float32), np.zeros((20, width), np.float32)
     assert checkpoint.fill(whole) == []
-    damage(min(stopped.checkpoints.glob("replay/0-*.safetensors")), "missing")
+    damage(min(stopped.checkpoints.glob("replay/120-*.safetensors")), "missing")
     assert checkpoint.fill(small) == []
     np.testing.assert_array_equal(small[np.arange(last - 20, last) % 20], whole[-20:])
 
