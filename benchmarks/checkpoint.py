@@ -31,7 +31,7 @@ Files: TypeAlias = dict[Path, int]  # bytes by file
 def measure(_: str, options: Options) -> list[Row]:
     """Train until the last checkpoint in HELD is written, and return a row for each of them."""
     interval, held = (2_000, HELD[:2]) if options.quick else (50_000, HELD)
-    words = f"--warmup-steps 10000000 --steps 10000001 --checkpoint-interval {interval}".split()
+    words = f"--warmup-steps 10000000 --steps 10000001 --checkpoint-interval {interval} --evaluation-interval 0".split()
     launch, seen = Launch([*csac_command("csac"), *words], usable_cores()), {}
     with tempfile.TemporaryDirectory() as written:
         told = {stamps.FOLDER: written, stamps.EVERY: str(EVERY), "XDG_STATE_HOME": written}

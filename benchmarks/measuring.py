@@ -114,11 +114,11 @@ def call_command(function: str, **arguments: Any) -> list[str]:
     return [sys.executable, "-m", "benchmarks.call", function, json.dumps(arguments)]
 
 
-def time_command(command: Sequence[str], **variables: str) -> float:
-    """Return the seconds from launch to exit, on all cores. Raises ProcessFailure like `answers`."""
+def time_command(command: Sequence[str], code: int = 0, **variables: str) -> float:
+    """Return the seconds from launch to exit with `code`, on all cores. Raises ProcessFailure like `answers`."""
     began = time.monotonic()
     with started([Launch(command, usable_cores())], surroundings(**variables)) as (folder, (process,)):
-        if process.wait():
+        if process.wait() != code:
             raise failure(folder, process)
         return time.monotonic() - began
 

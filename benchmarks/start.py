@@ -25,13 +25,14 @@ class Start(NamedTuple):
     name: str
     arguments: tuple[str, ...] = ()
     seeds: int = 0
+    code: int = 0
 
 
 STARTS = [
     Start("`csac --help`", ("--help",)),
     Start("`csac evaluate --help`", ("evaluate", "--help")),
     Start("`csac train --help`", ("train", "--help")),
-    Start("a mistake in `csac train`", ("train", TASK, "--stepz", "3")),
+    Start("a mistake in `csac train`", ("train", TASK, "--stepz", "3"), code=2),
     Start("first update, 1 seed", seeds=1),
     Start("first update, 5 seeds", seeds=5),
 ]
@@ -42,7 +43,7 @@ def measure(start: Start, options: Options) -> list[Row]:
     with tempfile.TemporaryDirectory() as cache:
         if start.arguments:
             command = [sys.executable, "-m", "csac", *start.arguments]
-            return [{"what": start.name, "seconds": time_command(command, XDG_CACHE_HOME=cache)}]
+            return [{"what": start.name, "seconds": time_command(command, start.code, XDG_CACHE_HOME=cache)}]
         return [
             {"what": f"{start.name}, {kept}", "seconds": first_update(start.seeds, cache)}
             for kept in ("nothing kept", "programs kept")

@@ -16,6 +16,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from csac.record.run import RunDirectory
     from csac.record.sets import RunSet
 
 
@@ -74,7 +75,7 @@ def _run_training(training: Callable[..., RunSet], *arguments: Any, **options: A
 def _evaluate(options: Evaluate, _: str) -> int:
     from csac.console import tables
     from csac.console.waiting import progress_shown
-    from csac.deploy.choosing import load
+    from csac.deploy.choosing import has_policy, load_run
     from csac.evaluation.play import evaluate_run, perturbation_notes
     from csac.record.sets import RunSet
     from csac.record.tables import COLUMNS, check_new, write_rows
@@ -85,6 +86,9 @@ def _evaluate(options: Evaluate, _: str) -> int:
     notes = perturbation_notes(options.directory, options.perturbations)
     if file:
         check_new(file)
+    which: Any = options.which
+    policies = {run.seed: load_run(run, which) for run in runs.runs if has_policy(run, which)}  # a run may go on
+    steps = {run.seed: policies[run.seed].step or run.manifest.steps_done for run in runs.runs if run.seed in policies}
     with progress_shown(console, "evaluating", "episodes") as on_progress:
         results = dict(evaluate_run(**arguments, deterministic=deterministic, on_progress=on_progress))
     tables.print_lines(console, notes)
@@ -93,14 +97,15 @@ def _evaluate(options: Evaluate, _: str) -> int:
     failed = {seed: reason for seed, reason in runs.failures.items() if seed in results}
     notes = [f"seed {seed} failed at {reason}; it is in no mean, and in no file" for seed, reason in failed.items()]
     sound = [run for run in runs.runs if run.seed in results and run.seed not in failed]
+    for run in (run for run in runs.runs if run.seed in results):
+        notes += _untrained_notes(run, steps[run.seed])
     untested = [str(seed) for seed in runs.seeds if seed not in results and options.seed is None]
     notes += [f"without such a policy yet: seed {', '.join(untested)}"] * bool(untested)
-    tables.print_lines(console, [f"note: {text}" for text in notes + _untrained_notes(runs)])
+    tables.print_lines(console, [f"note: {text}" for text in dict.fromkeys(notes)])
     if file:
         rows = []
         for run in sound:
-            step = load(run.path, which=options.which).step or run.manifest.steps_done
-            rows += [episode.row(run.seed, step) for episode in results[run.seed]]
+            rows += [episode.row(run.seed, steps[run.seed]) for episode in results[run.seed]]
         if not rows:
             return complain(f"{file} is not written: every seed that was tested had failed in training", 1)
         write_rows(target, COLUMNS["evaluations"], rows)
@@ -134,18 +139,18 @@ def _export(options: Export, _: str) -> int:
     with console.status("exporting") if console.is_interactive else nullcontext():
         exported = export_run(**vars(options))
     print_lines(console, [str(exported.place), *export_lines(exported.fields["verification"])])
-    notes = exported.notes + _untrained_notes(runs)
+    facts = exported.fields["provenance"]
+    notes = exported.notes + _untrained_notes(runs.run(facts["seed"]), facts["steps"])
     print_lines(console, [f"note: {text}" for text in notes])
     return 0
 
 
-def _untrained_notes(runs: RunSet) -> list[str]:
-    """Return a note if the policies are untrained because their runs were stopped during the warm-up."""
-    manifest = runs.runs[0].manifest
-    warmup = manifest.config.hyperparameters.get("warmup_steps", 0)
-    if manifest.steps_done >= warmup or manifest.forked_from:
+def _untrained_notes(run: RunDirectory, step: int) -> list[str]:
+    """Return a note if a run's policy of this step is of the warm-up, and so untrained."""
+    warmup = run.config.hyperparameters.get("warmup_steps", 0)
+    if step >= warmup or run.manifest.forked_from:
         return []
-    return [f"this policy has never learnt: {manifest.steps_done:,} of {warmup:,} warm-up steps are done"]
+    return [f"this policy has never learnt: {step:,} of {warmup:,} warm-up steps are done"]
 
 
 def _latency(options: Latency, _: str) -> int:

@@ -44,7 +44,7 @@ def load(directory: str | os.PathLike[str], seed: int | None = None, which: Whic
         if isinstance(fields, dict) and fields.get("guards", {}).get("fallback") is not None:
             raise InputError(f"{folder} is an artefact with guards: csac.deploy.artefact.open_artefact keeps them")
         return Policy.load(folder / POLICY)
-    return load_run(choose_run(RunSet.open(directory), seed), which)
+    return load_run(choose_run(RunSet.open(directory), seed, which), which)
 
 
 class TrainedRuns(RunSet):
@@ -67,13 +67,13 @@ def has_policy(run: RunDirectory, which: Which) -> bool:
     return run.policy_file(which).exists()
 
 
-def choose_run(runs: RunSet, seed: int | None = None) -> RunDirectory:
+def choose_run(runs: RunSet, seed: int | None = None, which: Which = "last") -> RunDirectory:
     """Return the run whose policy `load` returns. Raises InputError as `load` does."""
     if seed is not None:
         if isinstance(seed, bool) or not isinstance(seed, Integral):
             raise InputError(f"seed must be a seed's label, a whole number, not {seed!r:.40}")
         return runs.run(int(seed))
-    candidates = [run for run in runs.runs if run.manifest.state != "failed" and has_policy(run, "last")]
+    candidates = [run for run in runs.runs if run.manifest.state != "failed" and has_policy(run, which)]
     if not candidates and runs.failures:
         failed, reason = next(iter(runs.failures.items()))
         raise InputError(f"every seed of {runs.path} failed (seed {failed} at {reason}): train again, or give a seed")

@@ -121,10 +121,13 @@ class Evaluator:
         observation_size, action_size = policy.contract.spec[:2]
         observations = np.zeros((EPISODES_AT_ONCE, observation_size), np.float32)
         noise = None if deterministic else np.zeros((EPISODES_AT_ONCE, action_size), np.float32)
-        running = list(enumerate(episodes))
+        rows = [number % EPISODES_AT_ONCE for number in numbers]  # the last bits depend on an observation's row
+        running = list(zip(rows, episodes, strict=True))
         try:
             with globals_seeded(self._first_seed + first):
-                self._ignores_seed = start(episodes, observations[: len(episodes)], self._ignores_seed)
+                first_observations = observations[: len(episodes)].copy()
+                self._ignores_seed = start(episodes, first_observations, self._ignores_seed)
+                observations[rows] = first_observations
                 while running:
                     if should_stop and should_stop():
                         raise EvaluationStopped

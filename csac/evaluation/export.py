@@ -77,7 +77,7 @@ def export_run(
     if episodes < 0:
         raise InputError(f"--episodes {episodes}: give 0 or more")
     runs = RunSet.open(directory)
-    run = choose_run(runs, seed)
+    run = choose_run(runs, seed, which)
     policy = load_run(run, which)
     guards = make_guards(policy.contract, fallback, rate_limit)
     facts: dict[str, Any] = {"provenance": provenance(runs, run, policy, which)}

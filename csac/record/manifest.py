@@ -38,6 +38,8 @@ class Origin:
     directory: str
     step: int
     changes: tuple[str, ...] = ()
+    task_since: int = 0
+    """The step of the last fork, this one or an earlier one, that changed the task or its arguments."""
 
     def changed(self, *names: str) -> bool:
         """Return whether one of these settings was changed."""

@@ -151,7 +151,7 @@ def _dress(axes: Axes, curves: Sequence[Curve], marks: Sequence[tuple[int, str]]
         axes.text(0.5, 0.5, "no evaluations yet", transform=axes.transAxes, ha="center", color="#777777")
         return
     axes.set_xlim(0, 1.015 * max(float(curve.steps.max()) for curve in curves) or 1.0)
-    for step, text in marks:
+    for step, text in [mark for mark in marks if mark[0] <= axes.get_xlim()[1]]:
         axes.axvline(step, color="#555555", linewidth=1, linestyle=(0, (4, 3)))
         axes.annotate(text, (step, 1), (4, -4), ("data", "axes fraction"), "offset points", va="top", fontsize=9)
 

@@ -175,9 +175,7 @@ class RunDirectory:
     def evaluations(self) -> np.ndarray:
         """The rows of evaluations.csv, one per evaluation episode; of a fork to another task those on it alone."""
         rows, origin = self.rows("evaluations"), self.manifest.forked_from
-        if origin and origin.changed("task ", "environment_arguments"):
-            rows = rows[rows["step"] > origin.step]
-        return rows
+        return rows[rows["step"] > origin.task_since] if origin else rows
 
     def log(self, line: str) -> None:
         """Append a line to log.txt, with a timestamp."""

@@ -54,7 +54,8 @@ class RunSet:
         if is_run(path):
             return cls(path, [RunDirectory.open(path)])
         below = [folder for folder in path.glob("seed-*") if is_run(folder)]
-        runs = sorted(map(RunDirectory.open, below), key=lambda run: run.seed)
+        runs = [run for run in map(RunDirectory.open, below) if run.path == run_path(path, run.seed)]  # no backup
+        runs.sort(key=lambda run: run.seed)
         if not runs:
             RunDirectory.open(path)  # raises InputError that says what is there instead
         return cls(path, runs)

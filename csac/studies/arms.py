@@ -19,7 +19,7 @@ from csac.algorithms import ALGORITHMS
 from csac.presets import PRESETS, hyperparameters
 from csac.record.config import RunConfig
 from csac.record.run import RunDirectory, is_run
-from csac.record.sets import RunSet, find_sets
+from csac.record.sets import RunSet, find_sets, run_path
 from csac.record.statistics import evaluation_matrix, maximum_average_return
 from csac.record.tables import joined
 from csac.tasks.perturbations import by_step, perturbations_of
@@ -66,7 +66,13 @@ class Arm:
     def incomplete(self) -> dict[int, int]:
         """The last evaluated step of each seed that is behind or has not started; such a seed is in no statistic."""
         ends = {seed: int(rows["step"].max(initial=0)) for seed, rows in self._sound.items()}
-        behind = {seed: step for seed, step in ends.items() if step < max(ends.values()) or not step}
+        ended_early = {
+            run.seed
+            for run in self.runs
+            if run.manifest.state == "finished" and run.manifest.steps_done < run.config.steps
+        }
+        longest = max(ends.values(), default=0)
+        behind = {seed: end for seed, end in ends.items() if not end or (end < longest and seed not in ended_early)}
         return behind | dict.fromkeys(self.missing, 0)
 
     @functools.cached_property
@@ -127,12 +133,14 @@ def read_arms(
                 continue
             seen.add(run.path)
             config = run.config
-            alike = json.dumps([config.algorithm, settings(config)], sort_keys=True)
+            origin = run.manifest.forked_from
+            fork = [origin.step, origin.changes] if origin and origin.changes else []
+            alike = json.dumps([config.algorithm, settings(config), fork], sort_keys=True)
             key = label, alike * (not label), config.task, config.perturbations
             folders = found.setdefault(key, {})
             if label and run.seed in [other.seed for runs in folders.values() for other in runs]:
                 raise InputError(f"{label}: {run.path} is a second run of seed {run.seed}; label them apart")
-            folders.setdefault(run.path.parent, []).append(run)
+            folders.setdefault(_set_of(run), []).append(run)
     arms: list[Arm] = []
     for (label, _, task, perturbations), folders in found.items():
         together = [run for runs in folders.values() for run in runs]
@@ -142,6 +150,11 @@ def read_arms(
     for arm, label in zip(arms, labels(arms), strict=True):
         arm.label = label
     return arms
+
+
+def _set_of(run: RunDirectory) -> Path:
+    """Return the folder of a run's set; of a run alone, its own."""
+    return run.path.parent if run.path == run_path(run.path.parent, run.seed) else run.path
 
 
 def _runs(path: Path, on_damaged: Callable[[InputError], None] | None) -> list[RunDirectory]:
@@ -171,7 +184,7 @@ def labels(arms: Sequence[Arm]) -> list[str]:
     ]
     keys = [(label, arm.place) for arm, label in zip(arms, full, strict=True)]
     return [
-        f"{label}, {arm.runs[0].path.parent}" if keys.count((label, arm.place)) > 1 else label
+        f"{label}, {_set_of(arm.runs[0])}" if keys.count((label, arm.place)) > 1 else label
         for arm, label in zip(arms, full, strict=True)
     ]
 
@@ -216,7 +229,7 @@ def train_command(config: RunConfig, seeds: Sequence[int]) -> str:
     words = ["csac", "train", config.task, "--algorithm", config.algorithm, "--steps", str(config.steps)]
     words += ["--seeds", str(seeds[-1] - seeds[0] + 1), *(["--first-seed", str(seeds[0])] if seeds[0] else [])]
     default = RunConfig(task=config.task)
-    evaluated = ("evaluation_interval", "evaluation_episodes", "evaluation_environments", "evaluation_seed")
+    evaluated = ("evaluation_interval", "evaluation_episodes", "evaluation_environments")
     for name in ("environments", *evaluated, "device", "hindsight"):
         words += option(name, getattr(config, name)) if getattr(config, name) != getattr(default, name) else []
     words += [word for change in config.perturbations for word in ("--perturb", change)]

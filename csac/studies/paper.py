@@ -119,7 +119,7 @@ def claims(arms: Sequence[Arm]) -> list[Claim]:
 
 def _is_whole(arm: Arm) -> bool:
     changes = [step for step, _ in arm.marks]
-    return arm.config.steps >= STEPS[arm.task] and all(step == FRICTION_STEP for step in changes)
+    return arm.rows["step"].max(initial=0) >= STEPS[arm.task] and all(step == FRICTION_STEP for step in changes)
 
 
 def _compared(arm: Arm, other: Arm, beside: Sequence[Arm]) -> Iterator[Claim]:
@@ -153,7 +153,7 @@ def weight(arm: Arm, other: Arm) -> Iterator[Claim]:
     """Yield the claim that the paper's best weight gives a higher maximum average return than each other weight."""
     first, second = (one.config.hyperparameters for one in (arm, other))
     apart = [name for name in first if first[name] != second.get(name)]
-    if apart == ["relative_entropy_weight"] and first[apart[0]] == BEST_TAU:
+    if arm.task == WALKER and apart == ["relative_entropy_weight"] and first[apart[0]] == BEST_TAU:
         yield Claim("a higher maximum average return", arm, other, arm.best()[0], other.best()[0])
 
 
@@ -165,7 +165,9 @@ def efficiency(arm: Arm, other: Arm, arms: Sequence[Arm]) -> Iterator[Claim]:
     published = INTERACTIONS.get(arm.task)
     if published and published["CSAC"] < published[other.published or ""]:
         boundary, is_the_papers = lower_boundary(arms), not _has_ppo(arms)
-        ours, others = -interactions(arm, boundary), -interactions(other, boundary)
+        until = min(int(one.rows["step"].max()) for one in (arm, other))  # one may not be finished
+        steps = (interactions(one, boundary) for one in (arm, other))
+        ours, others = (-np.where(own <= until, own, np.inf) for own in steps)
         yield Claim("fewer steps to the lower boundary", arm, other, ours, others, not is_the_papers)
 
 
@@ -187,7 +189,8 @@ def success(arm: Arm, other: Arm) -> Iterator[Claim]:
 
 def robustness(arm: Arm, other: Arm) -> Iterator[Claim]:
     """Yield the claims against SAC on HalfCheetah with increased friction: less loss, faster recovery, a higher end."""
-    if arm.task != CHEETAH or other.published != "SAC":
+    is_the_papers = arm.task == CHEETAH and all(change.startswith("friction=") for change in arm.condition)
+    if not is_the_papers or other.published != "SAC":
         return
     ours, others = (list(recovery(one.rows, one.marks[0][0]).values()) for one in (arm, other))
     for text, name, sign in (

@@ -17,6 +17,7 @@ from csac.record.plots import encoded, figure_of, looks_of
 from csac.record.rendering import EMPTY, Cell, Row, Table, markdown, number, numeric
 from csac.record.statistics import drawdown, evaluation_matrix, is_case, last_evaluations
 from csac.record.summaries import last_rows, over_seeds, recoveries
+from csac.seeds import EVALUATION_SEED
 from csac.studies import paper
 from csac.studies.arms import by_place, differing, plain, seconds_per_step, settings, train_command
 from csac.types import InputError
@@ -71,7 +72,8 @@ def report_of(arms: Sequence[Arm], commands: Sequence[str], analyses: Sequence[s
 def write(path: Path, title: str, parts: Sequence[Part]) -> None:
     """Write a report to `path`, an .html or .md file. Raises InputError for another kind, or if writing fails."""
     if path.suffix not in (".html", ".md"):
-        raise InputError(f"a report is an .html or an .md file: name it {path.with_suffix('.html')}")
+        name = path / "report.html" if path.is_dir() else path.with_suffix(".html")
+        raise InputError(f"a report is an .html or an .md file: name it {name}")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         content = _html(title, parts) if path.suffix == ".html" else _markdown(path, title, parts)
@@ -303,7 +305,8 @@ def provenance(arms: Sequence[Arm], commands: Sequence[str]) -> Iterator[Part]:
     runs = [run for arm in arms for run in arm.runs]
     if runs:
         manifests = [run.manifest for run in runs]
-        paces = [(seconds_per_step(run), run.manifest.steps_done) for run in runs]
+        begun = [run.manifest.forked_from.step if run.manifest.forked_from else 0 for run in runs]
+        paces = [(seconds_per_step(run), run.manifest.steps_done - at) for run, at in zip(runs, begun, strict=True)]
         times = [pace * steps for pace, steps in paces if pace]
         versions = {f"{name} {version}" for one in manifests for name, version in one.versions.items()}
         yield Heading("Where the numbers come from")
@@ -323,6 +326,7 @@ def provenance(arms: Sequence[Arm], commands: Sequence[str]) -> Iterator[Part]:
 def _command_of(arm: Arm) -> str | None:
     """Return the command that trains an arm; of what no such command names, the one typed, if any."""
     config, manifest = arm.config, arm.runs[0].manifest
-    if config.task_is_callable or config.demonstrations or manifest.forked_from:
+    is_default = config.evaluation_seed == EVALUATION_SEED  # no option sets another
+    if config.task_is_callable or config.demonstrations or manifest.forked_from or not is_default:
         return manifest.command
     return train_command(config, sorted(run.seed for run in arm.runs))

@@ -58,19 +58,20 @@ def run_study(runs: Sequence[StudyRun], directory: Path, execution: Execution, c
         if is_run(path) and run.config.steps > (existing := RunDirectory.open(path)).config.steps:
             refuse_lost(existing)
     programs = [_program(path, run, execution) for path, run in waiting.items()]
-    with (
-        stop_requested(lambda text: console.print(text)) as request,
-        progress_shown(console, "training", "steps") as show,
-    ):
-        progress = Progress(waiting, console, show)
-        if programs and execution.cluster:
-            execution.cluster.run(programs, progress.of, request.is_set)
-        elif programs:
-            turns = max(1, cores_to_use() // programs[0].threads)
-            supervise(programs, progress.of, request.is_set, execution.workers, turns)
-    if not execution.keep_checkpoints:
-        for path in waiting:
-            if RunDirectory.open(path).manifest.state == "finished":  # the replay buffer takes most of the space
+    try:
+        with (
+            stop_requested(lambda text: console.print(text)) as request,
+            progress_shown(console, "training", "steps") as show,
+        ):
+            progress = Progress(waiting, console, show)
+            if programs and execution.cluster:
+                execution.cluster.run(programs, progress.of, request.is_set)
+            elif programs:
+                turns = max(1, cores_to_use() // programs[0].threads)
+                supervise(programs, progress.of, request.is_set, execution.workers, turns)
+    finally:  # also of a full disk: the replay buffer takes most of the space
+        for path in waiting if not execution.keep_checkpoints else ():
+            if RunDirectory.open(path).manifest.state == "finished":
                 shutil.rmtree(path / "checkpoint", ignore_errors=True)
     return request.received[0] if request.received else None
 

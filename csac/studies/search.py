@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from csac.checks import did_you_mean
 from csac.record.config import RunConfig, as_json
+from csac.seeds import EVALUATION_SEED
 from csac.studies.arms import train_command
 from csac.types import InputError
 
@@ -139,7 +140,9 @@ class Search:
     def command(self, values: Mapping[str, Any]) -> str:
         """Return the command that trains a configuration with seeds that the search has not used."""
         first = 0 if self.config.seed >= REPORT_SEEDS else self.config.seed + self.seeds
-        config = dataclasses.replace(self.config, device="cpu", **self._hyperparameters(values))
+        config = dataclasses.replace(
+            self.config, device="cpu", evaluation_seed=EVALUATION_SEED, **self._hyperparameters(values)
+        )
         return train_command(config, range(first, first + REPORT_SEEDS))
 
     def _hyperparameters(self, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -177,9 +177,15 @@ def _run(
         return is_pruned or bool(runs.failures)
 
     try:
+        algorithm = dataclasses.replace(search.algorithm, **values)  # pyright: ignore[reportArgumentType]
+    except InputError as error:  # values that do not go together
+        study.tell(trial, state=TrialState.PRUNED)
+        console.print(f"{label}: {error}", soft_wrap=True)
+        return
+    try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # failed seeds are reported below
             runs = train(
-                dataclasses.replace(search.algorithm, **values),  # pyright: ignore[reportArgumentType]
+                algorithm,
                 search.config.task,
                 seeds=search.seeds,
                 first_seed=search.config.seed,
@@ -197,11 +203,13 @@ def _run(
     except InputError:
         study.tell(trial, state=TrialState.FAIL)
         raise
-    if is_pruned or runs.failures:
+    scores = list(last_evaluations(runs.evaluations).values())
+    if is_pruned or runs.failures or len(scores) < search.seeds:
         study.tell(trial, state=TrialState.PRUNED)
-        console.print(f"{label}: {'; '.join(runs.failures.values()) or 'pruned'}", soft_wrap=True)
+        reason = "pruned" if is_pruned else "a seed has no evaluation (see its log.txt)"
+        console.print(f"{label}: {'; '.join(runs.failures.values()) or reason}", soft_wrap=True)
     else:
-        score = float(np.mean(list(last_evaluations(runs.evaluations).values())))
+        score = float(np.mean(scores))
         study.tell(trial, score)
         console.print(f"{label}: {number(score)}, best {number(study.best_value)}")
     for run in runs.runs:  # the trial is over, and the replay buffer takes most of the space

@@ -102,7 +102,7 @@ def _of_file(path: Path) -> dict[str, Any]:
             return {name: file[name] for name in file.files}
     except OSError as error:
         raise InputError(f"demonstrations: cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, AttributeError, EOFError, zipfile.BadZipFile):
+    except (ValueError, AttributeError, TypeError, EOFError, zipfile.BadZipFile):
         raise InputError(f"demonstrations: {path} is no .npz file of arrays of numbers") from None
 
 

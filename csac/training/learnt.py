@@ -75,11 +75,16 @@ class Learnt:
         Observations are as the task gives them, actions on the environment's scale.
 
         Raises:
-            InputError: the algorithm has no critics Q(s, a).
+            InputError: the algorithm has no critics Q(s, a), or the actions have another size.
         """
         critics, statistics = self._critics()
         flat = np.atleast_2d(self._contract.flatten(observations))
-        inner = self._contract.bounds.unscale(np.asarray(actions, np.float32).reshape(len(flat), -1))
+        given, size = np.asarray(actions, np.float32), self._contract.spec.action_size
+        if given.size != len(flat) * size:
+            raise InputError(
+                f"actions has shape {given.shape}: give {size} numbers for each of {len(flat)} observations"
+            )
+        inner = self._contract.bounds.unscale(given.reshape(len(flat), size))
 
         def of_one(observation: jax.Array, action: jax.Array) -> list[jax.Array]:
             return [q_value(critic, normalise(statistics, observation), action) for critic in critics]

@@ -76,6 +76,12 @@ def refuse_differences(run: RunDirectory, wanted: RunConfig, has_schedule: bool)
         raise InputError(f"{run.path} cannot go beyond {before.steps:,} steps: {reason}")
 
 
+def refuse_mixed(config: RunConfig, runs: Sequence[RunDirectory]) -> None:
+    """Raise InputError if a set's runs differ from this configuration in more than seeds and steps."""
+    for run in runs:
+        refuse_differences(run, replace(config, seed=run.seed, steps=run.config.steps), has_schedule=False)
+
+
 def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
     """Roll the runs of a program back to their newest common sound checkpoint, or to their beginning.
 
@@ -256,7 +262,9 @@ class Source(NamedTuple):
         """Return the manifest of a new run, with its origin."""
         before = self.runs[manifest.config.seed]
         changes = tuple(differences(_fixed(before.config), _fixed(manifest.config)))
-        origin = Origin(str(before.path), self.step, changes)
+        earlier, origin = before.manifest.forked_from, Origin(str(before.path), self.step, changes)
+        is_other = origin.changed("task ", "environment_arguments")
+        origin = replace(origin, task_since=self.step if is_other else earlier.task_since if earlier else 0)
         restarts = before.manifest.restarts_episode or origin.changed("task ")
         return replace(manifest, forked_from=origin, restarts_episode=restarts)
 

@@ -23,7 +23,7 @@ from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, make_configs, seed_range
 from csac.training.devices import begin_with, choose_device
 from csac.training.program import Program, choose_groups, memory_needed, programs_of
-from csac.training.resume import Source, fork_options, refuse_differences, refuse_lost
+from csac.training.resume import Source, fork_options, refuse_differences, refuse_lost, refuse_mixed
 from csac.training.running import train_program
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.supervisor import supervise
@@ -170,6 +170,7 @@ def resume(
     runs = TrainedRuns.open(directory)
     config = runs.config
     named_task(config, runs.path, trust_task, "call csac.train with it and resume=True")
+    refuse_mixed(config, runs.runs)
     watch = Watch(progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
@@ -236,6 +237,7 @@ def _existing_runs(
     if source:
         for config in configs:
             source.refuse_incompatible(config, has_schedule)
+    refuse_mixed(configs[0], [RunDirectory.open(path) for path in sorted(place.glob("seed-*")) if is_run(path)])
     return existing
 
 

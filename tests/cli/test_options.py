@@ -148,7 +148,8 @@ def test_play_passes_its_options_on(monkeypatch):
 def test_export_passes_its_options_on(monkeypatch):
     make_runs("runs")
     verification = {"observations": 0, "largest_difference": 0.0}
-    exported = exporting.Exported(Path("there"), {"verification": verification}, [])
+    fields = {"verification": verification, "provenance": {"seed": 0, "steps": 10_000}}
+    exported = exporting.Exported(Path("there"), fields, [])
     calls = calls_of(monkeypatch, exporting, "export_run", exported)
     line = "export runs --seed 1 --checkpoint best --format onnx --out there --fallback middle --rate-limit 0.1"
     assert csac(f"{line} --episodes 4 --card --trust-task") == csac("export runs") == 0
