@@ -49,6 +49,12 @@ def test_a_seed_that_was_never_evaluated_has_no_best_policy(tmp_path):
         load(tmp_path / "run", seed=1, which="best")
 
 
+def test_the_best_policy_needs_no_last_one(tmp_path):
+    save_run(tmp_path / "run", seeds=(0,))
+    RunSet.open(tmp_path / "run").run(0).policy_file("last").unlink()
+    assert same(load(tmp_path / "run", which="best"), random_policy(contract(), 100))
+
+
 def test_a_run_of_a_set_is_loaded_by_its_folder(tmp_path):
     policies = save_run(tmp_path / "run")
     assert same(load(tmp_path / "run" / "seed-1"), policies[1])

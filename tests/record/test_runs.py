@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 
 import numpy as np
 import pytest
@@ -147,6 +148,12 @@ def test_a_set_has_the_rows_of_its_runs_and_leaves_out_those_that_failed(tmp_pat
     assert os.fspath(runs) == str(tmp_path / "set")
     with pytest.raises(InputError, match="no seed 2"):
         runs.run(2)
+
+
+def test_a_copy_of_a_seed_is_none_of_the_set(tmp_path):
+    make_set(tmp_path / "set", (0, 1))
+    shutil.copytree(tmp_path / "set" / "seed-0", tmp_path / "set" / "seed-0.bak")
+    assert [run.path.name for run in RunSet.open(tmp_path / "set").runs] == ["seed-0", "seed-1"]
 
 
 def test_runs_with_other_columns_share_those_that_all_have(tmp_path):

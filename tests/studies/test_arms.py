@@ -9,6 +9,7 @@ from csac.algorithms import ALGORITHMS
 from csac.cli import main
 from csac.presets import hyperparameters
 from csac.record.config import RunConfig
+from csac.record.manifest import Origin
 from csac.studies.arms import gather, name_of, read_arms, seconds_per_step, train_command
 from csac.types import InputError
 
@@ -98,6 +99,20 @@ def test_what_failed_or_is_behind_is_in_no_number(tmp_path):
     assert (arm.failures, arm.incomplete) == ({1: "step 5: reward is not finite"}, {2: 400})
     (early,) = read_arms([tmp_path], until=400)
     assert set(early.rows["seed"]) == {0, 2}
+
+
+def test_seeds_that_a_callback_ended_early_count(tmp_path):
+    write_run(tmp_path / "seed-0", config(seed=0))
+    write_run(tmp_path / "seed-1", config(seed=1), points=4)
+    (arm,) = read_arms([tmp_path])
+    assert (set(arm.rows["seed"]), arm.incomplete) == ({0, 1}, {})
+
+
+def test_forks_are_an_arm_of_their_own(tmp_path):
+    write_run(tmp_path / "a" / "seed-0", config(seed=0))
+    forked = write_run(tmp_path / "b" / "seed-1", config(seed=1))
+    forked.update_manifest(forked_from=Origin("c/seed-1", 900, ("discount is 0.9, not 0.99",)))
+    assert [seeds for *_, seeds in labels(tmp_path)] == [[0], [1]]
 
 
 def test_a_study_knows_its_seeds_that_have_not_begun(tmp_path):

@@ -169,6 +169,9 @@ def test_shortened_runs_and_few_seeds_decide_nothing(tmp_path):
     (claim, *_) = paper.claims(arms_of("mujoco", tmp_path, scale=0.1, tasks=["Ant-v4"]))
     assert claim.verdict()[0] == "not yet decidable"
     assert "shorter" in claim.verdict()[1]
+    whole = arms_of("mujoco", tmp_path / "whole", tasks=["Ant-v4"])
+    unfinished = [replace(arm, until=100_000) if arm.label == "SAC" else arm for arm in whole]
+    assert {one.verdict()[0] for one in paper.claims(unfinished) if one.other.label == "SAC"} == {"not yet decidable"}
     four = claim._replace(ours=claim.ours[:4])
     assert "fewer than five seeds" in four.verdict()[1]
 

@@ -155,6 +155,7 @@ def test_trials_begin_with_what_is_given_and_the_best_is_told(tmp_path, trained,
     assert trials(tmp_path / "tune")[int(np.argmax(discounts))].value == pytest.approx(100 * best)
     told = capsys.readouterr().out
     assert "csac train Pendulum-v1 --algorithm sac --steps 1000 --seeds 5 --evaluation-interval 100" in told
+    assert "--evaluation-seed" not in told  # there is no such option
     assert (tmp_path / "tune" / "history.png").exists()
     assert not list((tmp_path / "tune").glob("trial-*/seed-*/checkpoint"))
     assert len(others) == 3

@@ -178,6 +178,7 @@ def test_what_is_none_of_the_task_is_refused(tmp_path, changes, told):
         ("--demonstrations missing.npz", "demonstrations: cannot read missing.npz: No such file"),
         ("--demonstrations text.npz", "demonstrations: text.npz is no .npz file"),
         ("--demonstrations objects.npz", "demonstrations: objects.npz is no .npz file"),
+        ("--demonstrations one.npz", "demonstrations: one.npz is no .npz file"),
         ("--replay-size 20 --batch-size 8 --demonstrations good.npz", "demonstrations has 30 transitions"),
     ],
 )
@@ -186,6 +187,8 @@ def test_a_bad_file_is_one_line_on_the_command_line(tmp_path, monkeypatch, capsy
     np.savez("good.npz", allow_pickle=False, **arrays())
     np.savez("objects.npz", allow_pickle=True, **arrays() | {"rewards": np.array([None] * 30)})
     (tmp_path / "text.npz").write_text("rewards\n")
+    with open("one.npz", "wb") as file:
+        np.save(file, np.zeros(3))
     assert typed(f"train {TASK} --steps 50 --directory run {options}") == 2
     error = capsys.readouterr().err
     assert (error.count("\n"), told in error) == (1, True), error

@@ -67,6 +67,8 @@ def test_q_values_are_what_the_critics_of_the_state_say(sac):
     expected = np.stack([relu_network(critic.layers, inputs) for critic in learnt.state.critics], axis=1)
     np.testing.assert_allclose(learnt.q_values(observations, actions), expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(learnt.q_values(observations[0], actions[0]), expected[0], rtol=1e-4, atol=1e-5)
+    with pytest.raises(InputError, match="actions has shape"):
+        learnt.q_values(observations, actions[:1])
     policy = csac.load(sac)
     for left, layer in zip(policy.network.parameters.actors[0], learnt.state.actor.layers, strict=True):
         np.testing.assert_array_equal(left.weight, layer.weight)

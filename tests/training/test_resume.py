@@ -317,6 +317,9 @@ def test_a_fork_starts_with_the_checkpoint_and_leaves_its_source_unchanged(tmp_p
 def test_returns_on_the_task_before_are_in_no_number_of_a_fork(tmp_path, made):
     fork = run(tmp_path / "fork", task="Hopper-v5", start_from=f"{made.path}@360").runs[0]
     assert 0 < fork.rows("evaluations")["step"].min() < 360 < fork.evaluations["step"].min()
+    other: dict[str, Any] = {"task": "Hopper-v5", "steps": 600, "start_from": fork.path}
+    again = run(tmp_path / "again", replace(LEARNERS[0], discount=0.9), **other).runs[0]
+    assert again.evaluations["step"].min() == fork.evaluations["step"].min()
 
 
 @pytest.mark.parametrize(

@@ -213,6 +213,8 @@ def test_what_is_there_already_is_not_overwritten(tmp_path):
         run(tmp_path / "set", steps=200)
     assert contents(runs.runs[0]) == before
     assert run(tmp_path / "set", steps=200, first_seed=1).seeds == [1]
+    with pytest.raises(InputError, match="evaluation_episodes"):
+        run(tmp_path / "set", steps=200, first_seed=2, evaluation_episodes=3)  # a set is of one configuration
     assert RunSet.open(tmp_path / "set").seeds == [0, 1]
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").write_text("mine")
