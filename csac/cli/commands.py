@@ -87,8 +87,8 @@ def _evaluate(options: Evaluate, _: str) -> int:
     if file:
         check_new(file)
     which: Any = options.which
-    policies = {run.seed: load_run(run, which) for run in runs.runs if has_policy(run, which)}  # a run may go on
-    steps = {run.seed: policies[run.seed].step or run.manifest.steps_done for run in runs.runs if run.seed in policies}
+    chosen = [run for run in runs.runs if options.seed in (None, run.seed) and has_policy(run, which)]
+    steps = {run.seed: load_run(run, which).step or run.manifest.steps_done for run in chosen}  # a run may go on
     with progress_shown(console, "evaluating", "episodes") as on_progress:
         results = dict(evaluate_run(**arguments, deterministic=deterministic, on_progress=on_progress))
     tables.print_lines(console, notes)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from csac.record.run import RunDirectory
 from csac.seeds import name_seeds
-from csac.tasks.preflight import seed_globals
+from csac.tasks.preflight import globals_seeded
 from csac.training.devices import choose_device, threads_in_use
 from csac.training.loop import Loop
 from csac.training.provenance import provenance
@@ -36,7 +36,7 @@ def train_program(program: Program, watcher: Watcher, should_stop: Callable[[], 
             stack.enter_context(run.locked())
             run.manifest = RunDirectory.open(run.path).manifest  # may have changed before we got the lock
         choose_device(runs[0].config.device)
-        seed_globals(runs[0].seed)
+        stack.enter_context(globals_seeded(runs[0].seed))  # the caller's generators are as before afterwards
         points = roll_back(runs)
         current = provenance(program.task, program.command, threads_in_use())
         current["program"] = tuple(run.seed for run in runs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import random
 import sys
 import types
 import warnings
@@ -204,6 +205,12 @@ def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, options, name):
         run(tmp_path / "set", **{"steps": 200, **options})
     assert "\n" not in str(error.value)
     assert not (tmp_path / "set").exists()
+
+
+def test_the_callers_generators_are_as_before(tmp_path):
+    before = random.getstate(), repr(np.random.get_state())
+    run(tmp_path / "set", steps=30)
+    assert (random.getstate(), repr(np.random.get_state())) == before
 
 
 def test_what_is_there_already_is_not_overwritten(tmp_path):
