@@ -22,6 +22,10 @@ class EvaluationFailure(Failure):
     """An evaluation environment raised or returned a non-finite value. The one-line message names the episode."""
 
 
+class NotMade(EvaluationFailure):
+    """The task cannot be made in this process: a script registers it under its main guard, or it is gone."""
+
+
 class EvaluationEpisode(NamedTuple):
     """One evaluation episode; `success` is 1 or 0 as reported by the task, or None if it reports nothing.
 

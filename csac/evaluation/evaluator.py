@@ -11,7 +11,7 @@ import numpy as np
 from csac.checks import check_flag, check_whole
 from csac.deploy.contract import BOUNDS_ROUNDING
 from csac.deploy.policy import Policy
-from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, RunningEpisode, start
+from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, NotMade, RunningEpisode, start
 from csac.evaluation.pool import EvaluationStopped, Pending
 from csac.record.config import SEED_LIMIT
 from csac.seeds import EVALUATION_SEED, FRESH_EVALUATION_SEED
@@ -156,7 +156,9 @@ class Evaluator:
             if perturbed != self.perturbed:
                 self.perturb(perturbed)
             return self.run_batch(policy, first, deterministic, should_stop)
-        except (EvaluationFailure, InputError) as error:  # InputError: the task can no longer be created
+        except InputError as error:
+            return NotMade(str(error))
+        except EvaluationFailure as error:
             return EvaluationFailure(str(error))
 
     def play(self, policy: Any, number: int, deterministic: bool) -> EvaluationEpisode:

@@ -10,7 +10,7 @@ from collections import deque
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING
 
-from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure
+from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, NotMade
 from csac.processes import Child, cores_to_use, end
 from csac.types import InputError
 
@@ -40,8 +40,8 @@ class Pending:
     """An evaluation of several policies in progress.
 
     Each of the `workers` has one batch at a time; finished ones get the next batch during `is_over` and `results`.
-    Without workers, or for a batch whose worker died, `results` runs the batches in this process. `notes` are lines
-    about events that do not change the results.
+    Without workers, or for a batch whose worker died or cannot make the task, `results` runs the batches in this
+    process. `notes` are lines about events that do not change the results.
     """
 
     def __init__(
@@ -90,8 +90,13 @@ class Pending:
             except (EOFError, OSError):
                 self.notes.append(f"evaluation: {worker.cause_of_death()}; its episodes are run by this one instead")
                 continue
-            self._store(batch, answer)
             self._idle.append(worker)
+            if isinstance(answer, NotMade):
+                self.notes.append(
+                    f"evaluation: its process cannot make the task; its episodes are run by this one ({answer})"
+                )
+            else:
+                self._store(batch, answer)
         self._hand_out()
 
     def _hand_out(self) -> None:

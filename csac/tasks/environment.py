@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from csac.tasks.spaces import check_finite, contract_parts, dict_part, part, sca
 from csac.types import InputError, Snapshot, Spec
 
 _log = logging.getLogger(__name__)
+_made: WeakValueDictionary[int, Any] = WeakValueDictionary()  # the environments that tasks have made, by their id
 
 
 class Environment:
@@ -38,6 +40,9 @@ class Environment:
         arguments = dict(environment_arguments or {})
         self.raw = make(task, arguments if render_mode is None else {**arguments, "render_mode": render_mode})
         self.task_name = task_name(task, self.raw)
+        if id(self.raw.unwrapped) in _made:
+            raise InputError(f"{self.task_name} returned the same environment again: make a new one in each call")
+        _made[id(self.raw.unwrapped)] = self.raw.unwrapped
         self._quietly = quietly if is_pybullet(self.raw) else nullcontext
         self.has_memory = has_memory(task, self.raw)
         try:

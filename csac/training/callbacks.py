@@ -248,7 +248,7 @@ class Callbacks:
             return None
         try:
             return function(*arguments)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self.failure = CallbackFailure(f"{name} raised {raised(error)}")
             self.failure.__cause__ = error
             return None

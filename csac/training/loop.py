@@ -208,6 +208,7 @@ class Loop:
         outcome = self.environments.step(self._actions)
         self.step += self._stride
         for failure in outcome.failures:
+            self.evaluations.finish()  # before it, so that the last policy is this one
             self._save_policy(failure.seed_index)
             self._fail(failure.seed_index, failure.reason, failure.details)
         for episode in outcome.episodes:
@@ -239,8 +240,12 @@ class Loop:
 
         In the training environment, `step` is the last multiple of the interval, passed up to an episode ago.
         """
+        is_lent = not self.config.evaluation_environments  # the episodes run in the training environment
+        saved = self.environments.save(0) if is_lent and not self.environments.is_at_start else None
         self.evaluations.begin(step, self.learner.networks(), self.step - self._stride)
-        if not self.config.evaluation_environments:  # the episodes ran in the training environment
+        if saved and saved.values["exact"] and self.environments.restore(0, saved):
+            self._observations = self.environments.observations
+        elif is_lent:
             self.learner.truncate_last([0], self.step)
             self._observations = self.environments.begin_again()
             self._actions = self.learner.next_actions(self._observations, self.step)

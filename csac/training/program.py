@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import pickle
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -123,6 +124,8 @@ def threads_of(existing: Iterable[RunDirectory], cores: int, default: int) -> in
 
 def can_be_sent(task: Task | Algorithm) -> bool:
     """Return whether a task or an algorithm can be sent to another process, which cannot import from a notebook."""
+    if multiprocessing.current_process().daemon:  # a worker of a Pool, which may have no children
+        return False
     has_script, maker = script() is not None, task
     if isinstance(task, str):
         known = gymnasium.registry.get(task)

@@ -103,6 +103,15 @@ def refuse_lost(run: RunDirectory) -> None:
     _find(run, None)
 
 
+def can_resume(run: RunDirectory) -> bool:
+    """Return whether `refuse_lost` accepts a run."""
+    try:
+        refuse_lost(run)
+    except InputError:
+        return False
+    return True
+
+
 def _find(run: RunDirectory, until: int | None) -> ResumePoint:
     checkpoint, complaints = newest_sound(run.checkpoints, until)
     if checkpoint is None and complaints:

@@ -15,6 +15,7 @@ from csac.record.run import RunDirectory, StorageFailure
 from csac.seeds import name_seeds
 from csac.tasks.failures import one_line
 from csac.training.callbacks import STOPPED
+from csac.training.resume import can_resume
 from csac.training.watch import Watcher
 from csac.types import InputError
 
@@ -38,10 +39,10 @@ def supervise(
     """Run each program in its own process, `workers` at a time, until all have ended or been stopped.
 
     `watcher_of` returns the watcher of a program. A process that dies is replaced once: its runs resume from their
-    newest checkpoint. If it dies again, they fail. With `turns`, only this many processes train at a time, a few
-    hundred steps each, and the one furthest behind is next: five that share two cores freely make four fifths of the
-    steps. Raises InputError if a program's arguments are wrong, such as a checkpoint that does not fit, and
-    StorageFailure if a run directory can no longer be written; the other programs are stopped and saved.
+    newest checkpoint. If it dies again, or they cannot resume, they fail. With `turns`, only this many processes train
+    at a time, a few hundred steps each, and the one furthest behind is next: five that share two cores freely make four
+    fifths of the steps. Raises InputError if a program's arguments are wrong, such as a checkpoint that does not fit,
+    and StorageFailure if a run directory can no longer be written; the other programs are stopped and saved.
     """
     waiting, running, over = deque(programs), {}, []
     restarted: set[Path] = set()
@@ -103,7 +104,8 @@ def _replace(worker: _Worker, watcher: Watcher, restarted: set[Path], errors: li
         return []
     runs = [RunDirectory.open(path) for path in worker.program.directories]
     sound = [run for run in runs if run.manifest.state != "failed"]
-    if sound and restarted.isdisjoint(worker.program.directories):
+    is_first = restarted.isdisjoint(worker.program.directories)
+    if sound and is_first and all(map(can_resume, sound)):
         restarted.update(worker.program.directories)
         for run in sound:
             run.log(f"{reason}; its process is restarted")
@@ -114,7 +116,7 @@ def _replace(worker: _Worker, watcher: Watcher, restarted: set[Path], errors: li
             step = run.manifest.steps_done
             run.log(f"stopped at step {step}: {reason}")
             run.update_manifest(state="failed", failure=f"step {step}: {reason}")
-            watcher.failed(run.seed, step, f"{reason}, for the second time")
+            watcher.failed(run.seed, step, reason if is_first else f"{reason}, for the second time")
     return []
 
 

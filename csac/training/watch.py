@@ -81,7 +81,9 @@ class Watch(Watcher):
         """Report that a seed failed; without a reporter, warn."""
         super().failed(seed, step, reason)
         if not self.reporter:
-            warnings.warn(f"seed {seed} failed at step {step}: {reason}", RuntimeWarning, stacklevel=2)
+            with warnings.catch_warnings():
+                warnings.simplefilter("always", RuntimeWarning)  # as an error it would end the other seeds too
+                warnings.warn(f"seed {seed} failed at step {step}: {reason}", RuntimeWarning, stacklevel=2)
 
     def is_over(self, run: RunDirectory) -> bool:
         """Return whether a run needs no more training: all its steps are made, or a callback would still end it."""

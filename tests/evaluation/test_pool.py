@@ -10,9 +10,11 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium
 import probes
 import psutil
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from helped import Helped, ends_of
 from played import policy_for, run_of_task
 from policies import contract, random_policy
@@ -105,6 +107,14 @@ def test_a_policy_that_fails_does_so_in_its_place(how):
     assert [isinstance(result, EvaluationFailure) for result in results] == [False, True, True, False]
     assert "evaluation episode 2, reset with seed 1000002, at step 0: step raised RuntimeError" in str(results[1])
     assert "action[0]" in str(results[2])  # beyond the task's bounds
+
+
+def test_what_another_process_cannot_make_is_run_here(pool_of, monkeypatch):
+    monkeypatch.setitem(gymnasium.registry, "Here-v0", EnvSpec("Here-v0", probes.Endless))
+    pending = pool_of("Here-v0", {}, TWO_BATCHES).begin([POLICY])
+    assert pending.results() == [Evaluator("Here-v0", {}, TWO_BATCHES).run(POLICY)]
+    assert len(pending.notes) == 2
+    assert all("Here-v0" in note for note in pending.notes)
 
 
 def test_what_a_dying_process_takes_along_is_made_here(pool_of):

@@ -67,6 +67,14 @@ def test_it_resumes_exactly(whole, tmp_path):
     assert contents(again.runs[0]) == contents(whole)
 
 
+def test_a_longer_run_goes_on_as_if_it_had_not_ended(whole, tmp_path):
+    settings = {"task": HOPPER, "evaluation_environments": 0}
+    run(tmp_path / "run", steps=250, **settings)
+    longer = run(tmp_path / "run", resume=True, **settings).runs[0]
+    assert longer.policy_file("last").read_bytes() == whole.policy_file("last").read_bytes()
+    assert longer.manifest.history[-1].exact
+
+
 def test_evaluate_keeps_to_one_instance_too(tmp_path, monkeypatch):
     monkeypatch.setitem(gymnasium.registry, "One-v0", EnvSpec("One-v0", lambda **_: single()))
     (made,) = run_of_task(tmp_path / "run", "One-v0").runs

@@ -94,6 +94,13 @@ def test_an_environment_without_a_space_is_refused_and_closed():
     assert closed
 
 
+def test_a_function_that_returns_the_same_environment_again_is_refused():
+    one = Scripted()
+    Environment(lambda: one).close()
+    with pytest.raises(InputError, match="again"):
+        Environment(lambda: one)
+
+
 def test_the_advice_for_actions_without_bounds_works():
     def task() -> gymnasium.Env:
         return Scripted(action_space=spaces.Box(-np.inf, np.inf, (2,)))

@@ -23,6 +23,7 @@ import csac
 from csac import InputError
 from csac.algorithms import SAC
 from csac.record.sets import RunSet
+from csac.seeds import training_seed
 from csac.training.checkpoint import steps_in
 from csac.training.program import can_be_sent, choose_groups
 
@@ -185,6 +186,13 @@ def test_callbacks_hear_of_each_evaluation_and_may_end_a_run_early(tmp_path):
 def test_stop_when_is_asked_by_processes_too(tmp_path):
     runs = run(tmp_path / "set", steps=1_500, seeds=2, stop_when=lambda step, returns: step >= 200)
     assert all(one.evaluations["step"].max() == 200 for one in runs.runs)
+
+
+def test_a_dead_seed_without_checkpoints_fails_alone(tmp_path):
+    task = {"task": "probes:Deadly-v0", "environment_arguments": {"seed": training_seed(1, 60)}}
+    runs = run(tmp_path / "set", LEARNERS[1], steps=300, seeds=2, checkpoint_interval=0, **task)
+    assert "SIGKILL" in runs.failures[1]
+    assert runs.run(0).manifest.steps_done == 300
 
 
 @pytest.mark.parametrize(
