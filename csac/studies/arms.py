@@ -176,7 +176,7 @@ def labels(arms: Sequence[Arm]) -> list[str]:
         groups = by_place(sorted(namesakes, key=lambda arm: arm.place)).values()
         differences = [item for group in groups for item in differing([settings(arm.config) for arm in group])]
         if namesakes and name == namesakes[0].config.title:  # no preset: its values may differ between tasks
-            differences += differing([arm.config.hyperparameters for arm in namesakes])
+            differences += differing([_hyperparameters(arm.config) for arm in namesakes])
         distinguishing[name] = list(dict.fromkeys(differences))
     full = [
         ", ".join([name, *(f"{item} {plain(settings(arm.config).get(item))}" for item in distinguishing[name])])
@@ -191,7 +191,7 @@ def labels(arms: Sequence[Arm]) -> list[str]:
 
 def name_of(config: RunConfig) -> str:
     """Return the algorithm, the preset that a run follows, if any, and the `FITTED` values that differ from it."""
-    name, actual, make = config.title, config.hyperparameters, ALGORITHMS.get(config.algorithm)
+    name, actual, make = config.title, _hyperparameters(config), ALGORITHMS.get(config.algorithm)
     for preset in PRESETS:
         with suppress(InputError):  # a preset may lack the algorithm
             given: Any = hyperparameters(preset, config.algorithm, config.task)
@@ -206,7 +206,13 @@ def settings(config: RunConfig) -> dict[str, Any]:
     """Return the settings that a run's results depend on, apart from task, algorithm and perturbations."""
     options = {name: value for name, value in vars(config).items() if name not in NO_SETTING}
     arguments = {f"environment: {name}": value for name, value in config.environment_arguments.items()}
-    return {**config.hyperparameters, **options, **arguments}
+    return {**_hyperparameters(config), **options, **arguments}
+
+
+def _hyperparameters(config: RunConfig) -> dict[str, Any]:
+    """Return a run's hyperparameters; one newer than the run has its default."""
+    make: Any = ALGORITHMS.get(config.algorithm)
+    return {**(dataclasses.asdict(make()) if make else {}), **config.hyperparameters}
 
 
 def differing(several: Sequence[dict[str, Any]]) -> list[str]:
