@@ -6,7 +6,6 @@ Any number of processes may share a directory: Optuna's study is a journal in it
 from __future__ import annotations
 
 import dataclasses
-import math
 import shutil
 import sys
 import warnings
@@ -200,9 +199,6 @@ def _run(
     except Interrupted:
         _requeue(study, study.get_trials(deepcopy=False)[trial.number])
         return
-    except InputError:
-        study.tell(trial, state=TrialState.FAIL)
-        raise
     scores = list(last_evaluations(runs.evaluations).values())
     if is_pruned or runs.failures or len(scores) < search.seeds:
         study.tell(trial, state=TrialState.PRUNED)
@@ -232,7 +228,7 @@ def _conclude(study: optuna.Study, search: Search, directory: Path, console: Con
     if not (complete := _complete(study)):
         console.print("no trial is complete")
         return
-    ranked = sorted(complete, key=lambda trial: -(-math.inf if trial.value is None else trial.value))
+    ranked = sorted(complete, key=lambda trial: trial.value or 0.0, reverse=True)
     rows = []
     for trial in ranked[:SHOWN]:
         score = trial.value or 0.0
