@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from csac.checks import without_controls
-from csac.record.config import STEPS_LIMIT, RunConfig
+from csac.record.config import RunConfig
 from csac.types import InputError
 
 SCHEMA_VERSION = 2
@@ -82,10 +82,6 @@ class Manifest:
     """Whether a resume restarts the current episode, because the environment cannot be saved."""
     forked_from: Origin | None = None
     history: tuple[Continuation, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.steps_done <= STEPS_LIMIT:
-            raise InputError(f"steps_done is {self.steps_done}")
 
 
 class SchemaError(InputError):
