@@ -69,11 +69,6 @@ class Curve(NamedTuple):
     low: np.ndarray
     high: np.ndarray
 
-    @property
-    def seeds(self) -> int:
-        """Number of seeds."""
-        return len(self.returns)
-
     @classmethod
     def of(cls, label: str, rows: np.ndarray) -> Curve:
         """Return the curve for rows of evaluations.csv."""
@@ -157,11 +152,11 @@ def _dress(axes: Axes, curves: Sequence[Curve], marks: Sequence[tuple[int, str]]
 
 
 def _draw_curve(axes: Axes, curve: Curve, look: Look) -> None:
-    colour, style = look
+    (colour, style), seeds = look, len(curve.returns)
     marker = "o" if len(curve.steps) == 1 else None
-    if curve.seeds >= FEWEST_FOR_BAND:
+    if seeds >= FEWEST_FOR_BAND:
         axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0, zorder=1)
-    if 1 < curve.seeds < FEWEST_FOR_INTERVAL_BAND:
+    if 1 < seeds < FEWEST_FOR_INTERVAL_BAND:
         for line in curve.returns:
             there = ~np.isnan(line)
             axes.plot(curve.steps[there], line[there], color=colour, alpha=0.4, linewidth=0.7, marker=marker, zorder=2)
@@ -170,7 +165,7 @@ def _draw_curve(axes: Axes, curve: Curve, look: Look) -> None:
 
 def _draw_legend(figure: Figure, curves: Sequence[Curve], looks: Mapping[str, Look]) -> None:
     """Draw the legend, and what lines and bands mean, below the axes; the figure grows by its height."""
-    texts = {f"{c.label} ({c.seeds} seed{'s' * (c.seeds > 1)})": looks[c.label] for c in curves}
+    texts = {f"{c.label} ({len(c.returns)} seed{'s' * (len(c.returns) > 1)})": looks[c.label] for c in curves}
     wrapped = {text: textwrap.wrap(text, int(CHARACTERS * WIDTH) - 8) for text in texts}
     handles = [
         Line2D([], [], color=look[0], linestyle=look[1], linewidth=2.2, label="\n".join(wrapped[text]))
@@ -186,7 +181,7 @@ def _draw_legend(figure: Figure, curves: Sequence[Curve], looks: Mapping[str, Lo
 
 def _note(curves: Sequence[Curve]) -> str:
     """Return what lines and bands mean in a plot of these curves; empty if all have a single seed."""
-    counts = [curve.seeds for curve in curves]
+    counts = [len(curve.returns) for curve in curves]
     if max(counts) == 1:
         return ""
     few = [count for count in counts if 1 < count < FEWEST_FOR_INTERVAL_BAND]

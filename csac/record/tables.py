@@ -124,13 +124,9 @@ def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarr
     """
     rows = np.empty(len(body), [(name, np.int64 if name in INTEGER_COLUMNS else np.float64) for name in header])
     for index, name in enumerate(header):
-        convert = int if name in INTEGER_COLUMNS else _float
-        rows[name] = [convert(cells[index]) for cells in body]
+        convert = int if name in INTEGER_COLUMNS else float
+        rows[name] = [convert(cells[index] or "nan") for cells in body]
     return rows
-
-
-def _float(cell: str) -> float:
-    return float(cell) if cell else np.nan
 
 
 def _cell(path: Path, column: str, value: Any) -> str:

@@ -110,10 +110,6 @@ def test_where_few_seeds_are_left_there_is_no_interval():
     assert np.isnan(curve.high).tolist() == np.isnan(curve.low).tolist() == [False, False, True]
 
 
-def test_the_axis_has_the_limits_that_are_given():
-    assert axes_of(("csac", evaluations()), limits=(0.0, 1.0)).get_ylim() == (0.0, 1.0)
-
-
 def test_marks_are_vertical_lines_with_their_text():
     axes = axes_of(("csac", evaluations(1)), marks=[(30_000, "friction × 1.5")])
     assert np.asarray(axes.lines[-1].get_xdata()).tolist() == [30_000, 30_000]
