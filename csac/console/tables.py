@@ -41,9 +41,7 @@ WIDTH_ELSEWHERE = 200  # characters without a terminal: lines stay whole for gre
 
 def make_console() -> Console:
     """Return a console on standard output that prints text verbatim and ignores a closed pipe or terminal."""
-    output = sys.stdout
-    if output is None or output.closed:
-        output = io.StringIO()
+    output = sys.stdout or io.StringIO()
     width = None if output.isatty() else WIDTH_ELSEWHERE
     console = Console(markup=False, emoji=False, highlight=False, width=width)
     console.file = _LenientFile(output)  # pyright: ignore[reportAttributeAccessIssue]
