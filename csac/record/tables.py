@@ -8,7 +8,7 @@ import operator
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
@@ -28,7 +28,7 @@ INTEGER_COLUMNS = frozenset({"seed", "step", "episode", "length"})
 
 
 def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Append rows to the table at `path`: all of them or, on an error, none; flushed to the system on return.
+    """Append rows to the table at `path`, flushed to the system on return.
 
     The header is `columns`, then the rows' other keys; a new key causes the table to be rewritten with a new column,
     empty in earlier rows. A value is None (an empty cell), an integer, a boolean, or a float, written with the fewest
@@ -37,7 +37,6 @@ def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
     if not rows:
         return
     with open(path, "ab+") as file:
-        drop_torn_line(file)
         file.seek(0)
         old = next(csv.reader([file.readline().decode()]))
         header = list(dict.fromkeys([*(old or columns), *(column for row in rows for column in row)]))
@@ -138,15 +137,3 @@ def _cell(path: Path, column: str, value: Any) -> str:
     if number.shape or number.dtype.kind not in "buif":
         raise RuntimeError(f"{path.name}, column {column!r}: {value!r} is not a number")
     return str(int(number)) if number.dtype.kind in "bui" else str(number[()])
-
-
-def drop_torn_line(file: BinaryIO) -> None:
-    """Remove what follows the last newline: a line that a crash interrupted."""
-    end = file.seek(0, os.SEEK_END)
-    if not end:
-        return
-    file.seek(end - 1)
-    if file.read(1) == b"\n":
-        return
-    file.seek(0)
-    file.truncate(file.read().rfind(b"\n") + 1)
