@@ -60,13 +60,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    if words[:1] == ["help"]:
-        words = [*words[1:], "--help"]
     if not words or words[0] in ("-h", "--help"):
         with suppress(BrokenPipeError):
             print(HELP.rstrip())
         return 0
-    if words[0] in ("--version", "-V", "version"):
+    if words[0] in ("--version", "-V"):
         from csac import __version__
 
         print(f"csac {__version__}")
