@@ -77,8 +77,9 @@ def _evaluate(options: Evaluate, _: str) -> int:
     from csac.console.waiting import progress_shown
     from csac.deploy.choosing import has_policy, load_run
     from csac.evaluation.play import evaluate_run, perturbation_notes
+    from csac.record.files import writing
     from csac.record.sets import RunSet
-    from csac.record.tables import COLUMNS, check_new, write_rows
+    from csac.record.tables import COLUMNS, append_rows, check_new
 
     arguments, console, runs = dict(vars(options)), tables.make_console(), RunSet.open(options.directory)
     file, deterministic = arguments.pop("csv"), not arguments.pop("stochastic")
@@ -102,13 +103,10 @@ def _evaluate(options: Evaluate, _: str) -> int:
     untested = [str(seed) for seed in runs.seeds if seed not in results and options.seed is None]
     notes += [f"without such a policy yet: seed {', '.join(untested)}"] * bool(untested)
     tables.print_lines(console, [f"note: {text}" for text in dict.fromkeys(notes)])
-    if file:
-        rows = []
-        for run in sound:
-            rows += [episode.row(run.seed, steps[run.seed]) for episode in results[run.seed]]
-        if not rows:
-            return complain(f"{file} is not written: every seed that was tested had failed in training", 1)
-        write_rows(target, COLUMNS["evaluations"], rows)
+    rows = [episode.row(run.seed, steps[run.seed]) for run in sound for episode in results[run.seed]]
+    if target and rows:
+        with writing(target):
+            append_rows(target, COLUMNS["evaluations"], rows)
         tables.print_lines(console, [str(file)])
     return 0
 

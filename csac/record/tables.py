@@ -6,14 +6,13 @@ import csv
 import io
 import operator
 import os
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
-from csac.record.files import temporary_path, write_atomically, writing
+from csac.record.files import write_atomically
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -68,18 +67,6 @@ def check_new(path: Path) -> None:
         raise InputError(f"{path} exists: give another name, or remove it first")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"cannot write into {path.parent}: choose a folder that exists and is yours to write")
-
-
-def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a table as `append_rows` does, and give the file its name once complete. Raises InputError."""
-    aside = temporary_path(path)
-    try:
-        with writing(path):
-            append_rows(aside, columns, rows)
-            aside.replace(path)
-    finally:
-        with suppress(OSError):  # keep the first error
-            aside.unlink()
 
 
 def read_rows(path: str | Path) -> np.ndarray:

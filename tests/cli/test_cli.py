@@ -79,10 +79,8 @@ def test_evaluate_samples_where_it_is_asked_to():
 def test_the_rows_of_failed_seeds_alone_are_no_file(capsys):
     for run in make_runs("runs").runs:
         run.update_manifest(state="failed", failure="step 120: its reward is nan")
-    assert csac("evaluate runs --episodes 1 --csv rows.csv") == 1
-    output = capsys.readouterr()
-    assert "seed 0 failed at step 120: its reward is nan; it is in no mean" in output.out
-    assert "rows.csv" in output.err
+    assert csac("evaluate runs --episodes 1 --csv rows.csv") == 0
+    assert "seed 0 failed at step 120: its reward is nan; it is in no mean, and in no file" in capsys.readouterr().out
     assert not Path("rows.csv").exists()
 
 
