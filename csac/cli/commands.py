@@ -14,7 +14,7 @@ from csac.cli.parsing import HelpShown, parse
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
     from csac.record.run import RunDirectory
     from csac.record.sets import RunSet
@@ -31,9 +31,8 @@ def run(name: str, words: list[str]) -> int:
 
             return report(parse(Report, words, "csac report"), command)
         if name not in COMMANDS:
-            raise InputError(
-                f"no command is called {name!r}{_hint(name, [*COMMANDS, 'report', 'study'])} (csac --help)"
-            )
+            hint = did_you_mean(name, [*COMMANDS, "report", "study"]) or "csac --help lists them"
+            raise InputError(f"no command is called {name!r}: {hint}")
         kind, function = COMMANDS[name]
         leaving = nullcontext
         if name in ("train", "resume"):
@@ -186,7 +185,8 @@ def _study(words: list[str]) -> int:
             print(HELP.rstrip())
         return 0
     if words[0] not in COMMANDS:
-        raise InputError(f"no study command is called {words[0]!r}{_hint(words[0], COMMANDS)} (csac study --help)")
+        hint = did_you_mean(words[0], COMMANDS) or "csac study --help lists them"
+        raise InputError(f"no study command is called {words[0]!r}: {hint}")
     kind, run = COMMANDS[words[0]]
     return run(parse(kind, words[1:], f"csac study {words[0]}"))
 
@@ -207,11 +207,6 @@ def _tune(options: Any, command: str) -> int:
     seed_range(options.seeds, options.first_seed)
     search = Search(config=config, seeds=options.seeds, algorithm=learner, space=space_of(learner, wanted, typed))
     return tune(search, options.home(), options.trials, command, make_console())
-
-
-def _hint(word: str, known: Iterable[str]) -> str:
-    hint = did_you_mean(word, known, most=2)
-    return f"; {hint}" if hint else ""
 
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, str], int]]] = {
