@@ -74,7 +74,7 @@ class Reporter:
     def progress(self, steps: Mapping[int, int]) -> None:
         """Record the current steps of some seeds."""
         for seed, step in steps.items():
-            self._seeds[seed].step = max(step, self._seeds[seed].step) if step > self._seeds[seed].begin else step
+            self._seeds[seed].step = step
         if self._is_warming_up():
             self._speed = Speed(self._clock)
         self._speed.add(sum(one.step for one in self._seeds.values()))

@@ -57,12 +57,6 @@ def test_until_the_first_step_of_its_own_a_run_compiles(plain, terminal, clock, 
         reporter.close()
     assert lines(plain)[-1] == "step 500 of 1,000, compiling for 45 s"
     assert "50 %, step 500 of 1k, compiling for 45 s" in terminal.file.getvalue()
-    clock.now += 45
-    reporter = watch(plain, steps_done=500)
-    for step in (510, 520):
-        clock.now += 31
-        reporter.progress({0: step})
-    assert lines(plain)[-1] == "step 500 to 520 of 1,000"
 
 
 def test_the_quick_steps_of_the_warm_up_say_nothing_of_the_time_left(plain, clock, watch):
