@@ -103,7 +103,7 @@ def figure_of(
     `marks` are `(step, what changed there)`; `quantity` names what the column `return` holds, and `limits` are those of
     its axis; `looks` sets the looks of some labels, to match other figures.
     """
-    curves = [Curve.of(*run) for run in runs if not np.isnan(run[1]["return"]).all()]
+    curves = [Curve.of(*run) for run in runs]
     looks = {**looks_of(label for label, _ in runs), **(looks or {})}
     with matplotlib.style.context(["default", dict(STYLE)]):
         figure = Figure(figsize=(WIDTH, HEIGHT), dpi=PIXELS / WIDTH, layout="constrained")
@@ -112,8 +112,7 @@ def figure_of(
             _draw_curve(axes, curve, looks[curve.label])
         _dress(axes, curves, marks)
         axes.set(ylabel=quantity, ylim=limits)
-        if curves:
-            _draw_legend(figure, curves, looks)
+        _draw_legend(figure, curves, looks)
         if title:
             lines = textwrap.wrap(title, int(0.68 * CHARACTERS * WIDTH))
             figure.suptitle("\n".join(lines), x=0.02, ha="left", fontsize=13, fontweight="bold")
@@ -141,10 +140,6 @@ def _dress(axes: Axes, curves: Sequence[Curve], marks: Sequence[tuple[int, str]]
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda step, _: short(step)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace("-", "−")))
-    if not curves:
-        axes.set(xticks=[], yticks=[])
-        axes.text(0.5, 0.5, "no evaluations yet", transform=axes.transAxes, ha="center", color="#777777")
-        return
     axes.set_xlim(0, 1.015 * max(float(curve.steps.max()) for curve in curves) or 1.0)
     for step, text in [mark for mark in marks if mark[0] <= axes.get_xlim()[1]]:
         axes.axvline(step, color="#555555", linewidth=1, linestyle=(0, (4, 3)))

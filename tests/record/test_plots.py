@@ -123,11 +123,6 @@ def test_a_seed_that_ended_early_and_a_single_point_are_drawn():
     assert [line.get_marker() for line in (first, second, point)] == ["o", "o", "o"]
 
 
-@pytest.mark.parametrize("runs", [[], [("csac", evaluations(points=0))]])
-def test_nothing_to_draw_is_said(runs):
-    assert [text.get_text() for text in axes_of(*runs).texts] == ["no evaluations yet"]
-
-
 def test_pictures_need_neither_pyplot_nor_jax():
     code = (
         "import sys, csac.record.plots; print([name for name in ('matplotlib.pyplot', 'jax') if name in sys.modules])"
