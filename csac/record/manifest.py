@@ -84,10 +84,6 @@ class Manifest:
     history: tuple[Continuation, ...] = ()
 
 
-class SchemaError(InputError):
-    """A manifest has another schema version."""
-
-
 def read(content: bytes) -> Manifest:
     """Parse the content of a manifest file. Raises InputError that says what is wrong with it."""
     try:
@@ -96,7 +92,9 @@ def read(content: bytes) -> Manifest:
     except (ValueError, RecursionError, AttributeError, TypeError):
         raise InputError("it is not a JSON object") from None
     if version != SCHEMA_VERSION:
-        raise SchemaError(f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}")
+        raise InputError(
+            f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}: use its own csac"
+        )
     return parsed(Manifest, fields, "")
 
 

@@ -91,10 +91,8 @@ class RunDirectory:
                 reason = "holds no run" if path.exists() else reason
             except OSError as error:
                 raise InputError(f"cannot read {place}: {error.strerror}; check its permissions") from None
-            except manifests.SchemaError as error:
-                raise InputError(f"{place}: {error}; use the csac that wrote it") from None
             except InputError as error:
-                reason = f"has a damaged {MANIFEST}: {error}"
+                reason = f"has a {MANIFEST} that cannot be read: {error}"
         raise InputError(f"{path} {reason}; give a run directory ('csac runs' lists them)")
 
     @property
