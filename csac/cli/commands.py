@@ -16,7 +16,6 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from csac.record.run import RunDirectory
     from csac.record.sets import RunSet
 
 
@@ -97,8 +96,6 @@ def _evaluate(options: Evaluate, _: str) -> int:
     failed = {seed: reason for seed, reason in runs.failures.items() if seed in results}
     notes = [f"seed {seed} failed at {reason}; it is in no mean, and in no file" for seed, reason in failed.items()]
     sound = [run for run in runs.runs if run.seed in results and run.seed not in failed]
-    for run in (run for run in runs.runs if run.seed in results):
-        notes += _untrained_notes(run, steps[run.seed])
     untested = [str(seed) for seed in runs.seeds if seed not in results and options.seed is None]
     notes += [f"without such a policy yet: seed {', '.join(untested)}"] * bool(untested)
     tables.print_lines(console, [f"note: {text}" for text in dict.fromkeys(notes)])
@@ -129,25 +126,13 @@ def _play(options: Play, _: str) -> int:
 def _export(options: Export, _: str) -> int:
     from csac.console.tables import export_lines, make_console, print_lines
     from csac.evaluation.export import export_run
-    from csac.record.sets import RunSet
 
     console = make_console()
-    runs = RunSet.open(options.directory)
     with console.status("exporting") if console.is_interactive else nullcontext():
         exported = export_run(**vars(options))
     print_lines(console, [str(exported.place), *export_lines(exported.fields["verification"])])
-    facts = exported.fields["provenance"]
-    notes = exported.notes + _untrained_notes(runs.run(facts["seed"]), facts["steps"])
-    print_lines(console, [f"note: {text}" for text in notes])
+    print_lines(console, [f"note: {text}" for text in exported.notes])
     return 0
-
-
-def _untrained_notes(run: RunDirectory, step: int) -> list[str]:
-    """Return a note if a run's policy of this step is of the warm-up, and so untrained."""
-    warmup = run.config.hyperparameters.get("warmup_steps", 0)
-    if step >= warmup or run.manifest.forked_from:
-        return []
-    return [f"this policy has never learnt: {step:,} of {warmup:,} warm-up steps are done"]
 
 
 def _latency(options: Latency, _: str) -> int:

@@ -84,13 +84,6 @@ def test_the_rows_of_failed_seeds_alone_are_no_file(capsys):
     assert not Path("rows.csv").exists()
 
 
-@pytest.mark.parametrize(("warmup", "is_told"), [(100, False), (500, True)])
-def test_a_policy_of_the_warm_up_is_told_to_have_never_learnt(capsys, warmup, is_told):
-    make_runs("runs", hyperparameters={"warmup_steps": warmup})
-    assert csac("evaluate runs --seed 0 --episodes 1") == 0
-    assert ("never learnt: 100 of 500 warm-up steps" in capsys.readouterr().out) == is_told
-
-
 def test_runs_has_a_line_for_each_set(trained, tmp_path, capsys):
     assert csac(f"runs {trained[1].parent}") == 0
     assert words(capsys.readouterr().out)[1:] == [f"probes:Endless-v0 csac 2 40 / 40 finished 10.00 {trained[1]}"]
