@@ -27,7 +27,6 @@ from csac.studies.report import (
     write,
 )
 from csac.studies.study import find
-from csac.types import InputError
 
 HEIGHTS = {"csac": 3_000.0, "sac": 2_000.0, "ppo": 1_000.0, "td3": 2_500.0, "sd3": 2_200.0}
 
@@ -223,8 +222,3 @@ def test_the_report_of_a_study_is_of_what_is_there(tmp_path, capsys):
 def test_an_arm_without_runs_is_no_obstacle():
     parts = report_of([Arm("sac", "Ant-v4", (), missing=[0])], ["csac study report x"], ["curves"])
     assert "0 at step 0" in " ".join(part for part in parts if isinstance(part, str))
-
-
-def test_no_report_replaces_what_is_no_report(tmp_path):
-    with pytest.raises(InputError, match=r"name it .*notes\.html"):
-        write(tmp_path / "notes.txt", "x", [])
