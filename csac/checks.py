@@ -53,10 +53,10 @@ def check_arguments(name: str, value: object) -> None:
         raise InputError(f"{name} are keyword arguments such as {{'g': 9.0}}, not {value!r:.40}")
 
 
-def did_you_mean(word: str, known: Iterable[str], most: int = 1) -> str:
-    """Return "did you mean ...?" with the known words closest to `word`, or an empty string."""
-    matches = closest(word, known, most)
-    return f"did you mean {' or '.join(matches)}?" if matches else ""
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return "did you mean ...?" with the known word closest to `word`, or an empty string."""
+    matches = closest(word, known)
+    return f"did you mean {matches[0]}?" if matches else ""
 
 
 def closest(word: str, known: Iterable[str], most: int = 1) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import faulthandler
 import io
 import os
@@ -46,37 +45,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0: done. 1: the environment or the disk failed (internal errors are raised). 2: wrong arguments or input.
     3: finished, but a seed failed. 130: SIGINT. 143: SIGTERM.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
+    if arguments is None:
+        faulthandler.enable()  # a simulator's native code may crash this process
     warnings.formatwarning = lambda message, *_, **__: f"csac: warning: {message}\n"
     try:
-        code = _run(words)
-    finally:
-        failure = _flush()
-    return _unwritten(failure) if failure and not code else code
-
-
-def _run(words: list[str]) -> int:
-    try:
-        return _dispatch(words)
+        return _dispatch(list(sys.argv[1:] if arguments is None else arguments))
     except (InputError, Failure) as error:
         return complain(error, 2 if isinstance(error, InputError) else 1)
     except KeyboardInterrupt as error:
         return interrupted(error)
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
-            raise
-        return _unwritten(error)
+    finally:
+        _flush()
 
 
 def _dispatch(words: list[str]) -> int:
-    if words[:1] == ["help"]:
-        words = [*words[1:], "--help"]
     if not words or words[0] in ("-h", "--help"):
         with suppress(BrokenPipeError):
             print(HELP.rstrip())
         return 0
-    if words[0] in ("--version", "-V", "version"):
+    if words[0] in ("--version", "-V"):
         from csac import __version__
 
         print(f"csac {__version__}")
@@ -86,10 +74,6 @@ def _dispatch(words: list[str]) -> int:
     return run(words[0], words[1:])
 
 
-def _unwritten(error: OSError) -> int:
-    return complain(f"not all of the output could be written: {error.strerror}", 1)
-
-
 def _prepare_streams() -> None:
     """Open closed standard streams on /dev/null: the next opened file would receive what libraries print to them."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
@@ -97,19 +81,14 @@ def _prepare_streams() -> None:
     os.close(descriptor)
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    with suppress(OSError, ValueError):  # a caller's stderr may not be a real file
-        if not faulthandler.is_enabled():
-            faulthandler.enable()  # a simulator's native code may crash this process
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 
-def _flush() -> OSError | None:
-    """Flush stdout and return the error, if any; a pipe that its reader closed (`csac runs | head`) is no error."""
+def _flush() -> None:
+    """Flush stdout; a pipe that its reader closed (`csac runs | head`) is no error."""
     try:
         sys.stdout.flush()
-    except OSError as error:
+    except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return None if isinstance(error, BrokenPipeError) else error
-    return None

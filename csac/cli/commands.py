@@ -14,9 +14,8 @@ from csac.cli.parsing import HelpShown, parse
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
-    from csac.record.run import RunDirectory
     from csac.record.sets import RunSet
 
 
@@ -31,9 +30,8 @@ def run(name: str, words: list[str]) -> int:
 
             return report(parse(Report, words, "csac report"), command)
         if name not in COMMANDS:
-            raise InputError(
-                f"no command is called {name!r}{_hint(name, [*COMMANDS, 'report', 'study'])} (csac --help)"
-            )
+            hint = did_you_mean(name, [*COMMANDS, "report", "study"]) or "csac --help lists them"
+            raise InputError(f"no command is called {name!r}: {hint}")
         kind, function = COMMANDS[name]
         leaving = nullcontext
         if name in ("train", "resume"):
@@ -77,8 +75,9 @@ def _evaluate(options: Evaluate, _: str) -> int:
     from csac.console.waiting import progress_shown
     from csac.deploy.choosing import has_policy, load_run
     from csac.evaluation.play import evaluate_run, perturbation_notes
+    from csac.record.files import writing
     from csac.record.sets import RunSet
-    from csac.record.tables import COLUMNS, check_new, write_rows
+    from csac.record.tables import COLUMNS, append_rows, check_new
 
     arguments, console, runs = dict(vars(options)), tables.make_console(), RunSet.open(options.directory)
     file, deterministic = arguments.pop("csv"), not arguments.pop("stochastic")
@@ -97,18 +96,13 @@ def _evaluate(options: Evaluate, _: str) -> int:
     failed = {seed: reason for seed, reason in runs.failures.items() if seed in results}
     notes = [f"seed {seed} failed at {reason}; it is in no mean, and in no file" for seed, reason in failed.items()]
     sound = [run for run in runs.runs if run.seed in results and run.seed not in failed]
-    for run in (run for run in runs.runs if run.seed in results):
-        notes += _untrained_notes(run, steps[run.seed])
     untested = [str(seed) for seed in runs.seeds if seed not in results and options.seed is None]
     notes += [f"without such a policy yet: seed {', '.join(untested)}"] * bool(untested)
     tables.print_lines(console, [f"note: {text}" for text in dict.fromkeys(notes)])
-    if file:
-        rows = []
-        for run in sound:
-            rows += [episode.row(run.seed, steps[run.seed]) for episode in results[run.seed]]
-        if not rows:
-            return complain(f"{file} is not written: every seed that was tested had failed in training", 1)
-        write_rows(target, COLUMNS["evaluations"], rows)
+    rows = [episode.row(run.seed, steps[run.seed]) for run in sound for episode in results[run.seed]]
+    if target and rows:
+        with writing(target):
+            append_rows(target, COLUMNS["evaluations"], rows)
         tables.print_lines(console, [str(file)])
     return 0
 
@@ -132,25 +126,13 @@ def _play(options: Play, _: str) -> int:
 def _export(options: Export, _: str) -> int:
     from csac.console.tables import export_lines, make_console, print_lines
     from csac.evaluation.export import export_run
-    from csac.record.sets import RunSet
 
     console = make_console()
-    runs = RunSet.open(options.directory)
     with console.status("exporting") if console.is_interactive else nullcontext():
         exported = export_run(**vars(options))
     print_lines(console, [str(exported.place), *export_lines(exported.fields["verification"])])
-    facts = exported.fields["provenance"]
-    notes = exported.notes + _untrained_notes(runs.run(facts["seed"]), facts["steps"])
-    print_lines(console, [f"note: {text}" for text in notes])
+    print_lines(console, [f"note: {text}" for text in exported.notes])
     return 0
-
-
-def _untrained_notes(run: RunDirectory, step: int) -> list[str]:
-    """Return a note if a run's policy of this step is of the warm-up, and so untrained."""
-    warmup = run.config.hyperparameters.get("warmup_steps", 0)
-    if step >= warmup or run.manifest.forked_from:
-        return []
-    return [f"this policy has never learnt: {step:,} of {warmup:,} warm-up steps are done"]
 
 
 def _latency(options: Latency, _: str) -> int:
@@ -188,7 +170,8 @@ def _study(words: list[str]) -> int:
             print(HELP.rstrip())
         return 0
     if words[0] not in COMMANDS:
-        raise InputError(f"no study command is called {words[0]!r}{_hint(words[0], COMMANDS)} (csac study --help)")
+        hint = did_you_mean(words[0], COMMANDS) or "csac study --help lists them"
+        raise InputError(f"no study command is called {words[0]!r}: {hint}")
     kind, run = COMMANDS[words[0]]
     return run(parse(kind, words[1:], f"csac study {words[0]}"))
 
@@ -209,11 +192,6 @@ def _tune(options: Any, command: str) -> int:
     seed_range(options.seeds, options.first_seed)
     search = Search(config=config, seeds=options.seeds, algorithm=learner, space=space_of(learner, wanted, typed))
     return tune(search, options.home(), options.trials, command, make_console())
-
-
-def _hint(word: str, known: Iterable[str]) -> str:
-    hint = did_you_mean(word, known, most=2)
-    return f"; {hint}" if hint else ""
 
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, str], int]]] = {

@@ -306,15 +306,11 @@ def _with_algorithm(base: type[Any], words: list[str], task: str) -> type[Any]:
     hints: dict[str, Any] = get_type_hints(base, include_extras=True)
     names = tuple(dict.fromkeys([*ALGORITHMS, name]))
     hints |= {"algorithm": Literal[names], "preset": Annotated[Literal[PRESETS] | None, hint]}  # pyright: ignore[reportInvalidTypeForm]
-    fields = [(item, hints[item], _field_with_default(value)) for item, value in defaults.items()]
+    fields = [(item, hints[item], field(default_factory=lambda value=value: value)) for item, value in defaults.items()]
     fields.append((_field_of(name), OmitArgPrefixes[type(learner)], field(default=learner)))
     return dataclasses.make_dataclass(
         base.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace={"__doc__": base.__doc__}
     )
-
-
-def _field_with_default(value: Any) -> Any:
-    return field(default_factory=lambda: value) if isinstance(value, dict) else field(default=value)
 
 
 def _source(words: list[str]) -> RunSet | None:

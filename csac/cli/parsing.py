@@ -83,18 +83,10 @@ def chosen_algorithm(words: list[str], begun_with: str | None) -> tuple[str, Any
     return name, class_typed(name)
 
 
-def json_object(text: str) -> dict[str, Any]:
-    """Parse a JSON object. Raises ValueError."""
-    value = json.loads(text)
-    if not isinstance(value, dict):
-        raise ValueError(f"it takes a JSON object such as '{{\"name\": 1.5}}', not {text}")
-    return value
-
-
 JSON = PrimitiveConstructorSpec(
     nargs=1,
     metavar="JSON",
-    instance_from_str=lambda words: json_object(words[0]),
+    instance_from_str=lambda words: json.loads(words[0]),
     is_instance=lambda value: isinstance(value, dict),
     str_from_instance=lambda value: [json.dumps(value)],
 )

@@ -41,9 +41,7 @@ WIDTH_ELSEWHERE = 200  # characters without a terminal: lines stay whole for gre
 
 def make_console() -> Console:
     """Return a console on standard output that prints text verbatim and ignores a closed pipe or terminal."""
-    output = sys.stdout
-    if output is None or output.closed:
-        output = io.StringIO()
+    output = sys.stdout or io.StringIO()
     width = None if output.isatty() else WIDTH_ELSEWHERE
     console = Console(markup=False, emoji=False, highlight=False, width=width)
     console.file = _LenientFile(output)  # pyright: ignore[reportAttributeAccessIssue]
@@ -174,16 +172,11 @@ def latency_table(measured: Mapping[str, Sequence[Latency]]) -> Fitted:
     for name, several in measured.items():
         for latency in several:
             way = "flat out" if latency.rate is None else f"at {latency.rate:g} Hz"
-            texts = [f"{len(latency.durations):,}", *latency_cells(latency)]
-            cells = (Cell(text, float(text.replace(",", ""))) if text else EMPTY for text in texts)
-            rows.append(Row((Cell(f"{name}, {way}"), *cells)))
+            late = [EMPTY] * 2 if latency.lateness is None else _microseconds(latency.lateness, [99.0, 100.0])
+            cells = [*_microseconds(latency.durations, [*PERCENTILES.values()]), *late]
+            count = len(latency.durations)
+            rows.append(Row((Cell(f"{name}, {way}"), Cell(f"{count:,}", count), *cells)))
     return Fitted(Table(headings, tuple(rows), note="late: how long after its time a call began"))
-
-
-def latency_cells(latency: Latency) -> list[str]:
-    """Return the percentiles of the durations, then p99 and maximum of the lateness, in microseconds."""
-    late = ["", ""] if latency.lateness is None else _microseconds(latency.lateness, [99.0, 100.0])
-    return _microseconds(latency.durations, [*PERCENTILES.values()]) + late
 
 
 def _last_return(runs: RunSet) -> str:
@@ -209,9 +202,9 @@ def _mean(returns: Mapping[str, Any]) -> str:
     return f"{number(mean)} ± {number(returns['standard_deviation'] or 0.0, mean)}"
 
 
-def _microseconds(nanoseconds: np.ndarray, percentiles: list[float]) -> list[str]:
+def _microseconds(nanoseconds: np.ndarray, percentiles: list[float]) -> list[Cell]:
     values = np.percentile(nanoseconds, percentiles, method="higher") / 1e3
-    return [f"{value:.1f}" if value < 1000 else f"{value:,.0f}" for value in values]
+    return [Cell(f"{value:.1f}" if value < 1000 else f"{value:,.0f}", float(value)) for value in values]
 
 
 class _LenientFile:

@@ -24,7 +24,6 @@ class Speed:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._samples: deque[tuple[float, int]] = deque()
-        self._has_begun = False
 
     def add(self, total: int) -> None:
         """Record the total number of steps so far."""
@@ -32,10 +31,6 @@ class Speed:
         self._samples.append((now, total))
         while len(self._samples) > 2 and now - self._samples[1][0] > SPEED_WINDOW:
             self._samples.popleft()
-        if len(self._samples) == 2 and not self._has_begun:
-            self._has_begun = True
-            if now - self._samples[0][0] > SPEED_WINDOW:  # compilation preceded the first steps
-                self._samples.popleft()
 
     def per_second(self) -> float | None:
         """Return the speed, or None while there are too few samples."""

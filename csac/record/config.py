@@ -16,7 +16,6 @@ from csac.types import InputError
 STEPS_LIMIT = 2**31 - 1  # learners count their steps in int32
 SEED_LIMIT = 2**32  # a random key uses only the lowest 32 bits of a seed
 NEVER = 10**15  # an interval longer than any run
-MOST_EPISODES = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +100,7 @@ _RANGES = (
     ("environments", 1, 1_000),
     ("hindsight", 0, 100),
     ("evaluation_interval", 0, NEVER),
-    ("evaluation_episodes", 1, MOST_EPISODES),
+    ("evaluation_episodes", 1, 1_000_000),
     ("evaluation_environments", 0, 10),
     ("evaluation_seed", 0, 2**30 - 1),
     ("checkpoint_interval", 0, NEVER),
@@ -139,10 +138,6 @@ def differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -
         old, new = before.get(name), now.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
             lines += differences(old, new, f"{name}." if name in ("environment_arguments", "demonstrations") else "")
-        elif _listed(old) != _listed(new):
-            lines.append(f"{prefix}{name} is {_listed(old)!r}, not {_listed(new)!r}")
+        elif (old := _plain(old)) != (new := _plain(new)):
+            lines.append(f"{prefix}{name} is {old!r}, not {new!r}")
     return lines
-
-
-def _listed(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value

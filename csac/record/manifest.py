@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from csac.checks import without_controls
-from csac.record.config import STEPS_LIMIT, RunConfig
+from csac.record.config import RunConfig
 from csac.types import InputError
 
 SCHEMA_VERSION = 2
@@ -83,14 +83,6 @@ class Manifest:
     forked_from: Origin | None = None
     history: tuple[Continuation, ...] = ()
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.steps_done <= STEPS_LIMIT:
-            raise InputError(f"steps_done is {self.steps_done}")
-
-
-class SchemaError(InputError):
-    """A manifest has another schema version."""
-
 
 def read(content: bytes) -> Manifest:
     """Parse the content of a manifest file. Raises InputError that says what is wrong with it."""
@@ -100,7 +92,9 @@ def read(content: bytes) -> Manifest:
     except (ValueError, RecursionError, AttributeError, TypeError):
         raise InputError("it is not a JSON object") from None
     if version != SCHEMA_VERSION:
-        raise SchemaError(f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}")
+        raise InputError(
+            f"it has schema version {version!r:.20} and this csac reads {SCHEMA_VERSION}: use its own csac"
+        )
     return parsed(Manifest, fields, "")
 
 

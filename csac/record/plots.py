@@ -69,11 +69,6 @@ class Curve(NamedTuple):
     low: np.ndarray
     high: np.ndarray
 
-    @property
-    def seeds(self) -> int:
-        """Number of seeds."""
-        return len(self.returns)
-
     @classmethod
     def of(cls, label: str, rows: np.ndarray) -> Curve:
         """Return the curve for rows of evaluations.csv."""
@@ -108,7 +103,7 @@ def figure_of(
     `marks` are `(step, what changed there)`; `quantity` names what the column `return` holds, and `limits` are those of
     its axis; `looks` sets the looks of some labels, to match other figures.
     """
-    curves = [Curve.of(*run) for run in runs if not np.isnan(run[1]["return"]).all()]
+    curves = [Curve.of(*run) for run in runs]
     looks = {**looks_of(label for label, _ in runs), **(looks or {})}
     with matplotlib.style.context(["default", dict(STYLE)]):
         figure = Figure(figsize=(WIDTH, HEIGHT), dpi=PIXELS / WIDTH, layout="constrained")
@@ -117,8 +112,7 @@ def figure_of(
             _draw_curve(axes, curve, looks[curve.label])
         _dress(axes, curves, marks)
         axes.set(ylabel=quantity, ylim=limits)
-        if curves:
-            _draw_legend(figure, curves, looks)
+        _draw_legend(figure, curves, looks)
         if title:
             lines = textwrap.wrap(title, int(0.68 * CHARACTERS * WIDTH))
             figure.suptitle("\n".join(lines), x=0.02, ha="left", fontsize=13, fontweight="bold")
@@ -146,10 +140,6 @@ def _dress(axes: Axes, curves: Sequence[Curve], marks: Sequence[tuple[int, str]]
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda step, _: short(step)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace("-", "−")))
-    if not curves:
-        axes.set(xticks=[], yticks=[])
-        axes.text(0.5, 0.5, "no evaluations yet", transform=axes.transAxes, ha="center", color="#777777")
-        return
     axes.set_xlim(0, 1.015 * max(float(curve.steps.max()) for curve in curves) or 1.0)
     for step, text in [mark for mark in marks if mark[0] <= axes.get_xlim()[1]]:
         axes.axvline(step, color="#555555", linewidth=1, linestyle=(0, (4, 3)))
@@ -157,11 +147,11 @@ def _dress(axes: Axes, curves: Sequence[Curve], marks: Sequence[tuple[int, str]]
 
 
 def _draw_curve(axes: Axes, curve: Curve, look: Look) -> None:
-    colour, style = look
+    (colour, style), seeds = look, len(curve.returns)
     marker = "o" if len(curve.steps) == 1 else None
-    if curve.seeds >= FEWEST_FOR_BAND:
+    if seeds >= FEWEST_FOR_BAND:
         axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0, zorder=1)
-    if 1 < curve.seeds < FEWEST_FOR_INTERVAL_BAND:
+    if 1 < seeds < FEWEST_FOR_INTERVAL_BAND:
         for line in curve.returns:
             there = ~np.isnan(line)
             axes.plot(curve.steps[there], line[there], color=colour, alpha=0.4, linewidth=0.7, marker=marker, zorder=2)
@@ -170,7 +160,7 @@ def _draw_curve(axes: Axes, curve: Curve, look: Look) -> None:
 
 def _draw_legend(figure: Figure, curves: Sequence[Curve], looks: Mapping[str, Look]) -> None:
     """Draw the legend, and what lines and bands mean, below the axes; the figure grows by its height."""
-    texts = {f"{c.label} ({c.seeds} seed{'s' * (c.seeds > 1)})": looks[c.label] for c in curves}
+    texts = {f"{c.label} ({len(c.returns)} seed{'s' * (len(c.returns) > 1)})": looks[c.label] for c in curves}
     wrapped = {text: textwrap.wrap(text, int(CHARACTERS * WIDTH) - 8) for text in texts}
     handles = [
         Line2D([], [], color=look[0], linestyle=look[1], linewidth=2.2, label="\n".join(wrapped[text]))
@@ -186,7 +176,7 @@ def _draw_legend(figure: Figure, curves: Sequence[Curve], looks: Mapping[str, Lo
 
 def _note(curves: Sequence[Curve]) -> str:
     """Return what lines and bands mean in a plot of these curves; empty if all have a single seed."""
-    counts = [curve.seeds for curve in curves]
+    counts = [len(curve.returns) for curve in curves]
     if max(counts) == 1:
         return ""
     few = [count for count in counts if 1 < count < FEWEST_FOR_INTERVAL_BAND]

@@ -28,7 +28,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from csac.record.summaries import CaseSummary, RecoverySummary
+    from csac.record.summaries import RecoverySummary
 
 ROLLOUTS = 1_000  # cases are given per this many rollouts, as in the paper
 MOST_COLUMNS = 5  # of seeds in that table; with more seeds, only mean and deviation
@@ -141,10 +141,10 @@ def case_comparison_table(runs: Sequence[tuple[str, np.ndarray]]) -> Table | Non
     names = case_names([rows for _, rows in runs])
     if not names:
         return None
-    by_run = [{case.name: case for case in cases(rows, names)} for _, rows in runs]
+    by_run = [cases(rows, names) for _, rows in runs]
     body = [
-        Row((Cell(name if happens else f"{name} (mean)"), *(_rate_over_seeds(found.get(name)) for found in by_run)))
-        for name, happens in names.items()
+        Row((Cell(name if is_rate else f"{name} (mean)"), *(_rate(found.get(name), is_rate) for found in by_run)))
+        for name, is_rate in names.items()
     ]
     headings = (_rollouts([rows for _, rows in runs]), *(label for label, _ in runs))
     returns = Row((Cell("return (mean)"), *(_mean_return(rows) for _, rows in runs)))
@@ -224,7 +224,7 @@ def _with_interval(value: float, bounds: tuple[float, float] | None, form: str) 
 
 def _success(rows: np.ndarray) -> OverSeeds | None:
     """Return the share of successful episodes in the last evaluations, None if the task does not report success."""
-    return cases(last_rows(rows, points=3), {"success": True})[0].over_seeds if is_case(rows["success"]) else None
+    return cases(last_rows(rows, points=3), {"success": True})["success"] if is_case(rows["success"]) else None
 
 
 def _recovery_cells(one: Recovery, largest: float) -> list[Cell]:
@@ -254,8 +254,8 @@ def _mean_return(rows: np.ndarray) -> Cell:
     return plus_minus(over, ".3g" if 0 < abs(over.mean) < SMALL else ",.1f")
 
 
-def _rate_over_seeds(case: CaseSummary | None) -> Cell:
-    if case is None:
+def _rate(over: OverSeeds | None, is_rate: bool) -> Cell:
+    if over is None:
         return EMPTY
-    over, (form, scale) = case.over_seeds, (",.1f", ROLLOUTS) if case.is_case else (",.3f", 1)
+    form, scale = (",.1f", ROLLOUTS) if is_rate else (",.3f", 1)
     return plus_minus(over._replace(mean=scale * over.mean, std=scale * over.std), form)

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
-import multiprocessing
 import os
 import warnings
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from csac.checks import check_path
 from csac.record import manifest as manifests
-from csac.record.files import closed_in_children, is_locked, take, write_atomically, writing
-from csac.record.tables import COLUMNS, append_rows, continues, read_rows, structured
+from csac.record.files import is_locked, take, write_atomically, writing
+from csac.record.tables import COLUMNS, append_rows, read_rows, structured
 from csac.types import Failure, InputError
 
 if TYPE_CHECKING:
@@ -87,17 +84,15 @@ class RunDirectory:
         for place in (path / MANIFEST, *_manifest_copies(path)):
             try:
                 manifest = manifests.read(place.read_bytes())
-                if place.parent != path and not multiprocessing.parent_process():  # which has warned
+                if place.parent != path:
                     warnings.warn(f"{path / MANIFEST} is lost or damaged: a checkpoint's copy is read", stacklevel=2)
                 return cls(path, manifest)
             except (FileNotFoundError, NotADirectoryError):
                 reason = "holds no run" if path.exists() else reason
             except OSError as error:
                 raise InputError(f"cannot read {place}: {error.strerror}; check its permissions") from None
-            except manifests.SchemaError as error:
-                raise InputError(f"{place}: {error}; use the csac that wrote it") from None
             except InputError as error:
-                reason = f"has a damaged {MANIFEST}: {error}"
+                reason = f"has a {MANIFEST} that cannot be read: {error}"
         raise InputError(f"{path} {reason}; give a run directory ('csac runs' lists them)")
 
     @property
@@ -139,37 +134,17 @@ class RunDirectory:
     def rows(self, name: Table) -> np.ndarray:
         """Return all rows of a table as a structured array, empty if nothing was written yet.
 
-        If the file is damaged or was altered since the newest checkpoint, return the checkpoint's rows, with a warning.
+        If the file is damaged, return the rows of its copy in the newest checkpoint, with a warning.
         """
-        path, copy = self.table(name), self._saved_copy(name)
+        path = self.table(name)
         try:
-            if copy and not self._continues_copy(path, copy):
-                raise InputError(f"{path} does not continue its copy in the newest checkpoint")
-            rows = read_rows(path) if path.exists() else structured(COLUMNS[name], [])
+            return read_rows(path) if path.exists() else structured(COLUMNS[name], [])
         except InputError:
-            if not copy:
+            copies = [manifest.with_name(path.name) for manifest in _manifest_copies(self.path)]
+            if not copies:
                 raise
-            warnings.warn(f"{path} has changed since the newest checkpoint: its copy there is read", stacklevel=3)
-            rows = read_rows(copy)
-        if missing := set(COLUMNS[name]) - set(rows.dtype.names or ()):
-            raise InputError(f"{path} is damaged: it has no column {min(missing)}; restore it")
-        return rows
-
-    def _saved_copy(self, name: Table) -> Path | None:
-        """Return the path of a table's intact copy in the newest checkpoint, or None."""
-        for manifest in _manifest_copies(self.path)[:1]:
-            copy = manifest.with_name(f"{name}.csv")
-            with suppress(OSError, ValueError, KeyError, TypeError):
-                files = json.loads(manifest.with_name("checkpoint.json").read_bytes())["files"]
-                if files[copy.name]["sha256"] == hashlib.sha256(copy.read_bytes()).hexdigest():
-                    return copy
-        return None
-
-    def _continues_copy(self, path: Path, copy: Path) -> bool:
-        current, saved = path.read_bytes() if path.is_file() else b"", copy.read_bytes()
-        is_saved = self.manifest.state == "finished" and self.manifest.steps_done == self.manifest.last_checkpoint
-        is_more = is_saved and current.count(b"\n") > saved.count(b"\n")
-        return continues(current, saved) and not is_more
+            warnings.warn(f"{path} is damaged: its copy in the newest checkpoint is read", stacklevel=3)
+            return read_rows(copies[0])
 
     @property
     def evaluations(self) -> np.ndarray:
@@ -190,7 +165,7 @@ class RunDirectory:
                 raise InputError(f"{path} is a link: replace it by what it points to")
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
         try:
-            file = closed_in_children(os.fdopen(os.open(self.path / LOCK, flags, 0o666), "r+"))
+            file = os.fdopen(os.open(self.path / LOCK, flags, 0o666), "r+")
         except OSError as error:
             raise InputError(f"cannot write to {self.path}: {error.strerror}; check its permissions") from None
         with file:

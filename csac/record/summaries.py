@@ -46,15 +46,6 @@ class RecoverySummary(NamedTuple):
     """Number of seeds whose recovery is known; `regained` of them recovered."""
 
 
-class CaseSummary(NamedTuple):
-    """How often a case occurred, as a share of the episodes; or, for any other number, its mean per episode."""
-
-    name: str
-    is_case: bool
-    by_seed: dict[int, float]
-    over_seeds: OverSeeds
-
-
 def over_seeds(values: Iterable[float]) -> OverSeeds:
     """Return the mean, standard deviation and 95 % t-interval of one value per seed, NaNs left out."""
     known = np.array([value for value in values if not np.isnan(value)], dtype=np.float64)
@@ -111,17 +102,17 @@ def case_names(runs: Sequence[np.ndarray]) -> dict[str, bool]:
     return {name: is_case(column) for name, column in values.items() if name != "success" or not np.isnan(column).all()}
 
 
-def cases(rows: np.ndarray, names: Mapping[str, bool] | None = None) -> list[CaseSummary]:
-    """Return how often success and each event occurred in all episodes of `rows`, seed by seed.
+def cases(rows: np.ndarray, names: Mapping[str, bool]) -> dict[str, OverSeeds]:
+    """Return how often success and each event occurred in all episodes of `rows`, over seeds: a share of the episodes.
 
-    `names` comes from `case_names` of several runs, to treat them alike.
+    `names` comes from `case_names`; a number that is no case has its mean per episode instead.
     """
-    found, seeds = [], np.unique(rows["seed"]).tolist()
-    for name, happens in (case_names([rows]) if names is None else names).items():
-        if name in events_in(rows):
-            by_seed = {seed: mean_over_episodes(rows[name][rows["seed"] == seed], happens) for seed in seeds}
-            found.append(CaseSummary(name, happens, by_seed, over_seeds(by_seed.values())))
-    return found
+    seeds, known = np.unique(rows["seed"]).tolist(), events_in(rows)
+    return {
+        name: over_seeds(mean_over_episodes(rows[name][rows["seed"] == seed], is_case) for seed in seeds)
+        for name, is_case in names.items()
+        if name in known
+    }
 
 
 def last_rows(rows: np.ndarray, points: int = 1) -> np.ndarray:

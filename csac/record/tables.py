@@ -6,15 +6,13 @@ import csv
 import io
 import operator
 import os
-import textwrap
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
-from csac.record.files import temporary_path, write_atomically, writing
+from csac.record.files import write_atomically
 from csac.types import InputError
 
 if TYPE_CHECKING:
@@ -29,7 +27,7 @@ INTEGER_COLUMNS = frozenset({"seed", "step", "episode", "length"})
 
 
 def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Append rows to the table at `path`: all of them or, on an error, none; flushed to the system on return.
+    """Append rows to the table at `path`, flushed to the system on return.
 
     The header is `columns`, then the rows' other keys; a new key causes the table to be rewritten with a new column,
     empty in earlier rows. A value is None (an empty cell), an integer, a boolean, or a float, written with the fewest
@@ -38,9 +36,8 @@ def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
     if not rows:
         return
     with open(path, "ab+") as file:
-        drop_torn_line(file)
         file.seek(0)
-        old = _header(path, file.readline())
+        old = next(csv.reader([file.readline().decode()]))
         header = list(dict.fromkeys([*(old or columns), *(column for row in rows for column in row)]))
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
@@ -64,35 +61,12 @@ def continues(table: bytes, before: bytes) -> bool:
     return wider.startswith(header + b",") and others == [row + more for row in rows]
 
 
-def _header(path: Path, line: bytes) -> list[str]:
-    try:
-        return next(csv.reader([line.decode()]))
-    except (UnicodeDecodeError, csv.Error):
-        raise InputError(f"{path} is no table of a run (its first line is no header): restore it") from None
-
-
 def check_new(path: Path) -> None:
     """Raise InputError if no new table can be created at `path`, before anything has been computed for it."""
-    if path.suffix.lower() != ".csv":
-        raise InputError(f"{path} is no table: give the name of a .csv file")
-    with writing(path), suppress(FileNotFoundError):
-        temporary_path(path).lstat()
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"cannot write into {path.parent}: choose a folder that exists and is yours to write")
-
-
-def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a table as `append_rows` does, and give the file its name once complete. Raises InputError."""
-    aside = temporary_path(path)
-    try:
-        with writing(path):
-            append_rows(aside, columns, rows)
-            aside.replace(path)
-    finally:
-        with suppress(OSError):  # keep the first error
-            aside.unlink()
 
 
 def read_rows(path: str | Path) -> np.ndarray:
@@ -106,17 +80,18 @@ def read_rows(path: str | Path) -> np.ndarray:
     try:
         text = path.read_text(encoding="utf-8")
         header, *body = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))) or [[]]
+        needed = COLUMNS.get(path.stem, ("seed", "step"))
         if not header and not body:
-            return structured(COLUMNS.get(path.stem, ("seed", "step")), [])
+            return structured(needed, [])
         is_plain = all(name.isprintable() for name in header)  # no control characters
-        if len(set(header)) < len(header) or not {"seed", "step"} <= set(header) or not is_plain:
+        if len(set(header)) < len(header) or not {*needed} <= {*header} or not is_plain:
             raise ValueError(f"its header is {','.join(header)[:100]!r}")
         for number, cells in enumerate(body, start=2):
             if len(cells) != len(header):
                 raise ValueError(f"line {number} has {len(cells)} cells, not {len(header)}")
         return structured(header, body)
     except (OSError, csv.Error, ValueError, OverflowError) as error:
-        raise InputError(f"{path} is no table of a run ({_short(error)}): restore it") from None
+        raise InputError(f"{path} is no table of a run ({error!s:.150}): restore it") from None
 
 
 def joined(name: str, tables: Iterable[np.ndarray]) -> np.ndarray:
@@ -135,24 +110,13 @@ def structured(header: Sequence[str], body: Sequence[Sequence[str]]) -> np.ndarr
     """
     rows = np.empty(len(body), [(name, np.int64 if name in INTEGER_COLUMNS else np.float64) for name in header])
     for index, name in enumerate(header):
-        convert = int if name in INTEGER_COLUMNS else _float
-        rows[name] = [convert(cells[index]) for cells in body]
+        convert = int if name in INTEGER_COLUMNS else float
+        rows[name] = [convert(cells[index] or "nan") for cells in body]
     return rows
-
-
-def _short(error: Exception) -> str:
-    """Return an error's message, shortened: a cell may be as long as the file."""
-    return textwrap.shorten(str(error), 150, placeholder=" ...") if len(str(error)) < 10_000 else "a huge cell"
-
-
-def _float(cell: str) -> float:
-    return float(cell) if cell else np.nan
 
 
 def _cell(path: Path, column: str, value: Any) -> str:
     if column in INTEGER_COLUMNS:
-        if value is None:
-            raise RuntimeError(f"a row for {path.name} lacks {column!r}")
         return str(operator.index(value))
     if value is None:
         return ""
@@ -160,15 +124,3 @@ def _cell(path: Path, column: str, value: Any) -> str:
     if number.shape or number.dtype.kind not in "buif":
         raise RuntimeError(f"{path.name}, column {column!r}: {value!r} is not a number")
     return str(int(number)) if number.dtype.kind in "bui" else str(number[()])
-
-
-def drop_torn_line(file: BinaryIO) -> None:
-    """Remove what follows the last newline: a line that a crash interrupted."""
-    end = file.seek(0, os.SEEK_END)
-    if not end:
-        return
-    file.seek(end - 1)
-    if file.read(1) == b"\n":
-        return
-    file.seek(0)
-    file.truncate(file.read().rfind(b"\n") + 1)

@@ -191,13 +191,13 @@ def labels(arms: Sequence[Arm]) -> list[str]:
 
 def name_of(config: RunConfig) -> str:
     """Return the algorithm, the preset that a run follows, if any, and the `FITTED` values that differ from it."""
-    name, actual, make = config.title, _hyperparameters(config), ALGORITHMS.get(config.algorithm)
+    name, actual = config.title, _hyperparameters(config)
+    make: Any = ALGORITHMS.get(config.algorithm)
     for preset in PRESETS:
         with suppress(InputError):  # a preset may lack the algorithm
             given: Any = hyperparameters(preset, config.algorithm, config.task)
-            values: Any = dataclasses.asdict(make(**given)) if make else {}
-            changed = differing([actual, values])
-            if values and set(changed) <= set(FITTED):
+            changed = differing([actual, dataclasses.asdict(make(**given))])
+            if set(changed) <= set(FITTED):
                 return ", ".join([f"{name} ({preset})", *(f"{item} {plain(actual.get(item))}" for item in changed)])
     return name
 

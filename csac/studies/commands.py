@@ -19,7 +19,6 @@ from csac.checks import check_whole
 from csac.console.tables import Fitted, duration, make_console, program
 from csac.processes import cores_to_use
 from csac.record.rendering import Cell, Row, Table, short
-from csac.record.run import StorageFailure
 from csac.record.wandb import import_wandb
 from csac.studies.arms import gather, option, read_arms, seconds_per_step
 from csac.studies.study import find, named
@@ -210,11 +209,7 @@ def run(options: Run) -> int:
     if options.cell is not None:
         check_whole("--cell", options.cell, 0, len(runs) - 1)
         runs = [runs[options.cell]]
-    try:
-        stopped = run_study(runs, directory, options.execution(), console)
-    except StorageFailure as failure:
-        print(f"csac: {failure}; the same line goes on once that is mended", file=sys.stderr)
-        return 1
+    stopped = run_study(runs, directory, options.execution(), console)
     states = Counter(existing.state if (existing := one.open(directory)) else "waiting" for one in runs)
     _print_states(directory, states)
     for one in runs:

@@ -72,15 +72,8 @@ def sample(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
     return _rounded(trial.suggest_float(name, *ends, log=scale == "log"))
 
 
-def _is_tau_idle(algorithm: Any) -> bool:
-    """Return whether the reference policy is the actor itself, so that the exact relative entropy is zero."""
-    is_fresh = algorithm.reference_policy == "periodic" and algorithm.reference_period == 1
-    return is_fresh and algorithm.relative_entropy_estimator == "closed_form"
-
-
 # When a hyperparameter has an effect; those that are not listed always do.
 _HAS_EFFECT: Mapping[str, Callable[[Any], bool]] = {
-    "relative_entropy_weight": lambda algorithm: not _is_tau_idle(algorithm),
     "reference_period": lambda algorithm: algorithm.reference_policy == "periodic" and algorithm.reference_period > 1,
     "reference_rate": lambda algorithm: algorithm.reference_policy == "average",
     "target_rate": lambda algorithm: getattr(algorithm, "critic_normalisation", "none") == "none",

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from csac.algorithms import ALGORITHMS
-from csac.checks import check_whole, did_you_mean, without_controls
+from csac.checks import did_you_mean, without_controls
 from csac.presets import hyperparameters as preset_of
 from csac.record import manifest as manifests
-from csac.record.config import NEVER, RunConfig
+from csac.record.config import RunConfig
 from csac.record.run import RunDirectory, is_run
 from csac.studies import paper
 from csac.tasks.perturbations import perturbations_of, refuse_late
@@ -152,13 +152,6 @@ class Study:
             seeds=self.seeds if seeds is None else seeds,
         )
 
-    def steps_for(self, task: str) -> int:
-        """Return the steps of a run on this task, shortened by `scale`."""
-        steps = self.steps_on.get(task, self.steps)
-        if self.scale == 1:
-            return steps
-        return max(1, round(steps * self.scale / self.environments)) * self.environments
-
     def runs(self) -> list[StudyRun]:
         """Return every run, seed by seed, so that an unfinished study compares all methods on fewer seeds."""
         seeds = seed_range(self.seeds, self.first_seed)
@@ -174,11 +167,11 @@ class Study:
         ]
 
     def _run(self, task: str, condition: tuple[str, ...], method: Method, seed: int) -> StudyRun:
-        steps, algorithm = self.steps_for(task), method.on(task, self.common.get(method.algorithm, {}))
-        interval = self.evaluation_interval
+        steps, interval = self.steps_on.get(task, self.steps), self.evaluation_interval
+        algorithm = method.on(task, self.common.get(method.algorithm, {}))
         changes = perturbations_of(condition)
         if self.scale < 1:
-            check_whole("evaluation_interval", interval, 0, NEVER)
+            steps = max(1, round(steps * self.scale / self.environments)) * self.environments
             interval = max(1, min(interval, steps // FEWEST_POINTS)) if interval else 0
             changes = [dataclasses.replace(change, step=round(change.step * self.scale)) for change in changes]
             algorithm = _with_short_warmup(algorithm, steps)

@@ -6,7 +6,6 @@ Any number of processes may share a directory: Optuna's study is a journal in it
 from __future__ import annotations
 
 import dataclasses
-import math
 import shutil
 import sys
 import warnings
@@ -19,7 +18,7 @@ import numpy as np
 from csac.checks import check_whole
 from csac.console.tables import Fitted
 from csac.record.config import differences
-from csac.record.files import closed_in_children, is_locked, take, writing
+from csac.record.files import is_locked, take, writing
 from csac.record.rendering import Cell, Row, Table, number
 from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
@@ -122,7 +121,7 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
         trial.set_user_attr("trial", trial.user_attrs.get("trial", latest + 1))
         folder = _folder(directory, trial)
         folder.mkdir(exist_ok=True)
-        lock = closed_in_children(open(folder / ".lock", "a+"))  # noqa: SIM115  held for as long as the trial runs
+        lock = open(folder / ".lock", "a+")  # noqa: SIM115  held for as long as the trial runs
         take(lock, folder)
         with warnings.catch_warnings(action="ignore"):  # the first trial may lie outside the space
             values = {name: sample(trial, name, dimension) for name, dimension in search.space.items()}
@@ -200,9 +199,6 @@ def _run(
     except Interrupted:
         _requeue(study, study.get_trials(deepcopy=False)[trial.number])
         return
-    except InputError:
-        study.tell(trial, state=TrialState.FAIL)
-        raise
     scores = list(last_evaluations(runs.evaluations).values())
     if is_pruned or runs.failures or len(scores) < search.seeds:
         study.tell(trial, state=TrialState.PRUNED)
@@ -232,7 +228,7 @@ def _conclude(study: optuna.Study, search: Search, directory: Path, console: Con
     if not (complete := _complete(study)):
         console.print("no trial is complete")
         return
-    ranked = sorted(complete, key=lambda trial: -(-math.inf if trial.value is None else trial.value))
+    ranked = sorted(complete, key=lambda trial: trial.value or 0.0, reverse=True)
     rows = []
     for trial in ranked[:SHOWN]:
         score = trial.value or 0.0

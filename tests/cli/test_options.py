@@ -14,36 +14,22 @@ import csac.evaluation.export as exporting
 import csac.evaluation.play as playing
 import csac.training.train as training
 from csac.algorithms import ALGORITHMS, CSAC, SAC
-from csac.cli.options import Evaluate
 from csac.cli.parsing import value_of
-from csac.evaluation.evaluator import evaluate, evaluate_episodes
+from csac.record.config import RunConfig
 from csac.record.run import RunDirectory
+from csac.training.config import RUN_OPTIONS
 
-TRAINED = {
-    "steps": 1_000_000,
-    "environments": 1,
-    "seeds": 1,
-    "first_seed": 0,
-    "device": "cpu",
-    "evaluation_interval": 5_000,
-    "evaluation_environments": 10,
-    "evaluation_episodes": 10,
-    "evaluation_seed": 1_000_000,
-    "checkpoint_interval": 50_000,
-    "keep_checkpoints": 2,
-    "environment_arguments": {},
-    "perturbations": None,
-    "events": None,
-    "hindsight": 0,
-    "demonstrations": None,
-    "directory": None,
-    "resume": False,
-    "start_from": None,
-    "seeds_per_process": None,
-    "evaluation_processes": None,
-    "environment_processes": None,
-    "wandb": False,
-}
+
+def defaults(function):
+    return {name: item.default for name, item in inspect.signature(function).parameters.items()}
+
+
+# What `train` is called with if no option is typed: what is left out in Python.
+NOT_TYPED = {"algorithm", "task", "options", "tensorboard", "progress", "command"}
+NOT_TYPED |= {"callbacks", "on_evaluation", "stop_when"}
+TRAINED = {name: RunConfig.__dataclass_fields__[name].default for name in RUN_OPTIONS}
+TRAINED |= {"environment_arguments": {}, "perturbations": None, "events": None, "demonstrations": None}
+TRAINED |= {name: value for name, value in defaults(training.train).items() if name not in NOT_TYPED}
 
 
 def test_train_passes_its_options_on(train_call):
@@ -96,69 +82,47 @@ def test_train_without_options_uses_the_defaults(train_call):
     assert train_call("Hopper-v4") == {"algorithm": CSAC(), "task": "Hopper-v4", "command": command, **TRAINED}
 
 
-def test_python_has_the_defaults_of_the_command_line():
-    def defaults(function):
-        return {name: item.default for name, item in inspect.signature(function).parameters.items()}
-
-    here = defaults(training.train)
-    assert {name: value for name, value in here.items() if name in TRAINED} == {
-        name: value for name, value in TRAINED.items() if name in here
-    }
-    assert here["progress"] is defaults(training.resume)["progress"] is True
-    assert defaults(training.resume)["evaluation_processes"] is here["evaluation_processes"]
-    assert Evaluate.episodes == defaults(evaluate)["episodes"] == defaults(evaluate_episodes)["episodes"]
-
-
-def test_resume_passes_its_options_on(monkeypatch):
-    calls = calls_of(monkeypatch, training, "resume", make_set(Path("runs"), [[1.0]]))
-    line = "resume runs --steps 2e3 --trust-task"
-    assert csac(line) == csac("resume runs") == 0
-    assert calls == [
-        {"directory": Path("runs"), **options}
-        for options in (
-            {"steps": 2_000, "trust_task": True, "command": f"csac {line}"},
-            {"steps": None, "trust_task": False, "command": "csac resume runs"},
-        )
-    ]
-
-
-def test_evaluate_passes_its_options_on(monkeypatch):
-    make_runs("runs")
-    calls = calls_of(monkeypatch, playing, "evaluate_run")
-    line = "evaluate runs --seed 1 --checkpoint best --episodes 4 --processes 3 --stochastic"
-    assert csac(f"{line} --perturb friction=2 --perturb action_noise=0.1 --trust-task") == csac("evaluate runs") == 0
-    names = ("seed", "episodes", "deterministic", "perturbations", "processes", "trust_task", "which")
-    told = [
-        (1, 4, False, ("friction=2", "action_noise=0.1"), 3, True, "best"),
-        (None, 10, True, (), None, False, "last"),
-    ]
-    assert calls == [{"directory": Path("runs"), **dict(zip(names, values, strict=True))} for values in told]
-
-
-def test_play_passes_its_options_on(monkeypatch):
-    make_runs("runs")
-    calls = calls_of(monkeypatch, playing, "play")
-    line = "play runs --seed 1 --checkpoint best --episodes 4 --video film.mp4 --perturb friction=2 --trust-task"
-    assert csac(line) == csac("play runs") == 0
-    names = ("seed", "episodes", "video", "perturbations", "trust_task", "which")
-    told = [(1, 4, Path("film.mp4"), ("friction=2",), True, "best"), (None, 1, None, (), False, "last")]
-    assert calls == [{"directory": Path("runs"), **dict(zip(names, values, strict=True))} for values in told]
-
-
-def test_export_passes_its_options_on(monkeypatch):
-    make_runs("runs")
-    verification = {"observations": 0, "largest_difference": 0.0}
-    fields = {"verification": verification, "provenance": {"seed": 0, "steps": 10_000}}
-    exported = exporting.Exported(Path("there"), fields, [])
-    calls = calls_of(monkeypatch, exporting, "export_run", exported)
-    line = "export runs --seed 1 --checkpoint best --format onnx --out there --fallback middle --rate-limit 0.1"
-    assert csac(f"{line} --episodes 4 --card --trust-task") == csac("export runs") == 0
-    names = ("format", "seed", "which", "place", "fallback", "rate_limit", "episodes", "card", "trust_task")
-    told = [
-        ("onnx", 1, "best", Path("there"), "middle", 0.1, 4, True, True),
-        ("numpy", None, "last", None, None, None, 10, False, False),
-    ]
-    assert calls == [{"directory": Path("runs"), **dict(zip(names, values, strict=True))} for values in told]
+@pytest.mark.parametrize(
+    ("line", "module", "name", "given"),
+    [
+        ("resume runs --steps 2e3 --trust-task", training, "resume", {"steps": 2_000}),
+        (
+            "evaluate runs --seed 1 --checkpoint best --episodes 4 --processes 3 --stochastic --perturb friction=2 "
+            "--perturb action_noise=0.1 --trust-task",
+            playing,
+            "evaluate_run",
+            {"seed": 1, "which": "best", "episodes": 4, "processes": 3, "deterministic": False}
+            | {"perturbations": ("friction=2", "action_noise=0.1")},
+        ),
+        (
+            "play runs --seed 1 --checkpoint best --episodes 4 --video film.mp4 --perturb friction=2 --trust-task",
+            playing,
+            "play",
+            {"seed": 1, "which": "best", "episodes": 4, "video": Path("film.mp4"), "perturbations": ("friction=2",)},
+        ),
+        (
+            "export runs --seed 1 --checkpoint best --format onnx --out there --fallback middle --rate-limit 0.1 "
+            "--episodes 4 --card --trust-task",
+            exporting,
+            "export_run",
+            {"seed": 1, "which": "best", "format": "onnx", "place": Path("there"), "fallback": "middle"}
+            | {"rate_limit": 0.1, "episodes": 4, "card": True},
+        ),
+    ],
+)
+def test_commands_pass_their_options_on_and_have_the_defaults_of_python(monkeypatch, line, module, name, given):
+    fields = {"verification": {"observations": 0, "largest_difference": 0.0}}
+    exported = exporting.Exported(Path("there"), {**fields, "provenance": {"seed": 0, "steps": 10_000}}, [])
+    results = {"resume": make_runs("runs"), "export_run": exported}
+    left_out = defaults(getattr(module, name))
+    calls = calls_of(monkeypatch, module, name, results.get(name, ()))
+    assert csac(line) == csac(" ".join(line.split()[:2])) == 0
+    given = {**given, "directory": Path("runs"), "trust_task": True}
+    for call, expected in zip(
+        calls, (given, {key: left_out[key] for key in given} | {"directory": Path("runs")}), strict=True
+    ):
+        call.pop("command", None)
+        assert call == expected
 
 
 @pytest.mark.parametrize(

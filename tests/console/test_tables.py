@@ -108,11 +108,3 @@ def test_a_console_outlives_its_reader(monkeypatch):
 
     monkeypatch.setattr("sys.stdout", Closed())
     make_console().print("nobody reads this")
-
-
-@pytest.mark.parametrize("output", [None, io.StringIO()])
-def test_a_console_without_an_output_is_silent(monkeypatch, output):
-    if output:
-        output.close()
-    monkeypatch.setattr("sys.stdout", output)
-    make_console().print("nobody can read this")

@@ -178,7 +178,7 @@ def test_evaluate_writes_its_episodes_where_nothing_is(tmp_path, monkeypatch, ca
     expected = [(seed, 9, *episode[:4], *episode.events.values()) for seed in (0, 3) for episode in results[seed]]
     assert rows.tolist() == expected
     before = Path("cases.csv").read_bytes()
-    for name in ("cases.csv", "none/cases.csv", "cases.csv/x.csv", 300 * "x" + ".csv", "cases.txt", "."):
+    for name in ("cases.csv", "none/cases.csv", "cases.csv/x.csv", "."):
         assert main(["evaluate", "run", "--csv", name]) == 2
         assert capsys.readouterr().err.count("\n") == 1
     assert Path("cases.csv").read_bytes() == before

@@ -110,10 +110,6 @@ def test_where_few_seeds_are_left_there_is_no_interval():
     assert np.isnan(curve.high).tolist() == np.isnan(curve.low).tolist() == [False, False, True]
 
 
-def test_the_axis_has_the_limits_that_are_given():
-    assert axes_of(("csac", evaluations()), limits=(0.0, 1.0)).get_ylim() == (0.0, 1.0)
-
-
 def test_marks_are_vertical_lines_with_their_text():
     axes = axes_of(("csac", evaluations(1)), marks=[(30_000, "friction × 1.5")])
     assert np.asarray(axes.lines[-1].get_xdata()).tolist() == [30_000, 30_000]
@@ -125,11 +121,6 @@ def test_a_seed_that_ended_early_and_a_single_point_are_drawn():
     *_, mean, first, second, point = axes_of(("csac", rows[:-1]), ("sac", rows[:2])).lines
     assert np.asarray(mean.get_ydata())[-1] == rows["return"][-2]
     assert [line.get_marker() for line in (first, second, point)] == ["o", "o", "o"]
-
-
-@pytest.mark.parametrize("runs", [[], [("csac", evaluations(points=0))]])
-def test_nothing_to_draw_is_said(runs):
-    assert [text.get_text() for text in axes_of(*runs).texts] == ["no evaluations yet"]
 
 
 def test_pictures_need_neither_pyplot_nor_jax():

@@ -14,7 +14,6 @@ from csac.record.report_tables import (
 )
 from csac.record.summaries import (
     case_names,
-    cases,
     over_seeds,
     perturbation_recoveries,
     recoveries,
@@ -132,10 +131,6 @@ def test_each_perturbation_is_looked_at_as_far_as_the_next():
 
 def test_cases_are_shares_and_numbers_are_means():
     rows = rows_of([1.0] * 2, [1.0] * 2, crashed=[1, NAN, 0, 0], stops=[4, NAN, 1, 3])
-    crashed, stops = cases(rows)
-    assert (crashed.name, crashed.is_case, crashed.by_seed) == ("crashed", True, {0: 0.5, 1: 0.0})
-    assert (stops.name, stops.is_case, stops.by_seed) == ("stops", False, {0: 4.0, 1: 2.0})
-    assert (crashed.over_seeds.mean, stops.over_seeds.mean) == (0.25, 3.0)
     assert lines(case_table(rows)) == [
         ["per 1,000 rollouts (from 2 of each seed)", "seed 0", "seed 1", "mean ± std"],
         ["crashed", "500.0", "0.0", "250.0 ± 353.6"],

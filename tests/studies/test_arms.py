@@ -125,11 +125,6 @@ def test_a_study_knows_its_seeds_that_have_not_begun(tmp_path):
         gather(tiny_study(tmp_path, evaluation_interval=250), tmp_path)
 
 
-def test_nothing_there_is_said(tmp_path):
-    with pytest.raises(InputError, match="no run"):
-        read_arms([tmp_path])
-
-
 @pytest.mark.parametrize(
     ("one", "words"),
     [

@@ -10,7 +10,7 @@ from test_arms import config
 
 from csac.cli import main
 from csac.record.manifest import Origin
-from csac.record.rendering import EMPTY, Cell, Row, Table
+from csac.record.rendering import Table
 from csac.studies import paper
 from csac.studies.arms import Arm, gather, read_arms
 from csac.studies.report import (
@@ -27,7 +27,6 @@ from csac.studies.report import (
     write,
 )
 from csac.studies.study import find
-from csac.types import InputError
 
 HEIGHTS = {"csac": 3_000.0, "sac": 2_000.0, "ppo": 1_000.0, "td3": 2_500.0, "sd3": 2_200.0}
 
@@ -79,21 +78,6 @@ def test_a_report_in_markdown_has_its_pictures_beside_it(tmp_path):
     (picture,) = re.findall(r"!\[Ant-v4\]\((.*)\)", page)
     assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
     assert "| SAC | Ant-v4 | 0 | 1,000 | 1 finished |" in page
-
-
-def test_a_table_is_escaped_and_says_what_a_row_is(tmp_path):
-    rows = Row((Cell("<c>"), EMPTY), "failed"), Row((Cell("mean"), Cell("never", float("inf"))), "summary")
-    write(tmp_path / "page.html", "x", [Table(("run", "return"), rows, "T & U", "2 seeds: no interval")])
-    lines = (tmp_path / "page.html").read_text().splitlines()
-    assert lines[lines.index("<table>") + 1 : lines.index("</table>")] == [
-        "<caption>T &amp; U</caption>",
-        '<thead><tr><th scope="col">run</th><th scope="col" class="number">return</th></tr></thead>',
-        "<tbody>",
-        '<tr class="failed"><td>&lt;c&gt;</td><td class="number"></td></tr>',
-        '<tr class="summary"><td>mean</td><td class="number">never</td></tr>',
-        "</tbody>",
-        '<tfoot><tr><td colspan="2">2 seeds: no interval</td></tr></tfoot>',
-    ]
 
 
 @pytest.mark.parametrize(
@@ -238,8 +222,3 @@ def test_the_report_of_a_study_is_of_what_is_there(tmp_path, capsys):
 def test_an_arm_without_runs_is_no_obstacle():
     parts = report_of([Arm("sac", "Ant-v4", (), missing=[0])], ["csac study report x"], ["curves"])
     assert "0 at step 0" in " ".join(part for part in parts if isinstance(part, str))
-
-
-def test_no_report_replaces_what_is_no_report(tmp_path):
-    with pytest.raises(InputError, match=r"name it .*notes\.html"):
-        write(tmp_path / "notes.txt", "x", [])
