@@ -10,7 +10,6 @@ import signal
 import sys
 import time
 from contextlib import contextmanager, suppress
-from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -108,24 +107,10 @@ def outlive_termination() -> None:
     a task would send its simulator a SIGTERM without effect, and wait for it for ever. What a terminal sends to all its
     processes, a Ctrl-C or a hang-up, stays blocked: simulators live until their seeds are saved.
     """
-    before = signal.signal(signal.SIGTERM, _ignore_signal)
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
     signal.siginterrupt(signal.SIGTERM, False)  # native code may not expect interrupted system calls
-    block, unblock = (
-        partial(signal.pthread_sigmask, how, {signal.SIGTERM}) for how in (signal.SIG_BLOCK, signal.SIG_UNBLOCK)
-    )
-
-    def restore() -> None:
-        if signal.getsignal(signal.SIGTERM) is _ignore_signal:  # the task has set no other
-            signal.signal(signal.SIGTERM, before)
-        unblock()
-
-    # For forks without an exec: a SIGTERM reaches the child only after its handler is restored.
-    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=restore)
-    unblock()
-
-
-def _ignore_signal(*_: Any) -> None:
-    """Handle a signal by doing nothing."""
+    os.register_at_fork(after_in_child=lambda: signal.signal(signal.SIGTERM, before))  # for forks without an exec
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
 def script() -> Path | None:
@@ -154,27 +139,20 @@ class Child:
     It dies with this process, and ignores SIGTERM.
     """
 
-    _at_exit: Finalize | None = None
-
     def __init__(self, work: Callable[..., None], *arguments: Any) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, child_connection = context.Pipe()
         before = os.environ.get(_SAFE_PATH)
         self.process = context.Process(target=_run_child, args=(before, work, child_connection, *arguments))
-        try:
-            with safe_path(), worker_settings(), _hide_missing_script():
-                self.process.start()
-        except BaseException:  # a Ctrl-C that was blocked while the process started
-            if self.process.pid:
-                self.kill()
-            raise
+        with safe_path(), worker_settings(), _hide_missing_script():
+            self.process.start()
+            # At exit, Python joins its child processes; one that nobody has closed would wait for messages for ever.
+            self._at_exit = Finalize(None, _kill, (self.process,), exitpriority=0)
         child_connection.close()
-        # At exit, Python joins its child processes; one that nobody has closed would wait for messages for ever.
-        self._at_exit = Finalize(None, _kill, (self.process,), exitpriority=0)
 
     def tell(self, message: Any) -> None:
         """Send a message; if the process is dead, the next receive shows it."""
-        with suppress(BrokenPipeError, ConnectionResetError):
+        with suppress(OSError):
             self.connection.send(message)
 
     def cause_of_death(self) -> str:
@@ -196,8 +174,7 @@ class Child:
         """End the process at once, and wait until it is gone."""
         _kill(self.process)
         self.connection.close()
-        if self._at_exit:
-            self._at_exit.cancel()
+        self._at_exit.cancel()
 
 
 def _run_child(safe_path: str | None, work: Callable[..., None], *arguments: Any) -> None:

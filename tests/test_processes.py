@@ -110,8 +110,11 @@ def end_what_a_task_starts(connection: Connection) -> None:
     """Be told to end, in vain; then tell a program and a forked process to, and send how they did."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.raise_signal(number)
-    forked = multiprocessing.get_context("fork").Process(target=signal.pause, daemon=True)
+    context = multiprocessing.get_context("fork")
+    begun = context.Event()
+    forked = context.Process(target=lambda: (begun.set(), signal.pause()), daemon=True)
     forked.start()
+    begun.wait(30)
     forked.terminate()
     forked.join(30)
     ends: list[int | None] = [forked.exitcode]

@@ -170,8 +170,7 @@ class EvaluationPool:
         """
         workers, self._workers = self._workers, []
         for worker in workers:
-            if worker.process.is_alive():
-                worker.tell(None)  # closing the pipe is not enough if a child forked by a task holds it open
+            worker.tell(None)  # closing the pipe is not enough if a child forked by a task holds it open
         end(workers)
 
     def _start(self, processes: int) -> None:

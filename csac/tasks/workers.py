@@ -57,8 +57,7 @@ class Workers:
     def close(self) -> None:
         """Have the processes close their environments and end."""
         for worker in self._workers:
-            with suppress(OSError):
-                worker.tell(None)
+            worker.tell(None)
         end(self._workers)
 
 
@@ -75,8 +74,7 @@ class RemoteEnvironment:
 
     def ask(self, method: str, *arguments: Any) -> None:
         """Start a call in the worker; the next call of the method returns its result."""
-        with suppress(OSError):  # the process is dead: `answer` reports it
-            self._worker.tell((self._index, method, arguments))
+        self._worker.tell((self._index, method, arguments))
         self._is_pending = True
 
     def __getattr__(self, method: str) -> Callable[..., Any]:
