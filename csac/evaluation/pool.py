@@ -5,14 +5,13 @@ The workers run NumPy and the task; they do not import JAX.
 
 from __future__ import annotations
 
-import pickle
 from collections import deque
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING
 
+from csac.checks import check_whole
 from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure
 from csac.processes import Child, cores_to_use, end
-from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -141,14 +140,7 @@ class EvaluationPool:
     """
 
     def __init__(self, evaluator: Evaluator, processes: int) -> None:
-        if processes < 1:
-            raise InputError(f"{processes} processes: use at least one")
-        try:
-            pickle.dumps(evaluator)
-        except Exception as error:
-            raise InputError(
-                f"the task cannot be sent to another process: make it a module's function ({error})"
-            ) from None
+        check_whole("processes", processes, 1, 1_000)
         self._evaluator, self._processes = evaluator, processes
         self._workers: list[Child] = []
 
