@@ -9,10 +9,10 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-import re
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from numbers import Real
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +40,6 @@ NOISES = ("observation_noise", "action_noise")
 KINDS = (*PHYSICS, *NOISES)
 
 _EXAMPLE = "friction=1.5@300000"
-_PATTERN = re.compile(r"(?P<kind>[^=@]+?)\s*=(?P<value>[^=@]+)(?:@(?P<step>[^=@]+))?")
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Perturbation:
         if self.kind not in KINDS:
             raise InputError(f"no perturbation is called {self.kind!r}: there are {', '.join(KINDS)}")
         check_whole(f"the step of {self.kind}", self.step, 0, STEPS_LIMIT)
-        number = math.nan if isinstance(self.value, str | bool) else _number(self.value)
+        number = math.nan if isinstance(self.value, bool) or not isinstance(self.value, Real) else float(self.value)
         if not 0 <= number < math.inf or (self.kind == "mass" and not number):
             what = "factor" if self.kind in PHYSICS else "standard deviation"
             least = "above 0" if self.kind == "mass" else "of 0 or more"
@@ -71,13 +70,16 @@ class Perturbation:
     @classmethod
     def parse(cls, text: str) -> Perturbation:
         """Return the perturbation that `KIND=VALUE@STEP` or `KIND=VALUE` describes. Raise InputError if malformed."""
-        match = _PATTERN.fullmatch(text.strip())
-        value, step = (_number(match[name] or "0") if match else math.nan for name in ("value", "step"))
-        if match is None or math.isnan(value) or not step.is_integer():  # a step may be written as 3e5
+        kind, _, rest = text.partition("=")
+        value, at, step = rest.partition("@")
+        try:
+            number, begin = float(value), float(step) if at else 0.0
+        except ValueError:
             raise InputError(
                 f"a perturbation is written KIND=VALUE or KIND=VALUE@STEP, as {_EXAMPLE}, not {text!r:.60}"
-            )
-        return cls(match["kind"].replace("-", "_"), value, int(step))
+            ) from None
+        begin = int(begin) if begin.is_integer() else begin  # a step may be written as 3e5
+        return cls(kind.strip().replace("-", "_"), number, begin)  # pyright: ignore[reportArgumentType]
 
     def __str__(self) -> str:
         return f"{self.kind}={repr(self.value).removesuffix('.0')}" + (f"@{self.step}" if self.step else "")
@@ -147,14 +149,6 @@ def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:
     """Return (step, labels of the perturbations that start there), in order of the steps."""
     groups = itertools.groupby(perturbations_of(perturbations), attrgetter("step"))
     return [(step, ", ".join(item.label for item in group)) for step, group in groups]
-
-
-def _number(value: object) -> float:
-    """Return a value as a float, or nan if it is not a number."""
-    try:
-        return float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError, OverflowError):
-        return math.nan
 
 
 class Physics:

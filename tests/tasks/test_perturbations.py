@@ -63,7 +63,6 @@ def test_what_is_written_is_what_is_meant(text, kind, value, step):
         ("friction=2@soon", "soon"),
         ("friction=2@1.5", "1.5"),
         ("friction=2@inf", "inf"),
-        ("friction=2@1" + 5000 * "0", "friction=2@1"),
         ("friction=-1", "friction takes .* -1.0"),
         ("gravity=nan", "gravity"),
         ("mass=0", "mass takes a finite factor above 0"),
@@ -80,9 +79,7 @@ def test_a_mistake_is_one_line(text, name):
     assert len(str(refusal.value)) < 200
 
 
-@pytest.mark.parametrize(
-    "given", [("friction", 10**5000), ("friction", 2, 10**5000), ("friction", 2.0, 1.5), ("friction", "2")]
-)
+@pytest.mark.parametrize("given", [("friction", 2, 10**5000), ("friction", 2.0, 1.5), ("friction", "2")])
 def test_objects_are_checked_too(given: Any):
     with pytest.raises(InputError, match="friction"):
         Perturbation(*given)
