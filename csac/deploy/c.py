@@ -107,14 +107,14 @@ def _in_comment(text: str) -> str:
     return re.sub(r"[^\w.:/ -]", "_", text)
 
 
-def compile_c(*arguments: str | Path, program: str = "cc") -> None:
-    """Run a C compiler. Raises InputError if it is not found, or with its first error message."""
-    if shutil.which(program) is None:
-        raise InputError(f"an artefact in C needs a C compiler, and {program} is not found: install gcc or clang")
-    result = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
+def compile_c(*arguments: str | Path) -> None:
+    """Run the C compiler. Raises InputError if it is not found, or with its first error message."""
+    if shutil.which("cc") is None:
+        raise InputError("an artefact in C needs a C compiler, and cc is not found: install gcc or clang")
+    result = subprocess.run(["cc", *map(str, arguments)], capture_output=True, text=True)
     if result.returncode:
         complaint = next((line for line in result.stderr.splitlines() if "error" in line), result.stderr)
-        raise InputError(f"{program} does not compile the policy: {' '.join(complaint.split())}")
+        raise InputError(f"cc does not compile the policy: {' '.join(complaint.split())}")
 
 
 class Library:

@@ -57,10 +57,7 @@ class Policy:
 
     def _check(self) -> None:
         """Raise InputError if the layers do not fit each other or the contract."""
-        (observation_size, action_size), network = self.contract.spec[:2], self.network
-        kinds = (network.activation, network.head, network.critic_activation)
-        if kinds != (self.contract.activation, self.contract.head, self.contract.critic_activation):
-            raise InputError(f"the policy is {network.activation}/{network.head}, not as its contract says")
+        observation_size, action_size = self.contract.spec[:2]
         try:
             arguments = np.zeros((1, observation_size), np.float32), False, np.zeros((1, action_size), np.float32)
             fits = self.act(*arguments).shape == (1, action_size)
