@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from multiprocessing.context import SpawnProcess
 
 # How long to wait for the exit code of a process whose pipe has closed.
@@ -42,13 +42,13 @@ def usable_cores() -> list[int]:
     return list(range(os.cpu_count() or 1))
 
 
-def core_quota(folders: Iterable[Path] | None = None) -> int | None:
+def core_quota() -> int | None:
     """Return the CPU time that this process is allowed, in cores, rounded up; None without a quota.
 
-    A container with a quota still sees every core of its machine. `folders` are its control groups.
+    A container with a quota still sees every core of its machine.
     """
     quotas = []
-    for folder in control_groups() if folders is None else folders:
+    for folder in control_groups():
         with suppress(OSError, ValueError):
             quota, period = (folder / "cpu.max").read_text().split()
             quotas.append(max(1, math.ceil(int(quota) / int(period))))  # "max" raises ValueError
@@ -60,13 +60,13 @@ def cores_to_use() -> int:
     return len(usable_cores()[: core_quota()])
 
 
-def memory_left(folders: Iterable[Path] | None = None) -> int | None:
+def memory_left() -> int | None:
     """Return the bytes left to this process below its container's limit, or None without a limit.
 
-    The cache of files, which can be read again, counts as free. `folders` are as in `core_quota`.
+    The cache of files, which can be read again, counts as free.
     """
     left = []
-    for folder in control_groups() if folders is None else folders:
+    for folder in control_groups():
         with suppress(OSError, ValueError):
             limit, used = (int((folder / f"memory.{name}").read_text()) for name in ("max", "current"))
             statistics = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())

@@ -50,8 +50,6 @@ def observation_parts(space: object) -> Parts:
         if not math.prod(part.shape):
             raise InputError(f"{name} is empty: its shape is {part.shape}")
         parts.append((key, tuple(part.shape)))
-    if not parts:
-        raise InputError("the observation is an empty Dict")
     return tuple(parts)
 
 
@@ -107,16 +105,11 @@ def part(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
         raise EnvironmentFailure(f"{name} is not an array of numbers: {one_line(error)}") from error
     if array.shape != shape:
         raise EnvironmentFailure(f"{name} has shape {array.shape} where its space has {shape}")
-    check_finite(flat, shape, name)
-    return flat
-
-
-def check_finite(flat: np.ndarray, shape: tuple[int, ...], name: str) -> None:
-    """Raise EnvironmentFailure for the first non-finite number, with its index in an array of this `shape`."""
     bad = np.flatnonzero(~np.isfinite(flat))
     if bad.size:
         place = ", ".join(str(i) for i in np.unravel_index(bad[0], shape))
         raise EnvironmentFailure(f"{name}{f'[{place}]' if place else ''} is {flat[bad[0]]}")
+    return flat
 
 
 def scalar(reward: Any) -> float:
