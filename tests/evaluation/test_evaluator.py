@@ -371,7 +371,6 @@ def test_a_foreign_action_of_the_wrong_shape_is_named():
     ("given", "name"),
     [
         ({"episodes": 0}, "episodes"),
-        ({"episodes": 2.5}, "episodes"),
         ({"episodes": "3"}, "episodes"),
         ({"episodes": 1, "first_seed": -5}, "first_seed"),
         ({"deterministic": "no"}, "deterministic"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import runpy
 from contextlib import closing
 from pathlib import Path
@@ -105,14 +104,6 @@ def test_play_breaks_off_an_episode_that_never_ends(run_of, tmp_path, monkeypatc
     )
     assert episode.length == 5
     assert told[-1] == (5, 5)
-
-
-def test_a_task_that_changes_the_working_directory_moves_no_video(run_of, tmp_path, monkeypatch):
-    reset = Stripes.reset
-    monkeypatch.setattr(Stripes, "reset", lambda self, **given: (os.chdir(tmp_path.parent), reset(self, **given))[1])
-    monkeypatch.chdir(tmp_path)
-    list(play(run_of(3).path, video="film.mp4"))
-    assert (tmp_path / "film.mp4").stat().st_size
 
 
 def test_a_task_whose_spaces_have_changed_is_not_played(run_of, tmp_path):
