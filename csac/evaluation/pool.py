@@ -144,15 +144,11 @@ class EvaluationPool:
         self._evaluator, self._processes = evaluator, processes
         self._workers: list[Child] = []
 
-    def start(self) -> None:
-        """Start all processes that are not running, so that an evaluation need not wait for them."""
-        self._start(self._processes)
-
     def begin(
         self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
     ) -> Pending:
         """Start an evaluation and return at once. The previous one must be over; after a stop, close the pool first."""
-        self._start(min(self._processes, len(self._evaluator.batches(len(policies)))))
+        self.start(len(self._evaluator.batches(len(policies))))
         return Pending(self._evaluator, policies, deterministic, on_progress, self._workers)
 
     def close(self) -> None:
@@ -165,11 +161,12 @@ class EvaluationPool:
             worker.tell(None)  # closing the pipe is not enough if a child forked by a task holds it open
         end(workers)
 
-    def _start(self, processes: int) -> None:
+    def start(self, processes: int) -> None:
+        """Start processes until there are so many, or as many as the pool has, so that an evaluation need not wait."""
         for worker in [worker for worker in self._workers if not worker.process.is_alive()]:
             worker.kill()
             self._workers.remove(worker)
-        while len(self._workers) < processes:
+        while len(self._workers) < min(self._processes, processes):
             self._evaluator.close()  # workers get the evaluator without open environments
             self._workers.append(Child(_serve, self._evaluator))
 
