@@ -142,8 +142,7 @@ class Child:
     def __init__(self, work: Callable[..., None], *arguments: Any) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, child_connection = context.Pipe()
-        before = os.environ.get(_SAFE_PATH)
-        self.process = context.Process(target=_run_child, args=(before, work, child_connection, *arguments))
+        self.process = context.Process(target=_run_child, args=(work, child_connection, *arguments))
         with safe_path(), worker_settings(), _hide_missing_script():
             self.process.start()
             # At exit, Python joins its child processes; one that nobody has closed would wait for messages for ever.
@@ -177,11 +176,9 @@ class Child:
         self._at_exit.cancel()
 
 
-def _run_child(safe_path: str | None, work: Callable[..., None], *arguments: Any) -> None:
-    """Run a child's work, with the parent's PYTHONSAFEPATH restored for the child's own children."""
-    os.environ.pop(_SAFE_PATH, None)
-    if safe_path is not None:
-        os.environ[_SAFE_PATH] = safe_path
+def _run_child(work: Callable[..., None], *arguments: Any) -> None:
+    """Run a child's work."""
+    os.environ.pop(_SAFE_PATH)  # the child's own children need not have it
     die_with_parent()
     outlive_termination()
     work(*arguments)

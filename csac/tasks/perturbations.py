@@ -166,7 +166,6 @@ class Physics:
         self._task_name = task_name
         self._original = copy.copy(self._model)
         self._factors = dict.fromkeys(PHYSICS, 1.0)
-        self._scaled: dict[str, np.ndarray] = {}  # scaled values by array name, of the kinds whose factor is not 1
 
     def set(self, factors: Mapping[str, float]) -> None:
         """Scale the model from the next step on; a kind that is missing has the factor 1.
@@ -183,19 +182,18 @@ class Physics:
         if "mass" in changed:
             self._renew_constants()
         self._factors = wanted
-        names = (name for kind, factor in wanted.items() if factor != 1.0 for name in _SCALED[kind])
-        self._scaled = {name: attrgetter(name)(self._model).copy() for name in names}
 
     def undone(self) -> str | None:
         """Return an error message if a reset has undone the scaling, else None.
 
         Tasks that randomise their physics at each reset do so. The check takes a few microseconds.
         """
-        is_same = not self._scaled or getattr(self._environment, "model", None) is self._model
-        if is_same and all((attrgetter(name)(self._model) == array).all() for name, array in self._scaled.items()):
+        factors = {kind: factor for kind, factor in self._factors.items() if factor != 1.0}
+        scaled = ((attrgetter(name), factor) for kind, factor in factors.items() for name in _SCALED[kind])
+        is_same = not factors or getattr(self._environment, "model", None) is self._model
+        if is_same and all((of(self._model) == of(self._original) * factor).all() for of, factor in scaled):
             return None
-        kinds = " and ".join(kind for kind, factor in self._factors.items() if factor != 1.0)
-        return f"{self._task_name} sets its own physics at reset: {kinds} cannot be perturbed"
+        return f"{self._task_name} sets its own physics at reset: {' and '.join(factors)} cannot be perturbed"
 
     def _renew_constants(self) -> None:
         """Recompute the model constants derived from masses, using separate MjData to leave the episode untouched."""
