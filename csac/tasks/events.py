@@ -48,8 +48,6 @@ def number(value: Any) -> bool | float | None:
 
 def numbers(value: Any) -> np.ndarray | None:
     """Return booleans or finite numbers as an array, and None for anything else."""
-    if value is None or isinstance(value, str | bytes):
-        return None
     try:
         array = np.asarray(value)
     except Exception:  # `info` may hold anything

@@ -129,7 +129,6 @@ def test_predict_takes_dicts_dicts_of_batches_and_flat_observations():
             {"speed": 1.0, "position": [[1, 2]], "achieved": [1]},
             r"observation\['achieved'\] has shape \(1,\)",
         ),
-        (DICT_PARTS, {"speed": [1, 2], "position": [[1, 2]], "achieved": [1, 2]}, "differ in batch size"),
         (DICT_PARTS, np.zeros(4), "takes a dict of"),
     ],
 )
