@@ -10,7 +10,6 @@ import signal
 import sys
 import time
 from contextlib import contextmanager, suppress
-from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from multiprocessing.context import SpawnProcess
 
 # How long to wait for the exit code of a process whose pipe has closed.
@@ -43,13 +42,13 @@ def usable_cores() -> list[int]:
     return list(range(os.cpu_count() or 1))
 
 
-def core_quota(folders: Iterable[Path] | None = None) -> int | None:
+def core_quota() -> int | None:
     """Return the CPU time that this process is allowed, in cores, rounded up; None without a quota.
 
-    A container with a quota still sees every core of its machine. `folders` are its control groups.
+    A container with a quota still sees every core of its machine.
     """
     quotas = []
-    for folder in control_groups() if folders is None else folders:
+    for folder in control_groups():
         with suppress(OSError, ValueError):
             quota, period = (folder / "cpu.max").read_text().split()
             quotas.append(max(1, math.ceil(int(quota) / int(period))))  # "max" raises ValueError
@@ -61,13 +60,13 @@ def cores_to_use() -> int:
     return len(usable_cores()[: core_quota()])
 
 
-def memory_left(folders: Iterable[Path] | None = None) -> int | None:
+def memory_left() -> int | None:
     """Return the bytes left to this process below its container's limit, or None without a limit.
 
-    The cache of files, which can be read again, counts as free. `folders` are as in `core_quota`.
+    The cache of files, which can be read again, counts as free.
     """
     left = []
-    for folder in control_groups() if folders is None else folders:
+    for folder in control_groups():
         with suppress(OSError, ValueError):
             limit, used = (int((folder / f"memory.{name}").read_text()) for name in ("max", "current"))
             statistics = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
@@ -108,24 +107,10 @@ def outlive_termination() -> None:
     a task would send its simulator a SIGTERM without effect, and wait for it for ever. What a terminal sends to all its
     processes, a Ctrl-C or a hang-up, stays blocked: simulators live until their seeds are saved.
     """
-    before = signal.signal(signal.SIGTERM, _ignore_signal)
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
     signal.siginterrupt(signal.SIGTERM, False)  # native code may not expect interrupted system calls
-    block, unblock = (
-        partial(signal.pthread_sigmask, how, {signal.SIGTERM}) for how in (signal.SIG_BLOCK, signal.SIG_UNBLOCK)
-    )
-
-    def restore() -> None:
-        if signal.getsignal(signal.SIGTERM) is _ignore_signal:  # the task has set no other
-            signal.signal(signal.SIGTERM, before)
-        unblock()
-
-    # For forks without an exec: a SIGTERM reaches the child only after its handler is restored.
-    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=restore)
-    unblock()
-
-
-def _ignore_signal(*_: Any) -> None:
-    """Handle a signal by doing nothing."""
+    os.register_at_fork(after_in_child=lambda: signal.signal(signal.SIGTERM, before))  # for forks without an exec
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
 def script() -> Path | None:
@@ -154,27 +139,19 @@ class Child:
     It dies with this process, and ignores SIGTERM.
     """
 
-    _at_exit: Finalize | None = None
-
     def __init__(self, work: Callable[..., None], *arguments: Any) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, child_connection = context.Pipe()
-        before = os.environ.get(_SAFE_PATH)
-        self.process = context.Process(target=_run_child, args=(before, work, child_connection, *arguments))
-        try:
-            with safe_path(), worker_settings(), _hide_missing_script():
-                self.process.start()
-        except BaseException:  # a Ctrl-C that was blocked while the process started
-            if self.process.pid:
-                self.kill()
-            raise
+        self.process = context.Process(target=_run_child, args=(work, child_connection, *arguments))
+        with safe_path(), worker_settings(), _hide_missing_script():
+            self.process.start()
+            # At exit, Python joins its child processes; one that nobody has closed would wait for messages for ever.
+            self._at_exit = Finalize(None, _kill, (self.process,), exitpriority=0)
         child_connection.close()
-        # At exit, Python joins its child processes; one that nobody has closed would wait for messages for ever.
-        self._at_exit = Finalize(None, _kill, (self.process,), exitpriority=0)
 
     def tell(self, message: Any) -> None:
         """Send a message; if the process is dead, the next receive shows it."""
-        with suppress(BrokenPipeError, ConnectionResetError):
+        with suppress(OSError):
             self.connection.send(message)
 
     def cause_of_death(self) -> str:
@@ -196,15 +173,12 @@ class Child:
         """End the process at once, and wait until it is gone."""
         _kill(self.process)
         self.connection.close()
-        if self._at_exit:
-            self._at_exit.cancel()
+        self._at_exit.cancel()
 
 
-def _run_child(safe_path: str | None, work: Callable[..., None], *arguments: Any) -> None:
-    """Run a child's work, with the parent's PYTHONSAFEPATH restored for the child's own children."""
-    os.environ.pop(_SAFE_PATH, None)
-    if safe_path is not None:
-        os.environ[_SAFE_PATH] = safe_path
+def _run_child(work: Callable[..., None], *arguments: Any) -> None:
+    """Run a child's work."""
+    os.environ.pop(_SAFE_PATH)  # the child's own children need not have it
     die_with_parent()
     outlive_termination()
     work(*arguments)
@@ -282,7 +256,6 @@ def cause_of_death(exit_code: int) -> str:
     """Return how a process ended unexpectedly, as the end of a sentence."""
     if exit_code >= 0:
         return f"its process ended by itself with exit code {exit_code} (does the task call os._exit?)"
-    names = {one.value: one.name for one in signal.Signals}
-    name = names.get(-exit_code, f"signal {-exit_code}")  # a real-time signal has no name
+    name = signal.Signals(-exit_code).name
     hints = {"SIGKILL": " (out of memory?)", "SIGSEGV": " (a fault in native code, such as the task's simulator)"}
     return f"its process was killed by {name}{hints.get(name, '')}"

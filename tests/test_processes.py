@@ -16,13 +16,11 @@ import pytest
 
 from csac.processes import (
     Child,
-    cause_of_death,
     control_groups,
     core_quota,
     end,
     may_be_imported,
     memory_left,
-    move_to,
 )
 
 
@@ -44,19 +42,6 @@ def test_a_process_that_ended_is_not_said_to_have_been_killed():
             child.connection.recv()
         assert re.search(cause, child.cause_of_death())
         assert not child.process.is_alive()
-
-
-@pytest.mark.parametrize(
-    ("exit_code", "cause"),
-    [
-        (0, "its process ended by itself with exit code 0 (does the task call os._exit?)"),
-        (-9, "its process was killed by SIGKILL (out of memory?)"),
-        (-15, "its process was killed by SIGTERM"),
-        (-63, "its process was killed by signal 63"),
-    ],
-)
-def test_what_is_known_of_an_end_is_said(exit_code, cause):
-    assert cause_of_death(exit_code) == cause
 
 
 def test_a_script_without_a_guard_is_told_so_in_one_line(tmp_path):
@@ -110,8 +95,11 @@ def end_what_a_task_starts(connection: Connection) -> None:
     """Be told to end, in vain; then tell a program and a forked process to, and send how they did."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.raise_signal(number)
-    forked = multiprocessing.get_context("fork").Process(target=signal.pause, daemon=True)
+    context = multiprocessing.get_context("fork")
+    begun = context.Event()
+    forked = context.Process(target=lambda: (begun.set(), signal.pause()), daemon=True)
     forked.start()
+    begun.wait(30)
     forked.terminate()
     forked.join(30)
     ends: list[int | None] = [forked.exitcode]
@@ -210,19 +198,8 @@ def test_a_process_dies_with_its_parent(tmp_path):
             pytest.fail("the child outlived its parent")
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux moves threads")
-def test_a_thread_that_ends_meanwhile_keeps_no_other_where_it_was(monkeypatch):
-    moved = []
-
-    def move(thread: int, _: list[int]) -> None:
-        if thread == 2:
-            raise ProcessLookupError
-        moved.append(thread)
-
-    monkeypatch.setattr(os, "listdir", lambda _: ["1", "2", "3"])
-    monkeypatch.setattr(os, "sched_setaffinity", move)
-    move_to([0])
-    assert moved == [1, 3]
+def within(monkeypatch: pytest.MonkeyPatch, groups: list[Path]) -> None:
+    monkeypatch.setattr("csac.processes.control_groups", lambda: groups)
 
 
 def limited(folder: Path, **files: str) -> Path:
@@ -236,24 +213,28 @@ def limited(folder: Path, **files: str) -> Path:
 @pytest.mark.parametrize(
     ("text", "cores"), [("200000 100000\n", 2), ("150000 100000", 2), ("1000 100000", 1), ("max 100000\n", None)]
 )
-def test_a_container_s_share_of_its_processors(tmp_path, text, cores):
-    assert core_quota([limited(tmp_path, cpu_max=text)]) == cores
+def test_a_container_s_share_of_its_processors(tmp_path, monkeypatch, text, cores):
+    within(monkeypatch, [limited(tmp_path, cpu_max=text)])
+    assert core_quota() == cores
 
 
-def test_the_tightest_of_the_limits_around_a_process_holds(tmp_path):
+def test_the_tightest_of_the_limits_around_a_process_holds(tmp_path, monkeypatch):
     inner = limited(tmp_path / "job", cpu_max="400000 100000", memory_max="500", memory_current="100", memory_stat="")
     outer = limited(tmp_path, cpu_max="300000 100000", memory_max="max", memory_current="7", memory_stat="")
     (tmp_path / "listed").write_text("4:memory:/other\n0::/job\n")
     groups = control_groups(tmp_path / "listed", tmp_path)
     assert groups == [inner, outer]
-    assert (core_quota(groups), memory_left(groups)) == (3, 400)
+    within(monkeypatch, groups)
+    assert (core_quota(), memory_left()) == (3, 400)
 
 
-def test_what_was_only_read_from_files_counts_as_free(tmp_path):
+def test_what_was_only_read_from_files_counts_as_free(tmp_path, monkeypatch):
     files = {"memory_max": "1000", "memory_current": "900", "memory_stat": "anon 200\ninactive_file 600\n"}
-    assert memory_left([limited(tmp_path, **files)]) == 700
+    within(monkeypatch, [limited(tmp_path, **files)])
+    assert memory_left() == 700
 
 
-def test_where_there_are_no_control_groups_nothing_is_limited(tmp_path):
-    groups = control_groups(tmp_path / "none", tmp_path)
-    assert (groups, core_quota(groups), memory_left([tmp_path])) == ([], None, None)
+def test_where_there_are_no_control_groups_nothing_is_limited(tmp_path, monkeypatch):
+    assert control_groups(tmp_path / "none", tmp_path) == []
+    within(monkeypatch, [tmp_path])
+    assert (core_quota(), memory_left()) == (None, None)

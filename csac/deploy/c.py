@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import math
 import re
 import shutil
 import subprocess
@@ -96,8 +95,6 @@ def _in_blocks(weight: np.ndarray) -> np.ndarray:
 
 def _number(number: float) -> str:
     """Return a float32 number as text that C reads back exactly."""
-    if not math.isfinite(number):
-        raise InputError(f"the policy has a number {number}, which cannot be written in C")
     text = f"{number:.9g}"
     return text if "." in text or "e" in text else text + ".0"
 
@@ -107,14 +104,14 @@ def _in_comment(text: str) -> str:
     return re.sub(r"[^\w.:/ -]", "_", text)
 
 
-def compile_c(*arguments: str | Path, program: str = "cc") -> None:
-    """Run a C compiler. Raises InputError if it is not found, or with its first error message."""
-    if shutil.which(program) is None:
-        raise InputError(f"an artefact in C needs a C compiler, and {program} is not found: install gcc or clang")
-    result = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
+def compile_c(*arguments: str | Path) -> None:
+    """Run the C compiler. Raises InputError if it is not found, or with its first error message."""
+    if shutil.which("cc") is None:
+        raise InputError("an artefact in C needs a C compiler, and cc is not found: install gcc or clang")
+    result = subprocess.run(["cc", *map(str, arguments)], capture_output=True, text=True)
     if result.returncode:
         complaint = next((line for line in result.stderr.splitlines() if "error" in line), result.stderr)
-        raise InputError(f"{program} does not compile the policy: {' '.join(complaint.split())}")
+        raise InputError(f"cc does not compile the policy: {' '.join(complaint.split())}")
 
 
 class Library:

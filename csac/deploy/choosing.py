@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from numbers import Integral
 from pathlib import Path
 from typing import get_args
 
@@ -70,9 +69,7 @@ def has_policy(run: RunDirectory, which: Which) -> bool:
 def choose_run(runs: RunSet, seed: int | None = None, which: Which = "last") -> RunDirectory:
     """Return the run whose policy `load` returns. Raises InputError as `load` does."""
     if seed is not None:
-        if isinstance(seed, bool) or not isinstance(seed, Integral):
-            raise InputError(f"seed must be a seed's label, a whole number, not {seed!r:.40}")
-        return runs.run(int(seed))
+        return runs.run(seed)
     candidates = [run for run in runs.runs if run.manifest.state != "failed" and has_policy(run, which)]
     if not candidates and runs.failures:
         failed, reason = next(iter(runs.failures.items()))

@@ -130,8 +130,6 @@ class Contract:
             if (flat := _flat(array, shape)) is None:
                 raise InputError(f"observation[{key!r}] has shape {array.shape}; the policy takes {shape}, or a batch")
             parts.append(flat)
-        if len({part.shape[:-1] for part in parts}) > 1:
-            raise InputError("the parts of the observation differ in batch size: give every key as many rows")
         return np.concatenate(parts, axis=-1)
 
 

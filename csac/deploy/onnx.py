@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 from typing import TYPE_CHECKING, Any
 
@@ -32,12 +32,8 @@ def model(policy: Policy, guards: Guards, fields: dict[str, Any]) -> bytes:
     first and after a reset, then the last `next_state`. Outputs: `action` [n, action] on the environment's scale, and
     `next_state` if there is a `state`.
     """
-    for package in ("onnx", "onnxruntime"):  # onnx writes the graph, onnxruntime runs it for verification
-        if importlib.util.find_spec(package) is None:
-            raise _missing(package)
-    import onnx
-    from onnx import TensorProto, checker, helper
-
+    onnx = _package("onnx")
+    helper = onnx.helper
     graph, (observation_size, action_size) = _Graph(), policy.contract.spec[:2]
     inputs, outputs = {"observation": observation_size}, {"action": action_size}
     if guards.has_state:
@@ -45,7 +41,9 @@ def model(policy: Policy, guards: Guards, fields: dict[str, Any]) -> bytes:
     graph.add("Identity", [_guarded(graph, guards, policy.contract, _action(graph, policy))], "action")
 
     def values(sizes: dict[str, int]) -> list[Any]:
-        return [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", size]) for name, size in sizes.items()]
+        return [
+            helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["n", size]) for name, size in sizes.items()
+        ]
 
     nodes = [helper.make_node(kind, names, [output], output, **options) for kind, names, output, options in graph.nodes]
     constants = [onnx.numpy_helper.from_array(array, name) for name, array in graph.constants.items()]
@@ -54,22 +52,24 @@ def model(policy: Policy, guards: Guards, fields: dict[str, Any]) -> bytes:
         onnx_graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="csac"
     )
     helper.set_model_props(onnx_model, {"contract": json.dumps(fields, allow_nan=False)})
-    checker.check_model(onnx_model, full_check=True)
+    onnx.checker.check_model(onnx_model, full_check=True)
     return onnx_model.SerializeToString(deterministic=True)
 
 
-def _missing(package: str) -> InputError:
-    return InputError(f"an ONNX artefact needs the package {package}: pip install '.[onnx]' in a clone of csac")
+def _package(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise InputError(
+            f"an ONNX artefact needs the package {name}: pip install '.[onnx]' in a clone of csac"
+        ) from None
 
 
 class Session:
     """Run a graph with ONNX Runtime, in one thread: a controller shares its processor."""
 
     def __init__(self, path: Path, policy: Policy, guards: Guards) -> None:
-        try:
-            import onnxruntime
-        except ImportError:
-            raise _missing("onnxruntime") from None
+        onnxruntime = _package("onnxruntime")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
@@ -82,7 +82,7 @@ class Session:
         inputs = {"observation": observation[None]}
         if self._state is not None:
             inputs["state"] = self._state
-        outputs: Any = self._session.run(None, inputs)
+        outputs = self._session.run(None, inputs)
         if self._state is not None:
             self._state = outputs[1]
         return outputs[0][0]

@@ -69,15 +69,10 @@ class Evaluator:
         """Perturb the task from the next batch on, as `Environment.perturb` does.
 
         Raise InputError if the task does not support it: here if environments are open, otherwise in the next batch.
-        Each batch raises it again until the perturbation is changed.
         """
+        for environment in self._environments:
+            environment.perturb(values)
         self.perturbed = dict(values)
-        try:
-            for environment in self._environments:
-                environment.perturb(values)
-        except InputError:
-            self.close()  # the remaining ones are not perturbed and must not be used as if they were
-            raise
 
     def begin(
         self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
@@ -196,11 +191,7 @@ class Evaluator:
             self.close()
         while len(self._environments) < count:
             environment = Environment(self._task, self._environment_arguments)
-            try:
-                environment.perturb(self.perturbed)
-            except InputError:
-                environment.close()
-                raise
+            environment.perturb(self.perturbed)
             self._environments.append(environment)
 
 
@@ -214,8 +205,8 @@ def evaluate(
     perturbations: str | Perturbation | Iterable[str | Perturbation] = (),
 ) -> np.ndarray:
     """Return the returns [episodes] of a policy. Arguments and errors are those of `evaluate_episodes`."""
-    arguments = policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed
-    return np.array([episode.episode_return for episode in _evaluate(*arguments)])
+    arguments = episodes, first_seed, deterministic, environment_arguments, (), perturbations
+    return np.array([episode.episode_return for episode in evaluate_episodes(policy, task, *arguments)])
 
 
 def evaluate_episodes(
@@ -247,20 +238,9 @@ def evaluate_episodes(
         InputError: as `Evaluator.run`, invalid arguments, or perturbations that the task does not support.
         EvaluationFailure: as `Evaluator.run`.
     """
-    if events is not None:
-        check_events(events)
     events = events_of(task) if events is None else events
-    return _evaluate(policy, deterministic, perturbations, task, environment_arguments, episodes, first_seed, events)
-
-
-def _evaluate(
-    policy: Any,
-    deterministic: bool,
-    perturbations: str | Perturbation | Iterable[str | Perturbation],
-    task: Task,
-    *arguments: Any,
-) -> list[EvaluationEpisode]:
-    evaluator = Evaluator(task, *arguments)
+    check_events(events)
+    evaluator = Evaluator(task, environment_arguments, episodes, first_seed, events)
     evaluator.perturb(values_at(constant_perturbations(perturbations), 0))
     check_flag("deterministic", deterministic)
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
@@ -268,12 +248,12 @@ def _evaluate(
     with closing(evaluator):
         if not isinstance(policy, Policy):
             return [evaluator.play(policy, number, deterministic) for number in range(evaluator.episodes)]
-        episodes = evaluator.run(policy, deterministic)
+        results = evaluator.run(policy, deterministic)
     one, other = (name.rpartition(":")[2] if isinstance(name, str) else "" for name in (policy.contract.task, task))
     if one != other and one and other and not one.isidentifier():  # the name of a Python function identifies no task
         text = f"the policy was trained on {one} and is evaluated on {other}: their returns cannot be compared"
-        warnings.warn(text, stacklevel=3)
-    return episodes
+        warnings.warn(text, stacklevel=2)
+    return results
 
 
 def check_contract(policy: Policy, environment: Environment) -> None:

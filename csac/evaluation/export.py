@@ -13,7 +13,7 @@ import numpy as np
 from csac.deploy.artefact import FILES, Artefact, Format, open_artefact, write_artefact
 from csac.deploy.card import CARD, CURVE, model_card
 from csac.deploy.choosing import choose_run, load_run
-from csac.deploy.contract import CONTRACT, FLOAT32_MAX, read_json, write_json
+from csac.deploy.contract import CONTRACT, read_json, write_json
 from csac.deploy.guards import make_guards
 from csac.deploy.policy import POLICY
 from csac.deploy.verify import compare_actions
@@ -242,8 +242,6 @@ def control_rate(raw: Any) -> float | None:
         return 120.0 / ratio
     step = raw.get_wrapper_attr("dt") if raw.has_wrapper_attr("dt") else None
     if isinstance(step, int | float | np.floating) and step > 0:
-        rate = round(1.0 / float(step), 6)
-        if 0 < rate <= FLOAT32_MAX:
-            return rate
+        return round(1.0 / float(step), 6)
     frames = raw.metadata.get("render_fps")
     return float(frames) if isinstance(frames, int | float) and frames > 0 else None

@@ -5,14 +5,13 @@ The workers run NumPy and the task; they do not import JAX.
 
 from __future__ import annotations
 
-import pickle
 from collections import deque
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING
 
+from csac.checks import check_whole
 from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, NotMade
 from csac.processes import Child, cores_to_use, end
-from csac.types import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -146,26 +145,15 @@ class EvaluationPool:
     """
 
     def __init__(self, evaluator: Evaluator, processes: int) -> None:
-        if processes < 1:
-            raise InputError(f"{processes} processes: use at least one")
-        try:
-            pickle.dumps(evaluator)
-        except Exception as error:
-            raise InputError(
-                f"the task cannot be sent to another process: make it a module's function ({error})"
-            ) from None
+        check_whole("processes", processes, 1, 1_000)
         self._evaluator, self._processes = evaluator, processes
         self._workers: list[Child] = []
-
-    def start(self) -> None:
-        """Start all processes that are not running, so that an evaluation need not wait for them."""
-        self._start(self._processes)
 
     def begin(
         self, policies: Sequence[Policy], deterministic: bool = True, on_progress: OnProgress | None = None
     ) -> Pending:
         """Start an evaluation and return at once. The previous one must be over; after a stop, close the pool first."""
-        self._start(min(self._processes, len(self._evaluator.batches(len(policies)))))
+        self.start(len(self._evaluator.batches(len(policies))))
         return Pending(self._evaluator, policies, deterministic, on_progress, self._workers)
 
     def close(self) -> None:
@@ -175,15 +163,15 @@ class EvaluationPool:
         """
         workers, self._workers = self._workers, []
         for worker in workers:
-            if worker.process.is_alive():
-                worker.tell(None)  # closing the pipe is not enough if a child forked by a task holds it open
+            worker.tell(None)  # closing the pipe is not enough if a child forked by a task holds it open
         end(workers)
 
-    def _start(self, processes: int) -> None:
+    def start(self, processes: int) -> None:
+        """Start processes until there are so many, or as many as the pool has, so that an evaluation need not wait."""
         for worker in [worker for worker in self._workers if not worker.process.is_alive()]:
             worker.kill()
             self._workers.remove(worker)
-        while len(self._workers) < processes:
+        while len(self._workers) < min(self._processes, processes):
             self._evaluator.close()  # workers get the evaluator without open environments
             self._workers.append(Child(_serve, self._evaluator))
 

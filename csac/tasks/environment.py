@@ -19,7 +19,7 @@ from csac.tasks.failures import EnvironmentFailure, failure_of, one_line, raise_
 from csac.tasks.perturbations import NOISES, PHYSICS, Noise, Physics
 from csac.tasks.pybullet import quietly
 from csac.tasks.registry import Task, has_memory, is_pybullet, make, task_name
-from csac.tasks.spaces import check_finite, contract_parts, dict_part, part, scalar
+from csac.tasks.spaces import contract_parts, dict_part, part, scalar
 from csac.types import InputError, Snapshot, Spec
 
 _log = logging.getLogger(__name__)
@@ -182,7 +182,6 @@ class Environment:
         """Return the flat observation with noise, and set `raw_observation` to the same in the task's own structure."""
         assert self._noise
         noisy = self._noise.on_observation(flat)
-        check_finite(noisy, noisy.shape, "the observation with its noise")
         ends = np.cumsum([math.prod(shape) for _, shape in self._parts])[:-1]
         raw = {key: part.reshape(shape) for (key, shape), part in zip(self._parts, np.split(noisy, ends), strict=True)}
         self.raw_observation = raw.get(None, raw)

@@ -40,12 +40,6 @@ def info_name(event: str) -> str:
     return event.rpartition(":")[0] if event.endswith((":sum", ":mean")) else event
 
 
-def numbers_in(info: Mapping[Any, Any]) -> dict[str, bool | float]:
-    """Return the entries of an `info` that are numbers, by name."""
-    named = {name: number(value) for name, value in info.items() if isinstance(name, str)}
-    return {name: value for name, value in named.items() if value is not None}
-
-
 def number(value: Any) -> bool | float | None:
     """Return a boolean or a finite number from `info` as a Python scalar, and None for anything else."""
     array = numbers(value)
@@ -54,8 +48,6 @@ def number(value: Any) -> bool | float | None:
 
 def numbers(value: Any) -> np.ndarray | None:
     """Return booleans or finite numbers as an array, and None for anything else."""
-    if value is None or isinstance(value, str | bytes):
-        return None
     try:
         array = np.asarray(value)
     except Exception:  # `info` may hold anything

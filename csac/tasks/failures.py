@@ -61,8 +61,5 @@ def one_line(error: BaseException) -> str:
 
 def message(error: BaseException) -> str:
     """Return an error's message in one line that is safe for every file and terminal."""
-    try:
-        text = str(error)
-    except Exception as failure:
-        text = f"(its message cannot be had: {type(failure).__name__})"
-    return " ".join(_ESCAPES.sub(" ", text.encode("utf-8", "backslashreplace").decode()).split())
+    text = str(error).encode("utf-8", "backslashreplace").decode()
+    return " ".join(_ESCAPES.sub(" ", text).split())

@@ -9,10 +9,10 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-import re
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from numbers import Real
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +40,6 @@ NOISES = ("observation_noise", "action_noise")
 KINDS = (*PHYSICS, *NOISES)
 
 _EXAMPLE = "friction=1.5@300000"
-_PATTERN = re.compile(r"(?P<kind>[^=@]+?)\s*=(?P<value>[^=@]+)(?:@(?P<step>[^=@]+))?")
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Perturbation:
         if self.kind not in KINDS:
             raise InputError(f"no perturbation is called {self.kind!r}: there are {', '.join(KINDS)}")
         check_whole(f"the step of {self.kind}", self.step, 0, STEPS_LIMIT)
-        number = math.nan if isinstance(self.value, str | bool) else _number(self.value)
+        number = math.nan if isinstance(self.value, bool) or not isinstance(self.value, Real) else float(self.value)
         if not 0 <= number < math.inf or (self.kind == "mass" and not number):
             what = "factor" if self.kind in PHYSICS else "standard deviation"
             least = "above 0" if self.kind == "mass" else "of 0 or more"
@@ -71,13 +70,16 @@ class Perturbation:
     @classmethod
     def parse(cls, text: str) -> Perturbation:
         """Return the perturbation that `KIND=VALUE@STEP` or `KIND=VALUE` describes. Raise InputError if malformed."""
-        match = _PATTERN.fullmatch(text.strip())
-        value, step = (_number(match[name] or "0") if match else math.nan for name in ("value", "step"))
-        if match is None or math.isnan(value) or not step.is_integer():  # a step may be written as 3e5
+        kind, _, rest = text.partition("=")
+        value, at, step = rest.partition("@")
+        try:
+            number, begin = float(value), float(step) if at else 0.0
+        except ValueError:
             raise InputError(
                 f"a perturbation is written KIND=VALUE or KIND=VALUE@STEP, as {_EXAMPLE}, not {text!r:.60}"
-            )
-        return cls(match["kind"].replace("-", "_"), value, int(step))
+            ) from None
+        begin = int(begin) if begin.is_integer() else begin  # a step may be written as 3e5
+        return cls(kind.strip().replace("-", "_"), number, begin)  # pyright: ignore[reportArgumentType]
 
     def __str__(self) -> str:
         return f"{self.kind}={repr(self.value).removesuffix('.0')}" + (f"@{self.step}" if self.step else "")
@@ -149,14 +151,6 @@ def by_step(perturbations: Iterable[Perturbation]) -> list[tuple[int, str]]:
     return [(step, ", ".join(item.label for item in group)) for step, group in groups]
 
 
-def _number(value: object) -> float:
-    """Return a value as a float, or nan if it is not a number."""
-    try:
-        return float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError, OverflowError):
-        return math.nan
-
-
 class Physics:
     """Scales the physics of a MuJoCo task. Factors are relative to the model at the time this object is created.
 
@@ -172,7 +166,6 @@ class Physics:
         self._task_name = task_name
         self._original = copy.copy(self._model)
         self._factors = dict.fromkeys(PHYSICS, 1.0)
-        self._scaled: dict[str, np.ndarray] = {}  # scaled values by array name, of the kinds whose factor is not 1
 
     def set(self, factors: Mapping[str, float]) -> None:
         """Scale the model from the next step on; a kind that is missing has the factor 1.
@@ -189,19 +182,18 @@ class Physics:
         if "mass" in changed:
             self._renew_constants()
         self._factors = wanted
-        names = (name for kind, factor in wanted.items() if factor != 1.0 for name in _SCALED[kind])
-        self._scaled = {name: attrgetter(name)(self._model).copy() for name in names}
 
     def undone(self) -> str | None:
         """Return an error message if a reset has undone the scaling, else None.
 
         Tasks that randomise their physics at each reset do so. The check takes a few microseconds.
         """
-        is_same = not self._scaled or getattr(self._environment, "model", None) is self._model
-        if is_same and all((attrgetter(name)(self._model) == array).all() for name, array in self._scaled.items()):
+        factors = {kind: factor for kind, factor in self._factors.items() if factor != 1.0}
+        scaled = ((attrgetter(name), factor) for kind, factor in factors.items() for name in _SCALED[kind])
+        is_same = not factors or getattr(self._environment, "model", None) is self._model
+        if is_same and all((of(self._model) == of(self._original) * factor).all() for of, factor in scaled):
             return None
-        kinds = " and ".join(kind for kind, factor in self._factors.items() if factor != 1.0)
-        return f"{self._task_name} sets its own physics at reset: {kinds} cannot be perturbed"
+        return f"{self._task_name} sets its own physics at reset: {' and '.join(factors)} cannot be perturbed"
 
     def _renew_constants(self) -> None:
         """Recompute the model constants derived from masses, using separate MjData to leave the episode untouched."""

@@ -7,10 +7,8 @@ import io
 import logging
 import os
 import re
-import sys
 import tempfile
-import threading
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -33,7 +31,6 @@ _CHATTER = re.compile(
     r"|GL_[A-Z_]+=[^\n]*|MotionThreadFunc: [^\n]*|Thread with taskId [^\n]*|Thread TERMINATED)\r?\n"
 )
 
-_lock = threading.RLock()  # file descriptors are shared by the whole process
 _log = logging.getLogger(__name__)
 
 
@@ -155,25 +152,19 @@ def quietly() -> Iterator[None]:
     PyBullet prints from C, past Python's streams, and PyFlyt from Python, whose streams need not write to the file
     descriptors (a notebook's do not). Any other output is passed on at the end of the block.
     """
-    out, err = io.StringIO(), io.StringIO()
+    written = io.StringIO()
     try:
-        with _lock, _filter_descriptor(1), _filter_descriptor(2), redirect_stdout(out), redirect_stderr(err):
+        with _filter_descriptor(1), _filter_descriptor(2), redirect_stdout(written):
             yield
     finally:
-        for stream, buffer in ((sys.stdout, out), (sys.stderr, err)):
-            with suppress(OSError, ValueError, AttributeError):  # the reader is gone, or there is no stream
-                stream.write(_without_chatter(buffer.getvalue()))
+        print(_without_chatter(written.getvalue()), end="")
 
 
 @contextmanager
 def _filter_descriptor(descriptor: int) -> Iterator[None]:
     """Redirect a file descriptor to a file during this block, then pass on what is not chatter."""
     _flush()
-    try:
-        original = os.dup(descriptor)
-    except OSError:  # closed: there is nothing to redirect
-        yield
-        return
+    original = os.dup(descriptor)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), descriptor)
         try:
@@ -183,10 +174,9 @@ def _filter_descriptor(descriptor: int) -> Iterator[None]:
             os.dup2(original, descriptor)
             os.close(original)
             file.seek(0)
-            rest = _without_chatter(file.read().decode(errors="surrogateescape")).encode(errors="surrogateescape")
-            with suppress(OSError):  # the reader is gone
-                while rest:
-                    rest = rest[os.write(descriptor, rest) :]
+            rest = _without_chatter(file.read().decode(errors="surrogateescape"))
+            with open(descriptor, "w", errors="surrogateescape", closefd=False) as output:
+                output.write(rest)
 
 
 def _without_chatter(written: str) -> str:
@@ -196,8 +186,7 @@ def _without_chatter(written: str) -> str:
 
 
 def _flush() -> None:
-    """Flush the standard streams of Python and C."""
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError, AttributeError):
-            stream.flush()
+    """Flush the standard outputs of Python and C."""
+    with suppress(OSError):  # the reader is gone
+        print(end="", flush=True)
     ctypes.CDLL(None).fflush(None)

@@ -8,7 +8,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import gymnasium
@@ -79,9 +79,8 @@ def import_module_of(name: str) -> Any:
     the module. Modules that the user has not named are never looked up there.
     """
     module = module_of(name)
-    with suppress(OSError):  # a folder that is gone
-        if os.getcwd() not in sys.path:
-            sys.path.append(os.getcwd())
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
     try:
         return importlib.import_module(module)
     except BaseException as error:
@@ -167,8 +166,7 @@ def _isolated(is_pybullet: bool) -> Iterator[None]:
     """Hide Gymnasium's warnings and PyBullet's output in this block, and restore the working directory afterwards."""
     with ExitStack() as stack, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r".*WARN: ")  # such as: an id has a newer version
-        with suppress(OSError):  # a folder that is gone
-            stack.callback(os.chdir, os.getcwd())
+        stack.callback(os.chdir, os.getcwd())
         if is_pybullet:
             stack.enter_context(quietly())
         yield

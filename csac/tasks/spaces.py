@@ -50,8 +50,6 @@ def observation_parts(space: object) -> Parts:
         if not math.prod(part.shape):
             raise InputError(f"{name} is empty: its shape is {part.shape}")
         parts.append((key, tuple(part.shape)))
-    if not parts:
-        raise InputError("the observation is an empty Dict")
     return tuple(parts)
 
 
@@ -73,17 +71,12 @@ def _float32_within(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
 
     If no float32 lies between them, round both to the nearest.
     """
-    with np.errstate(over="ignore"):
-        nearest_low, nearest_high = low.astype(np.float32), high.astype(np.float32)
-    inner_low = _moved(nearest_low, nearest_low < low, np.inf)
-    inner_high = _moved(nearest_high, nearest_high > high, -np.inf)
+    nearest_low, nearest_high = low.astype(np.float32), high.astype(np.float32)
+    infinity = np.float32(np.inf)
+    inner_low = np.where(nearest_low < low, np.nextafter(nearest_low, infinity), nearest_low)
+    inner_high = np.where(nearest_high > high, np.nextafter(nearest_high, -infinity), nearest_high)
     is_between = inner_low <= inner_high
     return np.where(is_between, inner_low, nearest_low), np.where(is_between, inner_high, nearest_high)
-
-
-def _moved(rounded: np.ndarray, outside: np.ndarray, direction: float) -> np.ndarray:
-    """Return float32 numbers, with finite ones that lie `outside` moved to the next float in `direction`."""
-    return np.where(outside & np.isfinite(rounded), np.nextafter(rounded, np.float32(direction)), rounded)
 
 
 def dict_part(observation: Any, key: str | None, shape: tuple[int, ...]) -> np.ndarray:
@@ -107,16 +100,11 @@ def part(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
         raise EnvironmentFailure(f"{name} is not an array of numbers: {one_line(error)}") from error
     if array.shape != shape:
         raise EnvironmentFailure(f"{name} has shape {array.shape} where its space has {shape}")
-    check_finite(flat, shape, name)
-    return flat
-
-
-def check_finite(flat: np.ndarray, shape: tuple[int, ...], name: str) -> None:
-    """Raise EnvironmentFailure for the first non-finite number, with its index in an array of this `shape`."""
     bad = np.flatnonzero(~np.isfinite(flat))
     if bad.size:
         place = ", ".join(str(i) for i in np.unravel_index(bad[0], shape))
         raise EnvironmentFailure(f"{name}{f'[{place}]' if place else ''} is {flat[bad[0]]}")
+    return flat
 
 
 def scalar(reward: Any) -> float:

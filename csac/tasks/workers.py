@@ -14,7 +14,7 @@ import numpy as np
 
 from csac.processes import Child, end
 from csac.tasks.environment import Environment
-from csac.tasks.events import info_name, numbers_in
+from csac.tasks.events import info_name, number
 from csac.tasks.failures import EnvironmentFailure
 from csac.tasks.preflight import seed_globals
 from csac.tasks.registry import Task
@@ -42,8 +42,7 @@ class Workers:
         self._workers: list[Worker] = []
         try:
             for index, count in enumerate(counts):
-                work = _serve, task, environment_arguments, count, seed + index, events
-                self._workers.append(Worker(*work))
+                self._workers.append(Worker(_serve, task, environment_arguments, count, seed + index, events))
             descriptions = [worker.answer() for worker in self._workers]
         except BaseException:
             self.close()
@@ -57,8 +56,7 @@ class Workers:
     def close(self) -> None:
         """Have the processes close their environments and end."""
         for worker in self._workers:
-            with suppress(OSError):
-                worker.tell(None)
+            worker.tell(None)
         end(self._workers)
 
 
@@ -75,8 +73,7 @@ class RemoteEnvironment:
 
     def ask(self, method: str, *arguments: Any) -> None:
         """Start a call in the worker; the next call of the method returns its result."""
-        with suppress(OSError):  # the process is dead: `answer` reports it
-            self._worker.tell((self._index, method, arguments))
+        self._worker.tell((self._index, method, arguments))
         self._is_pending = True
 
     def __getattr__(self, method: str) -> Callable[..., Any]:
@@ -138,8 +135,8 @@ def _outcome(names: set[str], function: Any, *arguments: Any) -> tuple[Any, Exce
     try:
         result = function(*arguments)
         if function.__name__ == "step_environment_scale":
-            wanted = {name: result[-1][name] for name in names & result[-1].keys()}
-            result = (*result[:-1], numbers_in(wanted))  # `info` may hold objects that cannot be pickled
+            info = {name: number(result[-1].get(name)) for name in names}
+            result = (*result[:-1], info)  # the rest of it may hold objects that cannot be pickled
         return result, None, ""
     except Exception as error:
         return None, error, "".join(traceback.format_exception(error)) if error.__cause__ else ""

@@ -60,7 +60,7 @@ class Evaluations:
         if program.evaluation_processes and config.evaluation_environments:
             self.evaluator = pool = EvaluationPool(self._evaluator, program.evaluation_processes)
             stack.callback(pool.close)
-            pool.start()
+            pool.start(program.evaluation_processes)
         self._algorithm = config.algorithm
         self._perturbations = perturbations_of(config.perturbations)
         self._pending: tuple[int, list[int], list[Policy], Any] | None = None

@@ -149,16 +149,11 @@ def test_a_saved_policy_has_no_seeds_and_replaces_no_run(tmp_path):
         load(tmp_path / "kept", which="best")
     with pytest.raises(InputError, match="holds a run or an artefact: choose another folder"):
         policies[0].save(tmp_path / "run" / "seed-0")
-    for nothing in (None, 5, "", "a\0b"):
-        with pytest.raises(
-            InputError, match=r"the folder of a policy (is a path such as|cannot be .*: give a path such as)"
-        ):
-            policies[0].save(nothing)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="the folder of a policy is a path such as 'runs/first', not None"):
+        policies[0].save(None)  # pyright: ignore[reportArgumentType]
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write"):
         policies[0].save(tmp_path / "file")
-    with pytest.raises(InputError, match=r"cannot write .*: File name too long"):
-        policies[0].save(tmp_path / ("x" * 300))
 
 
 def test_an_artefact_with_guards_is_not_loaded_without_them(tmp_path):

@@ -159,7 +159,7 @@ def test_the_header_is_cpp_as_well(tmp_path, algorithm):
                       'csac_step(&s, o, a); csac_reset(&s); csac_policy(o, a); '
                       'for (int i = 0; i < 3; i++) std::printf("%.9g\\n", double(a[i])); return 0; }\n')  # fmt: skip
     flags = ("-std=c++11", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
-    compile_c(*flags, source, "-o", tmp_path / "main", program="c++")
+    subprocess.run(["c++", *flags, source, "-o", tmp_path / "main"], check=True)
     lines = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True).stdout.split()
     expected = policy.predict(np.array([0.1, 0.2, 0.3, 0.4, 0.5]))[0]
     np.testing.assert_allclose(np.array(lines, float), expected, atol=1e-5)

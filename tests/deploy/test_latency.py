@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import shlex
 import time
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from artefacts import leave
 from policies import algorithm_policy
-from rich.console import Console
 
 from csac.cli import main
 from csac.console.tables import latency_table
@@ -79,27 +77,13 @@ def test_the_command_prints_a_row_for_each(tmp_path, capsys):
     assert [len(row) for row in rows] == [7, 10]
 
 
-@pytest.mark.parametrize("width", [80, 200])
-def test_no_number_is_cut_at_any_width(width):
-    console = Console(file=io.StringIO(), width=width)
-    several = [Latency(np.full(100_000, 3_800)), Latency(np.full(500, 4_000), np.full(500, 123_456_789), 50.0)]
-    console.print(latency_table({"runs/cheetah/export/numpy": several}))
-    text = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
-    words = [word for line in text.splitlines() for word in line.split()]
-    for word in ("100,000", "500", "3.8", "4.0", "123,457", "p99.9"):
-        assert word in words
-
-
 @pytest.mark.parametrize(
     ("line", "message"),
     [
         ("", "give the folder of an artefact"),
         ("nowhere", "nowhere is not an artefact"),
         ("numpy --calls 0", "calls 0"),
-        ("numpy --calls 100000000000000", "calls 100000000000000"),
-        ("numpy --rate 1e6 --seconds 1e9", "seconds 1e+09 at rate 1e+06"),
         ("numpy --rate 0", "rate 0"),
-        ("numpy --seconds nan", "seconds nan"),
         ("numpy --rate 0.05 --seconds 10", "rate 0.05"),
     ],
 )

@@ -149,10 +149,8 @@ def test_processes_are_chosen_by_the_work_and_at_least_one_is_asked_for(monkeypa
     for quota, most in ((None, 3), (2, 2)):
         monkeypatch.setattr("csac.processes.core_quota", lambda quota=quota: quota)
         assert choose_processes(Evaluator("probes:Cases-v0", episodes=1000), 5) == most
-    with pytest.raises(InputError, match="0 processes"):
+    with pytest.raises(InputError, match="processes must be a whole number of 1 or more, not 0"):
         EvaluationPool(Evaluator("probes:Cases-v0"), processes=0)
-    with pytest.raises(InputError, match="cannot be sent to another process"):
-        EvaluationPool(Evaluator(lambda: probes.Cases()), processes=2)
 
 
 def test_a_task_may_have_processes_and_ends_them_when_the_pool_is_closed(tmp_path, pool_of):

@@ -63,7 +63,6 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
     ("name", "space", "message"),
     [
         ("action_space", spaces.Box(-np.inf, np.inf, (2,)), "infinite bounds"),
-        ("action_space", spaces.Box(-1e300, 1e300, (2,), np.float64), "infinite bounds"),
         ("action_space", spaces.Box(0, 5, (2,), np.int64), "continuous"),
         ("action_space", spaces.MultiDiscrete([2, 3]), "continuous"),
         ("action_space", spaces.Box(-1.0, 1.0, (0,)), "continuous"),
@@ -71,7 +70,6 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
         ("observation_space", spaces.Discrete(4), "Discrete.*FlattenObservation"),
         ("observation_space", spaces.Dict(a=spaces.Dict(b=UNIT)), r"observation\['a'\] is a .*Dict"),
         ("observation_space", spaces.Box(0, 255, (8, 8, 3), np.uint8), "image"),
-        ("observation_space", spaces.Dict(), "empty"),
         ("observation_space", spaces.Box(-1.0, 1.0, (0,)), "empty"),
         ("observation_space", spaces.Dict(NUMBERED), r"observation\[1\]"),
         ("observation_space", type("Box", (), {"__module__": "gym.spaces.box"})(), r"gym\.spaces\.box\.Box"),
@@ -99,19 +97,6 @@ def test_a_function_that_returns_the_same_environment_again_is_refused():
     Environment(lambda: one).close()
     with pytest.raises(InputError, match="again"):
         Environment(lambda: one)
-
-
-def test_the_advice_for_actions_without_bounds_works():
-    def task() -> gymnasium.Env:
-        return Scripted(action_space=spaces.Box(-np.inf, np.inf, (2,)))
-
-    with pytest.raises(InputError) as refusal:
-        Environment(task)
-    advice = str(refusal.value).rpartition("give it finite ones, as ")[2].removesuffix(" does")
-    bounded = Environment(lambda: eval(advice, {"gymnasium": gymnasium, "environment": task()}))
-    bounded.reset(0)
-    bounded.step(np.array([0.5, -2.0], np.float32))
-    np.testing.assert_array_equal(bounded.raw.unwrapped.actions, [[0.5, -1.0]])  # pyright: ignore
 
 
 def test_a_render_mode_that_the_task_lacks_is_refused():
@@ -241,30 +226,6 @@ def test_a_bad_action_never_reaches_the_environment(action, message):
     assert environment.raw.unwrapped.actions == []  # pyright: ignore
 
 
-@pytest.mark.parametrize("given", [([0.0], 1.0, False, {}), ([0.0], 1.0, False, False, {}, "more"), None])
-def test_a_step_of_another_api_is_a_failure(given):
-    class Old(Scripted):
-        def step(self, action):
-            return given
-
-    environment = Environment(lambda: gymnasium.wrappers.TimeLimit(Old(), 9))
-    environment.reset(0)
-    with pytest.raises(EnvironmentFailure, match=r"^step raised .*unpack"):
-        environment.step(np.zeros(1, np.float32))
-
-
-@pytest.mark.parametrize(
-    ("space", "given"), [(spaces.Box(-9, 9, (3,)), np.zeros(3)), (spaces.Box(-9, 9, (2,)), np.zeros(2)), (UNIT, None)]
-)
-def test_a_reset_that_gives_the_observation_alone_is_a_failure(space, given):
-    class Old(Scripted):
-        def reset(self, *, seed=None, options=None):
-            return given
-
-    with pytest.raises(EnvironmentFailure, match="reset"):
-        Environment(lambda: Old(space)).reset(0)
-
-
 @pytest.fixture
 def module(tmp_path, monkeypatch):
     """A user's module, whose environment divides by zero in a helper's function and raises in a library below it."""
@@ -294,16 +255,10 @@ def test_an_error_is_told_with_its_place_in_the_users_own_code(module):
         task.step(np.zeros(1, np.float32))
 
 
-class Unsaid(Exception):
-    def __str__(self) -> str:
-        raise ValueError("nothing")
-
-
 @pytest.mark.parametrize(
     ("error", "start"),
     [
         (RuntimeError("no file \udcff\nhere"), "RuntimeError: no file \\udcff here"),
-        (Unsaid(), "Unsaid: ("),
         (RuntimeError("\x1b[31mno\x1b[0m file\x07 here"), "RuntimeError: no file here"),
         (RuntimeError(), "RuntimeError"),
     ],

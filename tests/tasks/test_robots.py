@@ -122,23 +122,15 @@ def test_silence_is_for_pybullet_alone(tmp_path):
         places = [ended.stdout.index(piece) for piece in pieces]
         assert places == sorted(places)
     assert len(ended.stdout) == sum(len(piece) for pieces in sources for piece in pieces)
-    assert ended.stderr == "Version = ours: argv\n"
-    assert ended.returncode == 0
+    assert (ended.stderr, ended.returncode) == ("Version = ours: argv\n", 0)
 
 
 def test_silence_reaches_streams_that_are_not_the_process_s_own(capsys):
     with quietly():
         print("\033[A                             \033[A")
-        print("pybullet build time: now", file=sys.stderr)
         print("ours")
-        print("ours too", file=sys.stderr)
     print("after")
-    assert capsys.readouterr() == ("ours\nafter\n", "ours too\n")
-
-
-def test_silence_survives_a_closed_output(tmp_path):
-    code = "import os; from csac.tasks.pybullet import quietly; os.close(1)\nwith quietly(): pass\nos._exit(7)"
-    assert run_python(code, tmp_path).returncode == 7
+    assert capsys.readouterr() == ("ours\nafter\n", "")
 
 
 def test_silence_is_not_asked_of_other_tasks():

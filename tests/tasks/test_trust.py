@@ -27,11 +27,13 @@ def stranger(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     folder = tmp_path / "downloaded"
     (folder / "package").mkdir(parents=True)
+    (folder / "envs" / "robot").mkdir(parents=True)  # a namespace package
     marker = tmp_path / "marker"
     code = f"open({str(marker)!r}, 'w').close()\n" + Path(drawn.__file__).read_text().replace("Drawn", "Stranger")
     (folder / "stranger.py").write_text(code)
     (folder / "package" / "__init__.py").write_text(f"open({str(marker)!r}, 'w')")
     (folder / "package" / "stranger.py").write_text(code)
+    (folder / "envs" / "robot" / "stranger.py").write_text(code)
 
     def make_run(task: str) -> Path:
         path = folder / "run"
@@ -53,6 +55,7 @@ def test_untrusted_task_module_is_not_imported(stranger, monkeypatch, capsys):
         ("stranger", "stranger.py", ["play", "run", "--video", "a.mp4"]),
         ("stranger", "stranger.py", ["resume", "run"]),
         ("package.stranger", "package/__init__.py", ["evaluate", "run"]),
+        ("envs.robot.stranger", "envs", ["evaluate", "run"]),
     ):
         shutil.rmtree("run", ignore_errors=True)
         stranger.make_run(f"{module}:Stranger-v0")
@@ -76,21 +79,6 @@ def test_a_task_that_was_trusted_once_is_trusted_where_it_was_found(stranger, mo
     assert "add --trust-task" in capsys.readouterr().err
 
 
-def test_a_module_in_a_folder_without_init_is_asked_about_and_then_trusted(stranger, monkeypatch, capsys):
-    path = stranger.folder / "envs" / "robot" / "stranger.py"
-    path.parent.mkdir(parents=True)
-    path.write_text((stranger.folder / "stranger.py").read_text())
-    stranger.make_run("envs.robot.stranger:Stranger-v0")
-    monkeypatch.chdir(stranger.folder)
-    assert main(["evaluate", "run"]) == 2
-    told = capsys.readouterr().err
-    assert f"the module envs.robot.stranger in {stranger.folder / 'envs'}" in told
-    assert (told.count("\n"), stranger.marker.exists()) == (1, False)
-    done = csac(stranger.folder, "evaluate", "run", "--episodes", "1", "--trust-task")
-    assert done.returncode == 0, done.stderr
-    trust.refuse_untrusted("envs.robot.stranger:Stranger-v0", "run")
-
-
 def test_training_records_the_task_module_as_trusted(stranger, monkeypatch):
     """One's own runs stay one command."""
     monkeypatch.chdir(stranger.folder)
@@ -108,19 +96,16 @@ def test_what_imports_nothing_new_is_not_asked_about(task):
     trust.refuse_untrusted(task, "run")
 
 
-@pytest.mark.parametrize(
-    "task", ["nowhere:Task", ":Task-v0:", "a..b:Task", ".a:Task", "a\0b:Task", "\ud800:Task", "nowhere.at.all:Task"]
-)
+@pytest.mark.parametrize("task", ["nowhere:Task", ":Task-v0:", ".a:Task", "nowhere.at.all:Task"])
 def test_what_cannot_be_a_module_is_not_found(task):
     with pytest.raises(InputError, match="which is not found here"):
         trust.refuse_untrusted(task, "run")
     trust.remember(task)
 
 
-@pytest.mark.parametrize("state", [os.devnull, f"/{'x' * 300}"])
-def test_where_nothing_can_be_noted_one_is_asked_each_time(stranger, monkeypatch, state):
+def test_where_nothing_can_be_noted_one_is_asked_each_time(stranger, monkeypatch):
     monkeypatch.syspath_prepend(stranger.folder)
-    monkeypatch.setenv("XDG_STATE_HOME", state)
+    monkeypatch.setenv("XDG_STATE_HOME", os.devnull)
     trust.refuse_untrusted("stranger:Stranger-v0", "run", trust_task=True)
     with pytest.raises(InputError, match="add --trust-task"):
         trust.refuse_untrusted("stranger:Stranger-v0", "run")
