@@ -279,7 +279,8 @@ def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[s
     """Train every program that is not over, show progress, and draw the curve. Raises as `train`."""
     done = {run.path for run in runs.runs if watch.is_over(run)}
     programs = [program for program in programs if not done.issuperset(program.directories)]
-    watch.send("start", runs, [*notes, *tidy_programs()])
+    tidy_programs()
+    watch.send("start", runs, notes)
     with ExitStack() as stack, stop_requested(watch.note) as request:
         stack.callback(watch.send, "close")
 
