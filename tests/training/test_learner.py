@@ -46,7 +46,7 @@ def test_a_checkpoint_names_its_arrays_by_where_they_are_in_the_state(tmp_path):
     of_adam = {f"state.actor_optimiser.0.{moment}.{part}" for moment in ("mu", "nu") for part in parts}
     assert of_networks | of_adam | {"state.actor_metrics.actor_loss", "state.actor_optimiser.0.count"} < set(arrays)
     assert set(arrays) - {name for name in arrays if name.startswith("state.")} == {"sums", "key", "waiting"}
-    np.testing.assert_array_equal(arrays["state.actor.layers.1.bias"], learner.carry(0).state.actor.layers[1].bias)
+    np.testing.assert_array_equal(arrays["state.actor.layers.1.bias"], learner.state(0).actor.layers[1].bias)
 
 
 def test_a_checkpoint_of_the_schema_before_is_refused_in_one_line(tmp_path, monkeypatch):
