@@ -18,7 +18,7 @@ from csac.tasks.perturbations import perturbations_of
 from csac.tasks.trust import remember
 from csac.training.config import algorithm_of
 from csac.training.program import Program, threads_of
-from csac.training.resume import refuse_lost
+from csac.training.resume import find_resume_point
 from csac.training.signals import stop_requested
 from csac.training.supervisor import supervise
 from csac.training.watch import Watcher
@@ -56,7 +56,7 @@ def run_study(runs: Sequence[StudyRun], directory: Path, execution: Execution, c
         try_tasks(run.config for run in waiting.values())
     for path, run in waiting.items():  # before any is changed
         if is_run(path) and run.config.steps > (existing := RunDirectory.open(path)).config.steps:
-            refuse_lost(existing)
+            find_resume_point(existing)
     programs = [_program(path, run, execution) for path, run in waiting.items()]
     try:
         with (

@@ -75,18 +75,11 @@ class Checkpoint(NamedTuple):
             raise Damaged(f"{path} is not a checkpoint ({type(error).__name__}: {error})") from error
 
     def read(self, name: str) -> bytes:
-        """Return a file's content; a damaged table or best policy comes from the run if it matches. Raises Damaged."""
-        path, facts = self._path(name), self.files[name]
-        try:
-            content = _read(path)
-            if facts_of(content) != facts:
-                raise Damaged(f"{path} has changed since it was written")
-            return content
-        except Damaged:
-            run_file = self.folder.parent / ("policy" if name.endswith(".safetensors") else "") / name
-            if run_file.is_file() and facts_of(content := run_file.read_bytes()[: facts["bytes"]]) == facts:
-                return content
-            raise
+        """Return a file's content. Raises Damaged."""
+        content = _read(path := self._path(name))
+        if facts_of(content) != self.files[name]:
+            raise Damaged(f"{path} has changed since it was written")
+        return content
 
     def state(self) -> Snapshot:
         """Return everything that was saved except the transitions. Raises Damaged."""
@@ -130,13 +123,12 @@ class Checkpoint(NamedTuple):
 class Writer:
     """Writes the checkpoints of one run, and remembers which transitions are on disk.
 
-    `keep` is how many checkpoints to keep, 0 for all; `known` are the files of the checkpoint that the run resumes
-    from, if its transitions are complete.
+    `known` are the files of the checkpoint that the run resumes from, if its transitions are complete.
     """
 
-    def __init__(self, folder: Path, keep: int, known: Mapping[str, Facts] | None = None) -> None:
-        self.folder, self.keep = folder, keep
-        self._shards = {name: facts for name, facts in (known or {}).items() if name.startswith(f"{REPLAY}/")}
+    def __init__(self, folder: Path, known: Mapping[str, Facts]) -> None:
+        self.folder = folder
+        self._shards = {name: facts for name, facts in known.items() if name.startswith(f"{REPLAY}/")}
 
     def write(self, step: int, saved: Snapshot, memory: Ring, others: Mapping[str, bytes]) -> None:
         """Write a checkpoint. Raises OSError."""
@@ -156,10 +148,6 @@ class Writer:
         fields = json.loads(json.dumps(fields))  # the checksum covers the fields as they will be read
         contents[LIST] = json.dumps({**fields, "sha256": _checksum(fields)}, indent=1).encode()
         write_folder(self.folder / f"step_{step}", contents)
-
-    def prune(self) -> None:
-        """Remove the files that no kept checkpoint needs."""
-        prune(self.folder, self.keep)
 
     def _write_new_rows(self, memory: Ring, oldest: int) -> None:
         first = max([end for _, end, _ in shards(self._shards)] + [oldest])
@@ -186,7 +174,7 @@ def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:
 
 
 def prune(folder: Path, keep: int, newest: int | None = None) -> None:
-    """Remove all checkpoints but the last `keep` up to step `newest`, and the transitions that none of those needs."""
+    """Keep the last `keep` checkpoints (0: all) up to step `newest`, with their transitions, and remove the others."""
     steps = [step for step in steps_in(folder) if newest is None or step <= newest]
     kept = steps[-keep:] if keep else steps
     needed: set[str] = set()

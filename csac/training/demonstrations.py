@@ -137,10 +137,8 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
     def field(name: str, size: int) -> np.ndarray:
         try:
             with np.errstate(over="ignore"):  # an overflow becomes infinite, which is refused
-                value = contract.flatten(arrays[name]) if "observations" in name else np.asarray(arrays[name])
-                if value.dtype.kind not in "biuf":
-                    raise TypeError(f"{value.dtype} is no type of numbers")
-                flat = value.astype(np.float32)
+                value = contract.flatten(arrays[name]) if "observations" in name else arrays[name]
+                flat = np.asarray(value, np.float32)
         except (InputError, TypeError, ValueError, OverflowError) as error:
             raise InputError(f"demonstrations: {name}: {message(error)}") from None
         if flat.shape[:1] != (number,) or flat.size != number * size:

@@ -125,11 +125,6 @@ class Learner:
         self._carry = self._carry._replace(sums=jnp.zeros_like(self._carry.sums))
         self._updates_summed = 0
 
-    def carry(self, index: int) -> Carry:
-        """Return the carry of the seed at this index with its state unpacked, as read-only NumPy views."""
-        carry = self._axis.of(jax.tree.map(np.asarray, self._carry), index)
-        return carry._replace(state=self._one.packing.unpack(carry.state))
-
     def save(self, index: int) -> Snapshot:
         """Return all that the seed at this index needs to resume, except its memory."""
         all_parts = _saved_parts(self._carry)  # without the memory's rows, which would be copied from a GPU to the host
@@ -186,10 +181,14 @@ class Learner:
 
     def first_non_finite(self, index: int) -> str | None:
         """Return the name of the first array in a seed's state that is not finite, or None."""
-        for name, array in by_name(self._axis.of(self._states(), index)).items():
+        for name, array in by_name(self.state(index)).items():
             if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
                 return name
         return None
+
+    def state(self, index: int) -> Any:
+        """Return the state of the seed at this index, as read-only NumPy views."""
+        return self._axis.of(self._states(), index)
 
     def _states(self) -> Any:
         """Return the state of all seeds, unpacked, as read-only NumPy views."""

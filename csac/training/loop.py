@@ -17,7 +17,7 @@ from csac.tasks.perturbations import by_step, perturbations_of, values_at
 from csac.tasks.vector import SeedEnvironments
 from csac.tasks.workers import choose_processes
 from csac.training.callbacks import Notifier
-from csac.training.checkpoint import Writer
+from csac.training.checkpoint import Writer, prune
 from csac.training.demonstrations import files_of, rows_of
 from csac.training.evaluations import Evaluations, is_finite
 from csac.training.hindsight import Hindsight
@@ -132,7 +132,7 @@ class Loop:
             run.update_manifest(steps_done=self.step, restarts_episode=restarts, last_checkpoint=self.step)
             self._writers[index].write(self.step, saved, self.learner.memory(index, self.step), _tables_and_policy(run))
         for index in alive:  # once all have this checkpoint: they resume from a common one
-            self._writers[index].prune()
+            prune(self.runs[index].checkpoints, self.config.keep_checkpoints)
         self._saved_at, self._saved_time = self.step, time.monotonic()
 
     def close(self) -> None:
@@ -143,9 +143,8 @@ class Loop:
 
     def _begin(self, points: Sequence[ResumePoint]) -> None:
         """Begin at step 0, or restore what `save` wrote."""
-        keep = self.config.keep_checkpoints
         demonstrations = files_of(self.config.demonstrations)
-        self._writers = [Writer(run.checkpoints, keep, demonstrations) for run in self.runs]
+        self._writers = [Writer(run.checkpoints, demonstrations) for run in self.runs]
         self._evaluation_pending = False  # whether the evaluation of this step was broken off
         self._perturb(max(self.step - self._stride, 0))  # as it was during the checkpoint's last step
         if not self.step:
@@ -188,7 +187,7 @@ class Loop:
         run, lost = self.runs[index], checkpoint.fill(rows)
         for text in lost:
             self._note_inexact(run, f"warning: {text}")
-        self._writers[index] = Writer(run.checkpoints, self.config.keep_checkpoints, {} if lost else checkpoint.files)
+        self._writers[index] = Writer(run.checkpoints, {} if lost else checkpoint.files)
 
     def _register_best(self) -> None:
         """Put the checksums of best policies into their contracts: a rollback or a fork restores only the files."""

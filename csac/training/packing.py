@@ -102,18 +102,6 @@ class SeedAxis:
 
 
 def by_name(tree: Any) -> dict[str, Any]:
-    """Return the leaves of a tree by their path, such as `actor.layers.0.weight`.
-
-    Checkpoints contain these names, so they depend only on the tree, not on how JAX prints a path.
-    """
+    """Return the leaves of a tree by their path, such as `actor.layers.0.weight`: their names in checkpoints."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {".".join(_part(step) for step in path): leaf for path, leaf in leaves}
-
-
-def _part(step: Any) -> str:
-    """Return one step of a path: a field's name, a dictionary's key, or an index in a sequence."""
-    if isinstance(step, jax.tree_util.GetAttrKey):
-        return step.name
-    if isinstance(step, jax.tree_util.SequenceKey):
-        return str(step.idx)
-    return str(step.key)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}

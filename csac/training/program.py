@@ -152,22 +152,16 @@ def memory_needed(programs: Sequence[Program], config: RunConfig, spec: Spec, at
     if needed > available:
         raise InputError(
             f"this needs about {needed / 2**30:,.1f} GiB of memory and {available / 2**30:.1f} GiB are available: "
-            f"use fewer seeds, a smaller replay or batch (one seed takes {per_seed / 2**30:,.2f} GiB)"
+            f"use fewer seeds or a smaller replay (one seed takes {per_seed / 2**30:,.2f} GiB)"
         )
     return f"memory: about {needed / 2**30:.1f} of {available / 2**30:.1f} GiB available"
 
 
 def _bytes_per_seed(algorithm: Algorithm, config: RunConfig, spec: Spec) -> int:
-    """Return the size of a seed's state and memory, and of the temporary arrays of one update.
-
-    The latter are the batch, and for each of its transitions one number per unit of the networks; a weight matrix has
-    as many units as columns.
-    """
+    """Return the size of a seed's state and memory."""
     steps, transitions = config.steps, config.steps + config.extra_transitions
     state, memory = jax.eval_shape(
         lambda key: (algorithm.init(key, spec, steps), algorithm.memory(spec, transitions)), KEY_DATA
     )
     jax.eval_shape(lambda state: algorithm.policy(state).parameters, state)  # refuses networks that cannot be exported
-    units = sum(leaf.shape[-1] for leaf in jax.tree.leaves(state) if len(leaf.shape) == 2)
-    kept = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((state, memory)))
-    return kept + 4 * algorithm.cadence.transitions_per_update * (memory.rows.shape[1] + units)
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((state, memory)))

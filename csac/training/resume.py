@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -89,30 +90,21 @@ def roll_back(runs: Sequence[RunDirectory]) -> list[ResumePoint]:
     """
     for run in runs:
         _remove_unfinished(run)
-    points = [_find(run, None) for run in runs]
+    points = [find_resume_point(run) for run in runs]
     while len({point.step for point in points}) > 1:
         until = min(point.step for point in points)
-        points = [_find(run, until) if point.step > until else point for run, point in zip(runs, points, strict=True)]
+        pairs = zip(runs, points, strict=True)
+        points = [find_resume_point(run, until) if point.step > until else point for run, point in pairs]
     for run, point in zip(runs, points, strict=True):
         point.notes.extend(_restore(run, point))
     return points
 
 
-def refuse_lost(run: RunDirectory) -> None:
-    """Raise InputError if a run has no sound checkpoint to resume from, and cannot restart from the beginning."""
-    _find(run, None)
+def find_resume_point(run: RunDirectory, until: int | None = None) -> ResumePoint:
+    """Return a run's newest sound checkpoint, of step `until` at most, or its beginning.
 
-
-def can_resume(run: RunDirectory) -> bool:
-    """Return whether `refuse_lost` accepts a run."""
-    try:
-        refuse_lost(run)
-    except InputError:
-        return False
-    return True
-
-
-def _find(run: RunDirectory, until: int | None) -> ResumePoint:
+    Raises InputError if no checkpoint is sound, or if the run cannot restart from the beginning.
+    """
     checkpoint, complaints = newest_sound(run.checkpoints, until)
     if checkpoint is None and complaints:
         raise InputError(f"no checkpoint of {run.path} is sound ({'; '.join(complaints)}): restore one, or train anew")
@@ -122,6 +114,13 @@ def _find(run: RunDirectory, until: int | None) -> ResumePoint:
     if checkpoint is None and results_are_final and any(len(run.rows(table)) for table in TABLES):
         raise InputError(f"{run.path} has results and no checkpoint to go on from: train in another directory")
     return ResumePoint(checkpoint, [f"warning: {text}; an earlier checkpoint is used" for text in complaints])
+
+
+def can_resume(run: RunDirectory) -> bool:
+    """Return whether `find_resume_point` finds one."""
+    with suppress(InputError):
+        return bool(find_resume_point(run))
+    return False
 
 
 def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
@@ -284,12 +283,10 @@ class Source(NamedTuple):
         contents: dict[str, bytes] = {}
         for name in checkpoint.files:
             if name.startswith(f"{REPLAY}/"):
-                target = run.checkpoints / name
-                target.unlink(missing_ok=True)
                 try:
-                    os.link(checkpoint.folder / name, target)
+                    os.link(checkpoint.folder / name, run.checkpoints / name)
                 except OSError:  # the file system has no hard links
-                    write_atomically(target, checkpoint.read(name))
+                    write_atomically(run.checkpoints / name, checkpoint.read(name))
                 continue
             contents[name] = checkpoint.read(name)
             if name.endswith(".csv"):

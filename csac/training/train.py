@@ -23,7 +23,7 @@ from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, make_configs, seed_range
 from csac.training.devices import begin_with, choose_device
 from csac.training.program import Program, choose_groups, memory_needed, programs_of
-from csac.training.resume import Source, fork_options, refuse_differences, refuse_lost, refuse_mixed
+from csac.training.resume import Source, find_resume_point, fork_options, refuse_differences, refuse_mixed
 from csac.training.running import train_program
 from csac.training.signals import Interrupted, stop_requested
 from csac.training.supervisor import supervise
@@ -213,7 +213,7 @@ def _set_configs(runs: Sequence[RunDirectory], configs: Sequence[RunConfig]) -> 
     with ExitStack() as locks:
         for run in runs:
             locks.enter_context(run.locked())
-            refuse_lost(run)
+            find_resume_point(run)
         for run, config in zip(runs, configs, strict=True):
             run.update_manifest(config=config)
 
@@ -279,7 +279,8 @@ def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[s
     """Train every program that is not over, show progress, and draw the curve. Raises as `train`."""
     done = {run.path for run in runs.runs if watch.is_over(run)}
     programs = [program for program in programs if not done.issuperset(program.directories)]
-    watch.send("start", runs, [*notes, *tidy_programs()])
+    tidy_programs()
+    watch.send("start", runs, notes)
     with ExitStack() as stack, stop_requested(watch.note) as request:
         stack.callback(watch.send, "close")
 

@@ -63,6 +63,6 @@ def run(
         program = Program(paths, algorithm, task, 1, environment_processes=environment_processes, tensorboard=False)
         with closing(Loop(program, runs, [ResumePoint(None, [])] * len(runs), Watcher())) as loop:
             loop.run(lambda: False)
-            carries = [loop.learner.carry(index) for index in range(len(seeds))]
-            states, memories = [carry.state for carry in carries], [carry.memory.rows for carry in carries]
+            states = [loop.learner.state(index) for index in range(len(seeds))]
+            memories = [loop.learner.memory(index, steps).rows for index in range(len(seeds))]
             return Outcome(states, memories, [one.evaluations for one in runs], [one.manifest.failure for one in runs])

@@ -64,17 +64,6 @@ class Ending(Walk):
         return self.compute_reward(achieved, desired, info) == 0.0
 
 
-class Boxed(Walk):
-    """Has one Box."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.observation_space = Box(-9.0, 9.0, (1,), np.float32)
-
-    def observe(self) -> Any:
-        return np.zeros(1, np.float32)
-
-
 class Mute(gymnasium.ObservationWrapper):
     """Has goals, and hides how they are rewarded."""
 
@@ -83,10 +72,6 @@ class Mute(gymnasium.ObservationWrapper):
 
     def has_wrapper_attr(self, name: str) -> bool:
         return name != "compute_reward" and super().has_wrapper_attr(name)
-
-
-for kind in (Walk, Ending, Boxed):
-    gymnasium.register(f"{kind.__name__}-v0", entry_point=lambda kind=kind, **options: kind(**options))
 
 
 def test_relabelled_transitions_by_hand():
@@ -135,13 +120,7 @@ def test_goals_are_found_among_the_parts_in_the_order_of_their_names():
     ids=["one", "several", "interval"],
 )
 def test_a_replay_has_each_step_once_and_its_copies_when_its_episode_ends(tmp_path, task, settings):
-    given: dict[str, Any] = {
-        "algorithm": SAC(**{**SMALL, "replay_size": 10_000}),
-        "task": f"{task.__name__}-v0",
-        **settings,
-    }
-    if "environments" in settings:
-        given["task"] = task
+    given: dict[str, Any] = {"algorithm": SAC(**{**SMALL, "replay_size": 10_000}), "task": task, **settings}
     made = run(tmp_path / "run", steps=120, seeds=2, seeds_per_process=2, hindsight=2, **given)
     for one in made.runs:
         replay = csac.load_checkpoint(one.path).replay()
@@ -195,7 +174,7 @@ def test_a_reward_that_cannot_be_computed_ends_the_seed(tmp_path):
 @pytest.mark.parametrize(
     ("task", "algorithm", "arguments", "told"),
     [
-        (Boxed, SAC(**SMALL), {}, "achieved_goal and desired_goal .* not one Box"),
+        ("Pendulum-v1", SAC(**SMALL), {}, "achieved_goal and desired_goal .* not one Box"),
         (lambda: Mute(Walk()), SAC(**SMALL), {}, "hindsight needs compute_reward"),
         (Walk, ROLLOUT, {}, "hindsight is for algorithms with a replay"),
         (Walk, SAC(n_steps=2, **SMALL), {}, "n_steps must be 1"),

@@ -37,7 +37,7 @@ def advance(learner: Learner, seeds: int, first: int, last: int) -> np.ndarray:
 def test_a_checkpoint_names_its_arrays_by_where_they_are_in_the_state(tmp_path):
     learner = Learner(TD3(**TINY), SPEC, [0], 100)
     ring = learner.memory(0, 0)
-    Writer(tmp_path, 2).write(0, learner.save(0), ring, {})
+    Writer(tmp_path, {}).write(0, learner.save(0), ring, {})
     arrays = safetensors.numpy.load((tmp_path / "step_0" / "state.safetensors").read_bytes())
 
     networks = ["actor", "target_actor", "critics.0", "critics.1", "target_critics.0", "target_critics.1"]
@@ -46,14 +46,14 @@ def test_a_checkpoint_names_its_arrays_by_where_they_are_in_the_state(tmp_path):
     of_adam = {f"state.actor_optimiser.0.{moment}.{part}" for moment in ("mu", "nu") for part in parts}
     assert of_networks | of_adam | {"state.actor_metrics.actor_loss", "state.actor_optimiser.0.count"} < set(arrays)
     assert set(arrays) - {name for name in arrays if name.startswith("state.")} == {"sums", "key", "waiting"}
-    np.testing.assert_array_equal(arrays["state.actor.layers.1.bias"], learner.carry(0).state.actor.layers[1].bias)
+    np.testing.assert_array_equal(arrays["state.actor.layers.1.bias"], learner.state(0).actor.layers[1].bias)
 
 
 def test_a_checkpoint_of_the_schema_before_is_refused_in_one_line(tmp_path, monkeypatch):
     learner = Learner(TD3(**TINY), SPEC, [0], 100)
     with monkeypatch.context() as older:
         older.setattr("csac.training.checkpoint.SCHEMA_VERSION", SCHEMA_VERSION - 1)
-        Writer(tmp_path, 2).write(5, learner.save(0), learner.memory(0, 0), {})
+        Writer(tmp_path, {}).write(5, learner.save(0), learner.memory(0, 0), {})
     with pytest.raises(Damaged, match=f"schema {SCHEMA_VERSION - 1}"):
         Checkpoint.open(tmp_path, 5)
 

@@ -163,17 +163,3 @@ def test_a_fork_of_a_perturbed_run_keeps_what_had_happened(tmp_path, perturbed):
     assert again.config.perturbations == other.config.perturbations
     with pytest.raises(InputError, match=r"friction=1@430 .*the run ends at step 400"):
         run(tmp_path / "short", start_from=f"{perturbed.path}@300", steps=400)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ((), r"perturbations is \['friction=2@200', .*\], not \[\]"),
-        ((*GIVEN[:4], "friction=1.5@430"), r"not \['friction=2@200', .*'friction=1.5@430'\]"),
-    ],
-)
-def test_other_perturbations_are_no_continuation(perturbed, given, message):
-    before = {path: path.read_bytes() for path in perturbed.path.rglob("*") if path.is_file()}
-    with pytest.raises(InputError, match=message):
-        run(perturbed.path, perturbations=given, resume=True, **LONG)
-    assert {path: path.read_bytes() for path in perturbed.path.rglob("*") if path.is_file()} == before
