@@ -9,6 +9,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
+from weakref import WeakSet
 
 from csac.types import InputError
 
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 SECONDS_FOR_LOCK = 0.2  # `is_locked` in another process holds a lock for an instant
+
+# Files whose locks this process holds; closed ones may stay in the set.
+_held_locks: WeakSet[IO[str]] = WeakSet()
 
 
 @contextmanager
@@ -47,6 +51,20 @@ def temporary_path(path: Path) -> Path:
     """Return the temporary name of a file until it is complete, unique among all writers on all machines."""
     unique = secrets.token_hex(4)  # containers on several machines often have equal process ids
     return path.with_name(f".{path.name}.{unique}.{os.getpid()}")
+
+
+def closed_in_children(file: IO[str]) -> IO[str]:
+    """Return the file, which forked processes will close: a task's helper process would otherwise keep its lock."""
+    _held_locks.add(file)
+    return file
+
+
+def _close_held_locks() -> None:
+    for file in list(_held_locks):
+        file.close()
+
+
+os.register_at_fork(after_in_child=_close_held_locks)
 
 
 def take(file: IO[str], path: Path) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from csac.checks import check_path
 from csac.record import manifest as manifests
-from csac.record.files import is_locked, take, write_atomically, writing
+from csac.record.files import closed_in_children, is_locked, take, write_atomically, writing
 from csac.record.tables import COLUMNS, append_rows, read_rows, structured
 from csac.types import Failure, InputError
 
@@ -165,7 +165,7 @@ class RunDirectory:
                 raise InputError(f"{path} is a link: replace it by what it points to")
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
         try:
-            file = os.fdopen(os.open(self.path / LOCK, flags, 0o666), "r+")
+            file = closed_in_children(os.fdopen(os.open(self.path / LOCK, flags, 0o666), "r+"))
         except OSError as error:
             raise InputError(f"cannot write to {self.path}: {error.strerror}; check its permissions") from None
         with file:

@@ -18,7 +18,7 @@ import numpy as np
 from csac.checks import check_whole
 from csac.console.tables import Fitted
 from csac.record.config import differences
-from csac.record.files import is_locked, take, writing
+from csac.record.files import closed_in_children, is_locked, take, writing
 from csac.record.rendering import Cell, Row, Table, number
 from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
@@ -121,7 +121,7 @@ def _next(study: optuna.Study, search: Search, directory: Path, trials: int) -> 
         trial.set_user_attr("trial", trial.user_attrs.get("trial", latest + 1))
         folder = _folder(directory, trial)
         folder.mkdir(exist_ok=True)
-        lock = open(folder / ".lock", "a+")  # noqa: SIM115  held for as long as the trial runs
+        lock = closed_in_children(open(folder / ".lock", "a+"))  # noqa: SIM115  held for as long as the trial runs
         take(lock, folder)
         with warnings.catch_warnings(action="ignore"):  # the first trial may lie outside the space
             values = {name: sample(trial, name, dimension) for name, dimension in search.space.items()}
