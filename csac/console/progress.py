@@ -20,7 +20,7 @@ from csac.record.rendering import number, short
 from csac.seeds import name_seeds
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rich.console import Console, RenderableType
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 CURVE_WIDTH = 24
+MOST_SEEDS_SHOWN = 12  # with more, only the mean and the range are shown
 
 
 class _Seed:
@@ -180,17 +181,21 @@ class Reporter:
         table.add_column(justify="right")
         table.add_column(style="dim", no_wrap=True)
 
-        def add(label: str, step: str, values: list[float], note: str = "", style: str = "") -> None:
+        def add(label: str, step: str, curve: Iterable[float], note: str = "", style: str = "") -> None:
+            values = list(curve)
             picture = "" if self.console.options.ascii_only else sparkline(values, low, high, CURVE_WIDTH)
             latest = number(values[-1], largest=max(abs(low), abs(high))) if values else ""
             table.add_row(Text(label), Text(step), Text(picture), Text(latest), Text(note), style=style)
 
-        for seed, one in self._seeds.items():
-            add(f"seed {seed}", short(one.step), curves[seed], *(("stopped", "red") if one.failure else ()))
+        if len(curves) <= MOST_SEEDS_SHOWN:
+            for seed, one in self._seeds.items():
+                add(f"seed {seed}", short(one.step), curves[seed], *(("stopped", "red") if one.failure else ()))
         living = [curves[seed] for seed in self._living() if curves[seed]]
         if len(living) > 1:
             shortest = min(map(len, living))
-            add("mean", "", np.mean([curve[:shortest] for curve in living], axis=0).tolist(), style="bold")
+            values = np.array([curve[:shortest] for curve in living])
+            ends = f"{number(values[:, -1].min())} to {number(values[:, -1].max())}"
+            add("mean", "", values.mean(axis=0), ends if len(curves) > MOST_SEEDS_SHOWN else "", "bold")
         return table
 
 
@@ -235,4 +240,6 @@ def _outcome(runs: RunSet, time_taken: str) -> str:
 def _spread(returns: Mapping[int, float]) -> str:
     if len(returns) == 1:
         return ""
+    if len(returns) > MOST_SEEDS_SHOWN:
+        return f" ({number(min(returns.values()))} to {number(max(returns.values()))})"
     return " (" + ", ".join(f"seed {seed} {number(value)}" for seed, value in returns.items()) + ")"

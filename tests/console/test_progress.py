@@ -35,9 +35,11 @@ def test_elsewhere_than_on_a_terminal_an_evaluation_of_all_seeds_is_one_line(pla
     assert lines(plain)[len(head) :] == [told]
 
 
-def test_one_seed_needs_no_mean(plain, watch):
+def test_one_seed_needs_no_mean_and_of_many_there_is_a_range(plain, watch):
     watch(plain, seeds=1).evaluated(200, {0: -3.25})
     assert lines(plain)[-1] == "step 200 of 1,000: mean return -3.25"
+    watch(plain, seeds=20).evaluated(200, {seed: float(seed) for seed in range(20)})
+    assert lines(plain)[-1] == "step 200 of 1,000: mean return 9.50 (0.00 to 19.00)"
 
 
 def test_silence_is_broken_after_half_a_minute(plain, clock, watch):
