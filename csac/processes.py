@@ -256,6 +256,7 @@ def cause_of_death(exit_code: int) -> str:
     """Return how a process ended unexpectedly, as the end of a sentence."""
     if exit_code >= 0:
         return f"its process ended by itself with exit code {exit_code} (does the task call os._exit?)"
-    name = signal.Signals(-exit_code).name
+    names = {one.value: one.name for one in signal.Signals}
+    name = names.get(-exit_code, f"signal {-exit_code}")  # a real-time signal has no name
     hints = {"SIGKILL": " (out of memory?)", "SIGSEGV": " (a fault in native code, such as the task's simulator)"}
     return f"its process was killed by {name}{hints.get(name, '')}"

@@ -71,12 +71,17 @@ def _float32_within(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
 
     If no float32 lies between them, round both to the nearest.
     """
-    nearest_low, nearest_high = low.astype(np.float32), high.astype(np.float32)
-    infinity = np.float32(np.inf)
-    inner_low = np.where(nearest_low < low, np.nextafter(nearest_low, infinity), nearest_low)
-    inner_high = np.where(nearest_high > high, np.nextafter(nearest_high, -infinity), nearest_high)
+    with np.errstate(over="ignore"):
+        nearest_low, nearest_high = low.astype(np.float32), high.astype(np.float32)
+    inner_low = _moved(nearest_low, nearest_low < low, np.inf)
+    inner_high = _moved(nearest_high, nearest_high > high, -np.inf)
     is_between = inner_low <= inner_high
     return np.where(is_between, inner_low, nearest_low), np.where(is_between, inner_high, nearest_high)
+
+
+def _moved(rounded: np.ndarray, outside: np.ndarray, direction: float) -> np.ndarray:
+    """Return float32 numbers, with finite ones that lie `outside` moved to the next float in `direction`."""
+    return np.where(outside & np.isfinite(rounded), np.nextafter(rounded, np.float32(direction)), rounded)
 
 
 def dict_part(observation: Any, key: str | None, shape: tuple[int, ...]) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import tempfile
 from contextlib import suppress
 from pathlib import Path
@@ -16,9 +17,17 @@ from typing import Any
 import jax
 
 from csac.training.devices import threads_in_use
-from csac.training.provenance import processor
 
 MOST_BYTES = 256 * 2**20  # for all programs; those of one algorithm, task and preset take half a MiB
+_PROCESSOR = (
+    "vendor_id",
+    "cpu family",
+    "model",
+    "stepping",
+    "flags",
+    "CPU ",
+    "Features",
+)  # of /proc/cpuinfo, x86 and ARM
 SECONDS_WORTH_KEEPING = 0.1  # of compile time; loading takes a tenth of it or less
 
 
@@ -30,8 +39,7 @@ def keep_programs() -> None:
     """
     if _is_users_choice():
         return
-    kind = hashlib.sha256(processor().encode()).hexdigest()[:12]
-    folder = _home() / f"{kind}-{threads_in_use()}"
+    folder = _home() / f"{_processor()}-{threads_in_use()}"
     with suppress(OSError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()  # raises if the folder cannot be written
@@ -54,6 +62,16 @@ def _is_users_choice() -> bool:
     config: Any = jax.config
     folder = config.jax_compilation_cache_dir
     return not config.jax_enable_compilation_cache or (folder is not None and Path(folder).parent != _home())
+
+
+def _processor() -> str:
+    """Return an identifier of the processor that XLA compiles for; without /proc/cpuinfo, of this machine."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = [platform.node()]
+    facts = sorted({line for line in lines if line.startswith(_PROCESSOR)}) or lines
+    return hashlib.sha256("\n".join([platform.machine(), *facts]).encode()).hexdigest()[:12]
 
 
 def _home() -> Path:

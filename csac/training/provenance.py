@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def provenance(task: Task, command: str | None, threads: int) -> dict[str, Any]:
     """Return these fields of a manifest for this process, whose device must have been chosen."""
-    machine = Machine(processor(), threads, platform.node(), **in_use())
+    machine = Machine(_processor(), threads, platform.node(), **in_use())
     return {
         "machine": machine,
         "versions": _versions(task, on_gpu=bool(machine.gpu)),
@@ -44,7 +44,7 @@ def _versions(task: Task, on_gpu: bool) -> dict[str, str]:
     return versions
 
 
-def processor() -> str:
+def _processor() -> str:
     """Return the processor's model, as far as the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()

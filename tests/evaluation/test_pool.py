@@ -110,7 +110,7 @@ def test_a_policy_that_fails_does_so_in_its_place(how):
 
 
 def test_what_another_process_cannot_make_is_run_here(pool_of, monkeypatch):
-    monkeypatch.setitem(gymnasium.registry, "Here-v0", EnvSpec("Here-v0", probes.Endless))
+    monkeypatch.setitem(gymnasium.registry, "Here-v0", EnvSpec("Here-v0", lambda **_: probes.Endless()))
     pending = pool_of("Here-v0", {}, TWO_BATCHES).begin([POLICY])
     assert pending.results() == [Evaluator("Here-v0", {}, TWO_BATCHES).run(POLICY)]
     assert len(pending.notes) == 2

@@ -63,6 +63,7 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
     ("name", "space", "message"),
     [
         ("action_space", spaces.Box(-np.inf, np.inf, (2,)), "infinite bounds"),
+        ("action_space", spaces.Box(-1e300, 1e300, (2,), np.float64), "infinite bounds"),
         ("action_space", spaces.Box(0, 5, (2,), np.int64), "continuous"),
         ("action_space", spaces.MultiDiscrete([2, 3]), "continuous"),
         ("action_space", spaces.Box(-1.0, 1.0, (0,)), "continuous"),
