@@ -10,7 +10,7 @@ import numpy as np
 
 from csac.deploy.contract import Contract
 from csac.deploy.policy import Policy
-from csac.evaluation.evaluator import EvaluationFailure, Evaluator
+from csac.evaluation.evaluator import LONGEST_EPISODE, EvaluationFailure, Evaluator
 from csac.evaluation.pool import EvaluationPool, EvaluationStopped
 from csac.tasks.perturbations import perturbations_of, values_at
 from csac.training.callbacks import mean_return
@@ -148,6 +148,8 @@ class Evaluations:
             policy.write(run.policy_file("best"))
         run.log(f"step {step}: mean return {mean:.1f}")
         run.update_manifest(steps_done=max(step, run.manifest.steps_done))
+        if any(episode.length >= LONGEST_EPISODE for episode in episodes):
+            self.watcher.note_of(run, f"step {step}: evaluation episodes were cut off after {LONGEST_EPISODE:,} steps")
 
     def _warn_of_missing_events(self, episodes: Sequence[EvaluationEpisode]) -> None:
         """Note which events no episode of the first evaluation reported."""
