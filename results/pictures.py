@@ -19,7 +19,7 @@ def draw_equal_time(path: Path, reached: dict[str, dict[str, np.ndarray]], times
     """Draw the mean and range over seeds against the seconds of training."""
     figure = _figure(7.5, 4.2)
     for axes, (task, arms) in zip(figure.subplots(1, len(reached), sharey=True), reached.items(), strict=True):
-        for colour, (label, values) in zip(COLOURS, arms.items(), strict=True):
+        for colour, (label, values) in zip(COLOURS[-len(arms) :], arms.items(), strict=True):
             axes.fill_between(times[task], values.min(axis=0), values.max(axis=0), color=colour, alpha=0.1, linewidth=0)
             axes.plot(times[task], values.mean(axis=0), color=colour, linewidth=2.2, label=label)
         _dress(axes, task, "seconds of training on two cores")
