@@ -9,7 +9,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from csac.checks import check_whole
+from csac.checks import check_arguments, check_whole
 from csac.seeds import EVALUATION_SEED
 from csac.types import InputError
 
@@ -113,6 +113,7 @@ def as_json(name: str, values: dict[str, Any]) -> dict[str, Any]:
 
     Raises InputError if JSON would change a value, since a resumed run would then not be the same run.
     """
+    check_arguments(name, values)
     plain = _plain(values)
     try:
         kept = json.loads(json.dumps(plain), parse_constant=float)  # no NaN is equal to another
