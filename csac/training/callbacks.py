@@ -217,13 +217,13 @@ class Callbacks:
                 continue
             name = f"{type(callback).__name__}.{event.method}"
             method = getattr(callback, event.method)
-            answers = [self._guarded(name, method, moment, *arguments) for moment, arguments in pairs]
+            answers = [self._guarded(name, _truth, method, moment, *arguments) for moment, arguments in pairs]
             stopped_by += [type(callback).__name__ for answer in answers if not (answer is None or answer)]
         if event.method == "on_evaluation":
             returns = {moment.seed: mean_return(episodes) for moment, (episodes,) in pairs}
             step = event.moments[0].step
             self._guarded("on_evaluation", self.on_evaluation, step, dict(returns))
-            if self._guarded("stop_when", self.stop_when, step, dict(returns)):
+            if self.stop_when and self._guarded("stop_when", _truth, self.stop_when, step, dict(returns)):
                 stopped_by.append("stop_when")
         stopper = str(self.failure) if self.failure else next(iter(stopped_by), "")
         return Answer(stopper, tuple(moment.scalars for moment in event.moments), self.failure is not None)
@@ -252,6 +252,11 @@ class Callbacks:
             self.failure = CallbackFailure(f"{name} raised {raised(error)}")
             self.failure.__cause__ = error
             return None
+
+
+def _truth(function: Callable[..., Any], *arguments: Any) -> bool | None:
+    answer = function(*arguments)
+    return None if answer is None else bool(answer)
 
 
 class Notifier:
