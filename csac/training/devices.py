@@ -94,9 +94,8 @@ def begin_with(threads: int) -> None:
 
 
 def threads_in_use() -> int:
-    """Return for how many cores XLA divides the work of this process; it also reads NPROC."""
-    reserved = os.environ.get("NPROC", "")
-    return int(reserved) if reserved.isdigit() and int(reserved) else _threads or len(usable_cores())
+    """Return for how many cores XLA divides the work of this process."""
+    return _threads or len(usable_cores())
 
 
 def in_use() -> dict[str, str]:
