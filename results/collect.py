@@ -92,8 +92,9 @@ def main() -> None:
     asked = parser.parse_args()
     for arm in read_arms(asked.runs):
         for run in arm.runs:
-            if run.manifest.state == "finished" and add_run(asked.folder, asked.arm or arm.label, run):
-                print(f"added: {asked.arm or arm.label} on {run.config.task}, seed {run.seed}")
+            if run.manifest.state == "finished":
+                done = "added" if add_run(asked.folder, asked.arm or arm.label, run) else "there already"
+                print(f"{done}: {asked.arm or arm.label} on {run.config.task}, seed {run.seed}")
 
 
 if __name__ == "__main__":

@@ -188,7 +188,7 @@ class _Film:
         adapter, raw = adapter_of(task), environment.raw
         self._picture: Callable[[], Any] = adapter.camera(raw) if adapter and adapter.camera else raw.render
         speed = (adapter and adapter.pictures_per_second) or raw.metadata.get("render_fps") or DEFAULT_FRAMES_PER_SECOND
-        self._frames_per_second, self._task, self._path = round(speed), task, path
+        self._frames_per_second, self._task, self._path = speed, task, path
         self._writer: Any = None
         self._frames_written = 0  # in this episode
         self._last = np.zeros((0, 0, 3), np.uint8)

@@ -34,7 +34,7 @@ ACTIONS: list[list[float]] = []  # that reached the task
 class Stripes(gymnasium.Env):
     """It never ends by itself, and can be drawn."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 12.5}  # noqa: RUF012
     observation_space = spaces.Box(-1, 1, (2,), np.float32)
     action_space = spaces.Box(-1, 1, (1,), np.float32)
 
@@ -82,8 +82,8 @@ def test_play_tells_how_far_it_is(run_of, tmp_path):
     episodes = list(play(run_of(7).path, episodes=2, video=film, on_progress=lambda done, of: told.append((done, of))))
     assert [episode.length for episode in episodes] == [7, 7]
     assert told == [(done, 14) for done in range(1, 15)]
-    frames, _ = imageio_ffmpeg.count_frames_and_secs(str(film))
-    assert frames == 2 * 10  # eight pictures, on the screen for a second
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
+    assert (frames, seconds) == (2 * 12, 24 / 12.5)  # eight pictures, on the screen for a second
 
 
 def test_the_example_films_runs_side_by_side(run_of, tmp_path):
