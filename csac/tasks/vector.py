@@ -129,6 +129,7 @@ class SeedEnvironments:
         if self._workers:
             for place in self._running:
                 self._by_place[place].ask("step_environment_scale", scaled[place])
+            self._workers.begin()
         for place in self._running:
             try:
                 step = self._by_place[place].step_environment_scale(scaled[place])
@@ -272,6 +273,8 @@ class SeedEnvironments:
             self._episodes_begun[place] += 1
             if self._workers:
                 self._by_place[place].ask("reset", seed)
+        if self._workers:
+            self._workers.begin()
         for place, seed in zip(places, seeds, strict=True):
             try:
                 self.observations[place] = self._by_place[place].reset(seed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
 from functools import partial
@@ -42,7 +43,7 @@ class Workers:
         self._workers: list[Worker] = []
         try:
             for index, count in enumerate(counts):
-                self._workers.append(Worker(_serve, task, environment_arguments, count, seed + index, events))
+                self._workers.append(Worker(task, environment_arguments, count, seed + index, events))
             descriptions = [worker.answer() for worker in self._workers]
         except BaseException:
             self.close()
@@ -53,6 +54,11 @@ class Workers:
             for i in range(count)
         ]
 
+    def begin(self) -> None:
+        """Start the calls that were asked for, in all processes."""
+        for worker in self._workers:
+            worker.begin()
+
     def close(self) -> None:
         """Have the processes close their environments and end."""
         for worker in self._workers:
@@ -61,7 +67,7 @@ class Workers:
 
 
 class RemoteEnvironment:
-    """An `Environment` in a worker process, with its methods; `ask` starts a call without waiting for the result.
+    """An `Environment` in a worker process, with its methods; `ask` announces a call, which `Workers.begin` starts.
 
     A worker answers in order: after `ask` on several of its environments, collect their results in the same order
     before calling anything else. If it dies, every call raises EnvironmentFailure.
@@ -72,8 +78,8 @@ class RemoteEnvironment:
         self._worker, self._index, self._is_pending = worker, index, False
 
     def ask(self, method: str, *arguments: Any) -> None:
-        """Start a call in the worker; the next call of the method returns its result."""
-        self._worker.tell((self._index, method, arguments))
+        """Announce a call; the next call of the method returns its result."""
+        self._worker.calls.append((self._index, method, arguments))
         self._is_pending = True
 
     def __getattr__(self, method: str) -> Callable[..., Any]:
@@ -91,14 +97,31 @@ class RemoteEnvironment:
 
 
 class Worker(Child):
-    """The parent's end of a process that steps environments."""
+    """The parent's end of a process that steps environments.
+
+    All calls are sent in one message and answered in one: two ends that both send more than a pipe holds never return.
+    """
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(_serve, *arguments)
+        self.calls: list[tuple[int, str, tuple[Any, ...]]] = []
+        self._answers: deque[tuple[Any, Exception | None, str]] = deque()
+
+    def begin(self) -> None:
+        """Send the calls that were announced."""
+        if self.calls:
+            self.tell(self.calls)
+            self.calls = []
 
     def answer(self) -> Any:
         """Return the next answer or raise the worker's exception; raise EnvironmentFailure if the process is gone."""
+        self.begin()
         try:
-            answer, error, details = self.connection.recv()
+            if not self._answers:
+                self._answers.extend(self.connection.recv())
         except (EOFError, OSError):
             raise EnvironmentFailure(f"its environments' process: {self.cause_of_death()}") from None
+        answer, error, details = self._answers.popleft()
         if error:
             raise error from (RuntimeError(details) if details else None)
         return answer
@@ -124,10 +147,9 @@ def _serve(
                 stack.callback(environments[-1].close)
             return environments[0].spec, environments[0].contract_parts, environments[0].task_name
 
-        connection.send(_outcome(names, make))
-        while request := connection.recv():
-            index, method, arguments = request
-            connection.send(_outcome(names, getattr(environments[index], method), *arguments))
+        connection.send([_outcome(names, make)])
+        while calls := connection.recv():
+            connection.send([_outcome(names, getattr(environments[i], method), *of_it) for i, method, of_it in calls])
 
 
 def _outcome(names: set[str], function: Any, *arguments: Any) -> tuple[Any, Exception | None, str]:

@@ -97,6 +97,20 @@ class Endless(Probe):
         return self.observation, self.constant_reward, False, self.steps == self.length, {}
 
 
+class Large(Endless):
+    """Observations and actions of 4 kB each."""
+
+    observation_space = Box(-np.inf, np.inf, (1000,), np.float32)
+    action_space = Box(-1.0, 1.0, (1000,), np.float32)
+
+    def step(self, action: np.ndarray) -> Result:
+        return action, *super().step(action)[1:]
+
+    def first_observation(self) -> np.ndarray:
+        super().first_observation()
+        return np.zeros(1000, np.float32)
+
+
 class Failing(Endless):
     """Raises in the `at`-th `step`, `reset` or `close` of its life, in episodes reset with one of `seeds` (None: any).
 

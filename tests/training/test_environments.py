@@ -104,6 +104,14 @@ def test_a_seed_fails_once_where_one_of_its_environments_does(processes):
         environments.close()
 
 
+def test_a_process_may_have_more_environments_than_fit_into_its_pipe():
+    environments = SeedEnvironments(probes.Large, None, [4], 256, 1)
+    actions = np.random.default_rng(0).uniform(-1, 1, (1, 256, 1000)).astype(np.float32)
+    environments.reset()
+    np.testing.assert_array_equal(environments.step(actions).next_observation, actions)
+    environments.close()
+
+
 def test_the_death_of_a_process_is_the_failure_of_its_seeds():
     environments = SeedEnvironments(probes.Deadly, {"seed": training_seed(4, 1, 1)}, [4], 2, 2)
     environments.reset()
