@@ -154,9 +154,9 @@ class Cadence(NamedTuple):
 
     def side_by_side(self, environments: int) -> Cadence:
         """Return the cadence for `environments`: intervals of whole turns of these, with the same updates per step."""
-        turns = -(-self.update_interval // environments) * environments
         whole = self.update_interval // math.gcd(self.update_interval, self.updates_per_interval)
-        interval = math.lcm(turns, whole)
+        shortest = math.lcm(environments, whole)
+        interval = -(-self.update_interval // shortest) * shortest
         updates = interval * self.updates_per_interval // self.update_interval
         return self._replace(update_interval=interval, updates_per_interval=updates)
 

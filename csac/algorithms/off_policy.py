@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from csac.algorithms.distributions import policy_at
@@ -45,7 +45,7 @@ from csac.types import Cadence, InputError, Metrics, PolicyNetwork, PolicyParame
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-UPDATES = Limit(lambda value: 0.01 <= value <= 1_000, "from 0.01 to 1,000")
+UPDATES = Limit(lambda value: np.float32(0.01) <= value <= 1_000, "from 0.01 to 1,000")
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class OffPolicy(Architecture):
     def cadence(self) -> Cadence:
         """When updates run, and on how many transitions."""
         updates = Fraction(self.updates_per_step).limit_denominator(100)
-        interval = math.lcm(self.update_interval, updates.denominator)
+        interval = -(-self.update_interval // updates.denominator) * updates.denominator
         return Cadence(
             warmup_steps=self.warmup_steps,
             update_interval=interval,

@@ -57,7 +57,7 @@ def test_a_rollout_holds_the_steps_of_a_turn_beside_each_other():
 
 @pytest.mark.parametrize(
     ("updates_per_step", "environments", "expected"),
-    [(1, 1, (1, 1)), (1, 4, (4, 4)), (0.25, 1, (4, 1)), (0.25, 4, (4, 1)), (0.25, 3, (12, 3)), (2, 3, (3, 6))],
+    [(1, 1, (1, 1)), (1, 4, (4, 4)), (0.25, 1, (4, 1)), (0.25, 3, (12, 3)), (2, 3, (3, 6)), (0.33, 8, (200, 66))],
 )
 def test_the_ratio_of_updates_to_steps_is_kept_whatever_the_number_of_environments(
     updates_per_step, environments, expected
@@ -66,6 +66,7 @@ def test_the_ratio_of_updates_to_steps_is_kept_whatever_the_number_of_environmen
     assert (cadence.update_interval, cadence.updates_per_interval) == expected
     assert cadence.first_update == -(-10_000 // expected[0]) * expected[0]
     assert Cadence(0, 10, 5, 8).side_by_side(4)[1:3] == (12, 6)  # rounded up to whole turns
+    assert SAC(updates_per_step=0.25, update_interval=50).cadence[1:3] == (52, 13)  # and to whole updates
 
 
 def test_a_resumed_ppo_run_equals_one_that_was_never_stopped(tmp_path):
