@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from csac.algorithms.shapes import Count, Key
-from csac.algorithms.statistics import ReturnScale
+from csac.algorithms.statistics import LIMIT, ReturnScale
 from csac.types import Transition
 
 if TYPE_CHECKING:
@@ -75,7 +75,9 @@ class Replay:
         """Return a batch drawn uniformly with replacement from the `count` rows added, or the newest `capacity`."""
         indices = jax.random.randint(key, (batch_size,), 0, jnp.minimum(count, self.rows.shape[0]))
         batch = self.at(indices, count, spec)
-        return batch if self.returns is None else batch._replace(reward=batch.reward / self.returns.statistics.std)
+        if self.returns is None:
+            return batch
+        return batch._replace(reward=jnp.clip(batch.reward / self.returns.statistics.std, -LIMIT, LIMIT))
 
     def at(self, indices: Int[Array, " batch"], count: Count, spec: Spec) -> Transition:
         """Return the transitions that start at these rows; none extends past the newest of the `count` rows added."""

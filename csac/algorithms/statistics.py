@@ -16,7 +16,7 @@ from csac.types import Normaliser, Transition
 # Added to variances and to the standard deviation of advantages, as in SB3 and CleanRL: either may be 0.
 EPSILON = 1e-8
 MOST = 1_000_000  # batches of values that statistics average over: float32 cannot count on for ever
-LIMIT = 10.0  # bound on normalised observations, in standard deviations
+LIMIT = 10.0  # bound on normalised observations and rewards, in standard deviations
 
 
 class Statistics(NamedTuple):

@@ -31,6 +31,14 @@ def test_rewards_are_divided_by_the_spread_of_the_returns_of_each_environment():
     assert set(np.asarray(drawn.reward).tolist()) == {0.5, 0.75, 1.0}
 
 
+def test_divided_rewards_are_bounded_as_a_new_scale_may_be_tiny():
+    rows = jnp.asarray(pack(batch_of(transition(reward=-3.0))))
+    ring = (
+        Replay.create(1, Spec(1, 1), discount=0.5, scale_rewards=True).measure(rows, Spec(1, 1)).add(rows, jnp.int32(0))
+    )
+    assert ring.sample(jax.random.key(0), jnp.int32(1), 1, Spec(1, 1)).reward == -10.0
+
+
 def test_a_scale_that_has_seen_nothing_is_1():
     assert ReturnScale.create(1).statistics.std == 1.0
 
