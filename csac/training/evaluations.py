@@ -57,7 +57,7 @@ class Evaluations:
             lent=None if config.evaluation_environments else environments.environments[0],
         )
         stack.callback(self._evaluator.close)
-        if program.evaluation_processes and config.evaluation_environments:
+        if program.evaluation_processes and config.evaluation_interval:
             self.evaluator = pool = EvaluationPool(self._evaluator, program.evaluation_processes)
             stack.callback(pool.close)
             pool.start(program.evaluation_processes)

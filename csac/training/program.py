@@ -101,8 +101,10 @@ def programs_of(
         is_worthwhile = is_worthwhile and 0 < config.evaluation_interval < config.steps
         processes = min(batches, max(1, spare // len(directories))) if is_worthwhile and has_processes else 0
     check_whole("evaluation_processes", processes, 0, 1_000)
-    if not config.evaluation_environments and max(config.environments, *map(len, directories)) > 1:
-        raise InputError("evaluation_environments=0 is for one environment, and one seed per process")
+    if not config.evaluation_environments and (processes or max(config.environments, *map(len, directories)) > 1):
+        raise InputError(
+            "evaluation_environments=0 is for one environment, one seed per process and evaluation_processes=0"
+        )
     stepping = template.environment_processes if has_processes else template.environment_processes or 0
     most = config.environments if config.environments > 1 else 0
     check_whole("environment_processes", stepping or 0, 0, most)

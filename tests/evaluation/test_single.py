@@ -92,6 +92,7 @@ def test_fewer_environments_give_the_same_numbers(tmp_path):
     np.testing.assert_array_equal(one.evaluations["return"], again)
 
 
-def test_several_seeds_cannot_share_it(tmp_path):
+@pytest.mark.parametrize("options", [{"seeds": 2, "seeds_per_process": 2}, {"evaluation_processes": 2}])
+def test_several_seeds_or_processes_cannot_share_it(tmp_path, options):
     with pytest.raises(InputError, match="evaluation_environments=0"):
-        run(tmp_path / "run", LEARNERS[1], seeds=2, seeds_per_process=2, evaluation_environments=0)
+        run(tmp_path / "run", LEARNERS[1], evaluation_environments=0, **options)
