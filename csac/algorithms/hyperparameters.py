@@ -46,6 +46,16 @@ SHARE = Limit(lambda value: 0 <= value <= 1, "from 0 to 1")
 DISCOUNT = Limit(lambda value: 0 <= value < 1, "at least 0 and less than 1")
 WIDTHS = Limit(lambda widths: all(width >= 1 for width in widths), "whole numbers of at least 1")
 
+# A hyperparameter that does nothing unless another one has this value.
+NEEDS = {
+    "reference_period": ("reference_policy", "periodic"),
+    "reference_rate": ("reference_policy", "average"),
+    "initial_entropy_weight": ("entropy_weight", "auto"),
+    "target_entropy": ("entropy_weight", "auto"),
+    "target_entropy_per_dimension": ("entropy_weight", "auto"),
+    "weight_learning_rate": ("entropy_weight", "auto"),
+}
+
 # Compiled programs count and compute in 32 bits.
 LARGEST_INTEGER, LARGEST_FLOAT = 2**31 - 1, float(np.finfo(np.float32).max)
 
@@ -63,6 +73,15 @@ def check_hyperparameters(algorithm: Any) -> None:
             object.__setattr__(algorithm, field.name, _convert(value, hints[field.name]))
         except ValueError as error:
             raise InputError(f"{field.name} must be {error}, not {value!r}") from None
+
+
+def without_effect(algorithm: Any) -> dict[str, str]:
+    """Return the hyperparameters that do nothing, with the setting that makes it so, such as "entropy_weight 0.2"."""
+    return {
+        name: f"{other} {getattr(algorithm, other)}"
+        for name, (other, value) in NEEDS.items()
+        if hasattr(algorithm, name) and getattr(algorithm, other, value) != value
+    }
 
 
 def reject_unknown_names(algorithm: type[Algorithm]) -> type[Algorithm]:

@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+from csac.algorithms.hyperparameters import without_effect
 from csac.checks import did_you_mean
 from csac.record.config import RunConfig, as_json
 from csac.seeds import EVALUATION_SEED
@@ -13,7 +14,7 @@ from csac.studies.arms import train_command
 from csac.types import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     import optuna
 
@@ -72,25 +73,17 @@ def sample(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
     return _rounded(trial.suggest_float(name, *ends, log=scale == "log"))
 
 
-# When a hyperparameter has an effect; those that are not listed always do.
-_HAS_EFFECT: Mapping[str, Callable[[Any], bool]] = {
-    "reference_period": lambda algorithm: algorithm.reference_policy == "periodic" and algorithm.reference_period > 1,
-    "reference_rate": lambda algorithm: algorithm.reference_policy == "average",
-    "target_rate": lambda algorithm: getattr(algorithm, "critic_normalisation", "none") == "none",
-    "weight_learning_rate": lambda algorithm: "auto" in dataclasses.asdict(algorithm).values(),
-}
-
-
 def space_of(algorithm: Algorithm, wanted: Sequence[str] | None = None, given: Sequence[str] = ()) -> Space:
     """Return the hyperparameters to search: those `wanted` that have an effect, are not `given` and not learnt."""
     values: dict[str, Any] = dataclasses.asdict(algorithm)  # pyright: ignore[reportArgumentType]
     family = getattr(algorithm, "name", type(algorithm).__name__)  # a user's subclass is searched like its base class
     space = {name: one for name, one in SPACES.get(family, {}).items() if name in values}
-    free = {
-        name: dimension
-        for name, dimension in space.items()
-        if name not in given and values[name] != "auto" and _HAS_EFFECT.get(name, lambda _: True)(algorithm)
-    }
+    fixed = {*given, *without_effect(algorithm)}
+    if values.get("critic_normalisation", "none") != "none":
+        fixed.add("target_rate")
+    if values.get("reference_period") == 1:
+        fixed.add("reference_period")
+    free = {name: dimension for name, dimension in space.items() if name not in fixed and values[name] != "auto"}
     for name in wanted or ():
         if name not in space:
             hint = did_you_mean(name, space) or f"there is {', '.join(space)}"

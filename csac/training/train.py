@@ -9,6 +9,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from csac.algorithms.hyperparameters import without_effect
 from csac.checks import check_flag, check_path
 from csac.deploy.choosing import TrainedRuns
 from csac.processes import cores_to_use, end_if_unguarded
@@ -131,7 +132,8 @@ def train(
     template = Program((), algorithm, task, 1, *settings)
     directories = [[run_path(place, seed) for seed in group] for group in groups]
     programs = programs_of(template, directories, existing, configs[0])
-    notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes, *_warmup_note(algorithm, configs[0])]
+    notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes]
+    notes += [*_warmup_note(algorithm, configs[0]), *_effect_notes(algorithm)]
     if watch.callbacks.interests.evaluations and not configs[0].evaluation_interval:
         notes.append("note: evaluation_interval is 0: no callback receives evaluations, and none ends a run by them")
 
@@ -312,3 +314,9 @@ def _warmup_note(algorithm: Algorithm, config: RunConfig) -> list[str]:
     if config.steps >= first:
         return []
     return [f"note: no updates: steps ({config.steps:,}) < {first:,}, where the first one comes"]
+
+
+def _effect_notes(algorithm: Algorithm) -> list[str]:
+    idle = without_effect(algorithm).items()
+    changed = [(name, why) for name, why in idle if getattr(algorithm, name) != getattr(type(algorithm), name, None)]
+    return [f"note: {name} has no effect with {why}" for name, why in changed]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from csac.algorithms import ALGORITHMS, CSAC, PPO, SAC, SD3, TD3
+from csac.algorithms.hyperparameters import without_effect
 from csac.types import InputError
 
 OFF_POLICY = (CSAC, SAC, TD3, SD3)
@@ -98,6 +99,16 @@ def test_every_number_has_a_range():
                 settings: dict[str, Any] = {name: -1}
                 with pytest.raises(InputError, match=name):
                     algorithm(**settings)
+
+
+def test_bounds_are_inclusive_in_32_bits():
+    assert SAC(updates_per_step=0.01).updates_per_step == 0.01
+
+
+def test_hyperparameters_without_effect_are_told():
+    assert without_effect(CSAC(entropy_weight="auto")) == {"reference_period": "reference_policy average"}
+    assert without_effect(SAC(entropy_weight=0.2))["target_entropy"] == "entropy_weight 0.2"
+    assert without_effect(TD3()) == {}
 
 
 @pytest.mark.parametrize("algorithm", OFF_POLICY)
