@@ -87,7 +87,8 @@ class SeedEnvironments:
         first = self.environments[0]
         self.spec = first.spec._replace(environments=environments)
         self.contract_parts, self.task_name = first.contract_parts, first.task_name
-        self._bounds = ActionBounds(self.contract_parts.action_low, self.contract_parts.action_high)
+        low, high = self.contract_parts.action_low, self.contract_parts.action_high
+        self._bounds, self.action_bounds = ActionBounds(low, high), [low.tolist(), high.tolist()]
         self.seeds = tuple(seeds)
         self.alive = np.ones(len(seeds), bool)
         self._running = self._places

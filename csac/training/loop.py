@@ -23,7 +23,7 @@ from csac.training.evaluations import Evaluations, is_finite
 from csac.training.hindsight import Hindsight
 from csac.training.learner import Learner
 from csac.training.resume import ResumePoint, record_inexact
-from csac.types import Snapshot
+from csac.types import InputError, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -161,6 +161,12 @@ class Loop:
             saved, origin = point.checkpoint.state(), run.manifest.forked_from
             environment = saved.part("environment")
             self.environments.refuse_incompatible(environment, saved.arrays["actions"])
+            is_new_task = origin and origin.step == self.step and origin.changed("task ", "environment_arguments")
+            if not is_new_task and saved.values.get("action_bounds") not in (None, self.environments.action_bounds):
+                raise InputError(
+                    f"{run.path}: the task's action bounds were {saved.values['action_bounds']}, and are "
+                    f"{self.environments.action_bounds} now"
+                )
             self._evaluation_pending = self._evaluation_pending or saved.values.get("evaluation_owed", False)
             for step in saved.values.get("evaluations_lost", []):
                 self._note_inexact(run, f"seed {run.seed}: the evaluation at step {step:,} was broken off")
@@ -278,6 +284,7 @@ class Loop:
         parts = {"learner": self.learner.save(index), "environment": self.environments.save(index)}
         saved = Snapshot.joined(parts | ({"hindsight": self.hindsight.save(index)} if self.hindsight else {}))
         saved.arrays["actions"] = self._actions[index]
+        saved.values["action_bounds"] = self.environments.action_bounds
         broken_off = self.evaluations.broken_off
         saved.values["evaluation_owed"] = self.step in broken_off
         saved.values["evaluations_lost"] = [step for step in broken_off if step != self.step]

@@ -88,6 +88,8 @@ class Watch(Watcher):
     def is_over(self, run: RunDirectory) -> bool:
         """Return whether a run needs no more training: all its steps are made, or a callback would still end it."""
         is_complete = run.manifest.steps_done >= run.config.steps
+        if run.config.evaluation_interval and not len(run.evaluations):  # they were lost: a checkpoint has them
+            return False
         return run.manifest.state == "finished" and (is_complete or self.callbacks.would_stop_again(run))
 
 

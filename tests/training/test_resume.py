@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.mujoco.hopper_v4 import HopperEnv
 from gymnasium.spaces import Box
-from probes import Probe
+from probes import Endless, Probe
 from resuming import ADAPTIVE, LEARNERS, SMALL, Crash, contents, crash_at, run, run_with_copies
 
 import csac
@@ -97,6 +97,19 @@ def test_a_run_that_lacks_a_new_hyperparameter_resumes_with_its_default(finished
     with finished.locked():
         finished.update_manifest(config=replace(config, hyperparameters=older))
     assert run(finished.path.parent, steps=510, resume=True, keep_checkpoints=0).steps_done == 510
+
+
+def test_a_resume_with_other_action_bounds_is_refused(tmp_path, monkeypatch):
+    given = {"task": "probes:Endless-v0"}
+    run(tmp_path / "run", steps=100, **given)
+    monkeypatch.setattr(Endless, "action_space", Box(-5.0, 5.0, (1,), np.float32))
+    with pytest.raises(InputError, match="action bounds"):
+        run(tmp_path / "run", steps=200, resume=True, **given)
+
+
+def test_lost_evaluations_of_a_finished_run_are_restored(finished, whole):
+    finished.table("evaluations").unlink()
+    assert contents(run(finished.path.parent, resume=True).runs[0]) == whole
 
 
 @pytest.mark.parametrize(
