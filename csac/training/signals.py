@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from csac.record.sets import RunSet
 
 
-class Interrupted(Exception):
-    """Training was stopped by a signal, after saving everything that can be saved.
+class Interrupted(KeyboardInterrupt):
+    """Training was stopped by a signal, SIGINT or SIGTERM, after saving everything that can be saved.
 
     `can_resume` says whether `resume` can continue it.
     """

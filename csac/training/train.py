@@ -15,7 +15,7 @@ from csac.deploy.choosing import TrainedRuns
 from csac.processes import cores_to_use, end_if_unguarded
 from csac.record.files import temporary_path
 from csac.record.manifest import Manifest
-from csac.record.run import RunDirectory, is_run
+from csac.record.run import RunDirectory, StorageFailure, is_run
 from csac.record.sets import RunSet, new_set_directory, run_path
 from csac.record.wandb import import_wandb
 from csac.tasks.trust import named_task
@@ -27,7 +27,7 @@ from csac.training.program import Program, choose_groups, memory_needed, program
 from csac.training.resume import Source, find_resume_point, fork_options, refuse_differences, refuse_mixed
 from csac.training.running import train_program
 from csac.training.signals import Interrupted, stop_requested
-from csac.training.supervisor import supervise
+from csac.training.supervisor import record_failure, supervise
 from csac.training.watch import Watch, draw_curve
 from csac.types import InputError
 
@@ -291,7 +291,12 @@ def _run(runs: TrainedRuns, programs: list[Program], watch: Watch, notes: list[s
 
         if len(programs) == 1:
             begin_with(programs[0].threads)
-            train_program(programs[0], watch, should_stop)
+            try:
+                train_program(programs[0], watch, should_stop)
+            except (InputError, StorageFailure):
+                raise
+            except Exception as error:
+                record_failure(programs[0], watch, error)
         elif programs:
             turns = max(1, cores_to_use() // programs[0].threads) if runs.config.device == "cpu" else None
             supervise(programs, lambda _: watch, should_stop, _workers(), turns)

@@ -157,6 +157,16 @@ def test_one_that_no_module_can_give_is_resumed_with_the_class_given(tmp_path, o
         run(tmp_path / "two", local, seeds=2, seeds_per_process=1)
 
 
+def test_an_exception_in_it_fails_the_run_also_in_this_process(tmp_path):
+    class Faulty(SAC):
+        def actor_loss(self, *_: Any, **__: Any) -> Any:
+            raise ValueError("my mistake")
+
+    runs = run(tmp_path / "run", Faulty(**SMALL), 100)
+    assert runs.failures[0] == "step 0: ValueError: my mistake"
+    assert "in actor_loss" in (runs.run(0).path / "log.txt").read_text()
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
