@@ -126,12 +126,21 @@ def make_orthogonal_mlp(
     return _with_hidden(layers, hidden)
 
 
-def learnable(network: Any) -> Any:
-    """Return the network. Raises InputError if one of its leaves is not an array."""
+def learnable(network: Any, inputs: int, outputs: int) -> Any:
+    """Return the network. Raises InputError if a leaf is no array, or if it does not map [inputs] to [outputs]."""
+    kind = type(network).__name__
     for leaf in jax.tree.leaves(network):
         if not eqx.is_array(leaf):
-            kind = type(network).__name__
-            raise InputError(f"{kind} has {leaf!r:.40}, which cannot be learnt: make its field eqx.field(static=True)")
+            raise InputError(
+                f"{kind} has {leaf!r:.40}, which cannot be learnt: make its field eqx.field(static=True); instead of "
+                "eqx.nn.MLP or eqx.nn.Lambda, which hold a function, write a module of eqx.nn.Linear layers"
+            )
+    try:
+        found = jax.eval_shape(network, jax.ShapeDtypeStruct((inputs,), jnp.float32))
+    except Exception as error:
+        raise InputError(f"{kind} cannot be called with {inputs} numbers: {error}".partition("\n")[0]) from error
+    if (shape := getattr(found, "shape", None)) != (outputs,):
+        raise InputError(f"{kind} returns an array of shape {shape}, not ({outputs},)")
     return network
 
 

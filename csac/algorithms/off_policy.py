@@ -167,9 +167,11 @@ class TwinCritics(OffPolicy):
         planned = self.updates(spec, steps)
         actor_adam = self.optimiser(self.actor_learning_rate, planned // self.policy_delay)
         actor_key, critics_key = jax.random.split(key)
-        actor = learnable(self.make_actor(actor_key, spec, actor_outputs))
+        actor = learnable(self.make_actor(actor_key, spec, actor_outputs), spec.observation_size, actor_outputs)
         first_key, second_key = jax.random.split(critics_key)
-        critics = learnable(self.make_critic(first_key, spec)), learnable(self.make_critic(second_key, spec))
+        pair = spec.observation_size + spec.action_size
+        first, second = (learnable(self.make_critic(key, spec), pair, 1) for key in (first_key, second_key))
+        critics = first, second
         if self.critic_normalisation != "none" and not isinstance(critics[0], MLP):
             raise InputError(f"critic_normalisation batch is for MLPs, not for {type(critics[0]).__name__}")
         statistics = Statistics.create((spec.observation_size,)) if self.normalise_observations else None

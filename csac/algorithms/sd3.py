@@ -131,8 +131,8 @@ class SD3(OffPolicy):
     def _make_pair(self, key: Key, spec: Spec, steps: int) -> Pair:
         planned = self.updates(spec, steps)
         actor_key, critic_key = jax.random.split(key)
-        actor = learnable(self.make_actor(actor_key, spec, spec.action_size))
-        critic = learnable(self.make_critic(critic_key, spec))
+        actor = learnable(self.make_actor(actor_key, spec, spec.action_size), spec.observation_size, spec.action_size)
+        critic = learnable(self.make_critic(critic_key, spec), spec.observation_size + spec.action_size, 1)
         return Pair(
             actor=actor,
             critic=critic,

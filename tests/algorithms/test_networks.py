@@ -86,6 +86,11 @@ class OneName(Halved):
     name: Any = eqx.field(static=True, default="halved")
 
 
+class Pair(OneName):
+    def __call__(self, inputs):
+        return jnp.repeat(self.inner(inputs), 2)
+
+
 def with_networks(kind: Any, actor: Any = None, critic: Any = None, **methods: Any) -> Any:
     """Return an algorithm of small networks, inside these modules where they are given."""
 
@@ -127,6 +132,11 @@ def test_an_actor_of_another_kind_leaves_by_the_layers_that_it_gives():
     ("learner", "message"),
     [
         (with_networks(SAC, critic=Halved)(**TINY), "Halved has 'halved', which cannot be learnt"),
+        (with_networks(SAC, critic=Pair)(**TINY), r"Pair returns an array of shape \(2,\), not \(1,\)"),
+        (
+            with_networks(SD3, critic=lambda _: eqx.nn.Linear(9, 1, key=jax.random.key(0)))(**TINY),
+            "Linear cannot be called with 4 ",
+        ),
         (with_networks(SAC, actor=OneName)(**TINY), "OneName is no MLP, but policies are exported as plain layers"),
         (with_networks(SD3, critic=OneName)(**TINY), "OneName is no MLP"),
         (
