@@ -65,7 +65,8 @@ def wrapper_warnings(environment: Environment) -> list[str]:
     """Return a warning for each wrapper that learns statistics, which csac neither saves nor exports."""
     return [
         f"{environment.task_name}: {type(wrapper).__name__} keeps statistics that are saved neither with the policy "
-        "nor in checkpoints, and each environment has its own: leave it out (PPO normalises by itself)"
+        "nor in checkpoints, and each environment has its own: leave it out, and use normalise_observations or "
+        "normalise_rewards"
         for wrapper in _wrappers(environment)
         if isinstance(wrapper, NormalizeObservation | NormalizeReward)
     ]

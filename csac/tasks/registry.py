@@ -79,6 +79,9 @@ def import_module_of(name: str) -> Any:
     the module. Modules that the user has not named are never looked up there.
     """
     module = module_of(name)
+    if os.sep in module:
+        hint = f"{os.path.basename(module).removesuffix('.py')}:{name.rpartition(':')[2]}"
+        raise InputError(f"{name}: write the module's name, not its path: {hint} in its folder")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:

@@ -50,6 +50,8 @@ def observation_parts(space: object) -> Parts:
         if not math.prod(part.shape):
             raise InputError(f"{name} is empty: its shape is {part.shape}")
         parts.append((key, tuple(part.shape)))
+    if not parts:
+        raise InputError("the observation is an empty Dict")
     return tuple(parts)
 
 

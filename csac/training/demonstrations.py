@@ -12,6 +12,7 @@ import numpy as np
 import safetensors.numpy
 
 from csac.algorithms.memory import pack
+from csac.checks import did_you_mean
 from csac.deploy.contract import Contract
 from csac.record.files import write_atomically
 from csac.tasks.failures import message
@@ -27,7 +28,9 @@ if TYPE_CHECKING:
 
 DemonstrationData = str | Path | Mapping[str, Any]  # a .npz file, the id of a Minari data set, or arrays by name
 
+REQUIRED = ("observations", "actions", "rewards", "next_observations", "terminations")
 OTHER_NAMES = {"terminations": "terminated", "truncations": "truncated"}  # names in `load_checkpoint(run).replay()`
+NAMES = (*REQUIRED, *OTHER_NAMES, *OTHER_NAMES.values())
 BOUNDS_TOLERANCE = 1e-3  # as a fraction of half an action's range: more than rounding
 
 
@@ -89,6 +92,9 @@ def _arrays(data: DemonstrationData, contract: Contract) -> tuple[dict[str, Any]
         arrays = _of_minari(data, contract)
     else:
         raise InputError(f"demonstrations is a .npz file, a dict of arrays or a Minari id, not {data!r:.40}")
+    for name in arrays:
+        if name not in NAMES and (hint := did_you_mean(name, NAMES)):
+            raise InputError(f"demonstrations has {name!r}: {hint}")
     return arrays | {name: arrays[other] for name, other in OTHER_NAMES.items() if other in arrays}, list(arrays)
 
 
@@ -126,8 +132,7 @@ def _of_minari(name: str, contract: Contract) -> dict[str, Any]:
 
 def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.ndarray:
     """Return packed transitions [n, width], actions in [-1, 1]."""
-    wanted = ("observations", "actions", "rewards", "next_observations", "terminations")
-    if missing := [name for name in wanted if name not in arrays]:
+    if missing := [name for name in REQUIRED if name not in arrays]:
         raise InputError(f"demonstrations lacks {', '.join(missing)}: it has {', '.join(map(str, names)) or 'nothing'}")
     spec, bounds = contract.spec, contract.bounds
     number = len(arrays["rewards"]) if hasattr(arrays["rewards"], "__len__") else 0

@@ -87,6 +87,7 @@ def test_a_report_in_markdown_has_its_pictures_beside_it(tmp_path):
         (["{}", "--out", "page.pdf"], "page.html"),
         (["{}", "--label", "ours"], "NAME=DIR"),
         (["{}", "--until", "0"], "--until"),
+        (["{}", "--until", "1"], "--until"),
     ],
 )
 def test_a_mistake_is_one_line(tmp_path, capsys, words, named):

@@ -73,6 +73,7 @@ def steps_of(environments: SeedEnvironments, count: int, action: float = 0.0) ->
         ("observation_space", spaces.Box(0, 255, (8, 8, 3), np.uint8), "image"),
         ("observation_space", spaces.Box(-1.0, 1.0, (0,)), "empty"),
         ("observation_space", spaces.Dict(NUMBERED), r"observation\[1\]"),
+        ("observation_space", spaces.Dict(), "empty"),
         ("observation_space", type("Box", (), {"__module__": "gym.spaces.box"})(), r"gym\.spaces\.box\.Box"),
     ],
 )

@@ -35,6 +35,7 @@ def run_python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
         ("quadx-waypoints-v1", f"did you mean {QUAD}"),
         ("Nothing/Like-this-v7", "write module:Id"),
         ("no_such_module:Task-v0", "no_such_module cannot be imported: ModuleNotFoundError"),
+        ("./probes.py:ConstantReward-v0", "probes:ConstantReward-v0"),
         ("probes:ConstantRewards-v0", "did you mean probes:ConstantReward-v0"),
         ("probes:Xyzzyxyzzy", "probes registers none of that name"),
         ("CartPole-v1", r"CartPole-v1: the action space is Discrete\(2\)"),

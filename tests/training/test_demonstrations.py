@@ -160,6 +160,7 @@ def test_a_minari_data_set_is_read_or_what_to_install_is_told(tmp_path, monkeypa
         ({"rewards": np.zeros(0)}, "no transitions"),
         ({"terminations": np.full(30, 0.5)}, "are 0 or 1"),
         ({"truncations": np.zeros(3)}, "truncations has shape"),
+        ({"truncation": np.zeros(30)}, "did you mean truncations"),
         ({"terminations": None}, "lacks terminations: it has observations, actions"),
     ],
 )
