@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from csac.algorithms.networks import MLP, gradient_step
-from csac.algorithms.normalisation import fold, normalised_before, normalised_pass
+from csac.algorithms.normalisation import fold, normalised_pass
 from csac.algorithms.shapes import Action, Actions, Observation, Scalar
 from csac.types import Metrics, Transition
 
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     import optax
-
-    from csac.algorithms.normalisation import Pass
 
 Critics: TypeAlias = tuple[MLP, MLP]
 
@@ -58,7 +56,6 @@ def update_critics(
     noise: Actions,
     critic_target: Callable[..., Scalar],
     next_action: Callable[[Observation, Action], Action],
-    normalisation: str,
 ) -> tuple[Any, Critics, Metrics]:
     """Return the state after one gradient step on its critics, these critics as plain MLPs, and the metrics.
 
@@ -67,21 +64,14 @@ def update_critics(
     action at which it evaluates the critics; `noise` is the noise of the next actions.
     """
     critics, optimiser_state, targets = state.critics, state.critic_optimiser, state.target_critics
-    if normalisation == "none":
+    if targets is not None:
         target_values = jax.vmap(partial(critic_target, targets=targets))(batch, noise)
         critics, optimiser_state, metrics = gradient_step(
             optimiser, critic_loss, critics, optimiser_state, batch, target_values
         )
         folded = critics
     else:
-        one_pass = normalised_before if normalisation == "batch_before" else normalised_pass
-        loss = partial(
-            normalised_critic_loss,
-            critic_target=critic_target,
-            next_action=next_action,
-            targets=targets,
-            one_pass=one_pass,
-        )
+        loss = partial(normalised_critic_loss, critic_target=critic_target, next_action=next_action)
         critics, optimiser_state, metrics = gradient_step(optimiser, loss, critics, optimiser_state, batch, noise)
         first, second = map(fold, critics, metrics.pop("moments"))
         folded = first, second
@@ -95,8 +85,6 @@ def normalised_critic_loss(
     *,
     critic_target: Callable[..., Scalar],
     next_action: Callable[[Observation, Action], Action],
-    targets: Critics | None = None,
-    one_pass: Callable[..., Pass] = normalised_pass,
 ) -> tuple[Scalar, Metrics]:
     """Return `critic_loss` of critics normalised over the batch, and the metrics with the `moments` of that batch.
 
@@ -107,10 +95,9 @@ def normalised_critic_loss(
         jnp.concatenate([transition.observation, transition.action]),
         jnp.concatenate([transition.next_observation, next_action(transition.next_observation, noise)]),
     )
-    first, second = (one_pass(critic, pairs) for critic in critics)
+    first, second = (normalised_pass(critic, pairs) for critic in critics)
     # The target needs values that this pass has computed: XLA finds the common products and computes them once.
-    own = (first.folded, second.folded) if targets is None else tuple(one_pass(t, pairs).folded for t in targets)
-    target = critic_target(transition, noise, targets=jax.lax.stop_gradient(own))
+    target = critic_target(transition, noise, targets=jax.lax.stop_gradient((first.folded, second.folded)))
     values = first.outputs[0][0], second.outputs[0][0]
     loss, metrics = squared_errors(values, jax.lax.stop_gradient(target))
     return loss, {**metrics, "moments": (first.moments, second.moments)}

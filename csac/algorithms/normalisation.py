@@ -44,19 +44,8 @@ def fold_layer(layer: Layer, moments: Moments) -> Layer:
     return layer._replace(weight=weight, bias=layer.bias - moments.mean @ weight)
 
 
-def fold_output(layer: Layer, moments: Moments) -> Layer:
-    """Return the layer x ↦ (xW - mean) / √(variance + ε) + b as one affine layer of x."""
-    scale = 1.0 / jnp.sqrt(moments.variance + EPSILON)
-    return layer._replace(weight=layer.weight * scale, bias=layer.bias - moments.mean * scale)
-
-
 def fold(network: MLP, moments: Sequence[Moments]) -> MLP:
-    """Return the network whose layers normalise their inputs by these moments, one for each layer.
-
-    With moments of the hidden layers alone, these normalise their outputs.
-    """
-    if len(moments) < len(network.layers):
-        return MLP((*map(fold_output, network.layers, moments), network.layers[-1]), network.activation)
+    """Return the network whose layers normalise their inputs by these moments, one for each layer."""
     return MLP(tuple(map(fold_layer, network.layers, moments)), network.activation)
 
 
@@ -83,18 +72,3 @@ def normalised_pass(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> Pass
         folded.append(fold_layer(layer, moments[-1]))
         inputs = [values @ folded[-1].weight + folded[-1].bias for values in inputs]
     return Pass(inputs, tuple(moments), MLP(tuple(folded), network.activation))
-
-
-def normalised_before(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> Pass:
-    """Return what `normalised_pass` does for a network that normalises before each activation, and adds the bias after.
-
-    No scale is learnt: with relu the next layer's weights express it.
-    """
-    moments, folded = [], []
-    for layer in network.layers[:-1]:
-        moments.append(moments_of([values @ layer.weight for values in inputs]))
-        folded.append(fold_output(layer, moments[-1]))
-        inputs = [network.activate(layer, values @ folded[-1].weight + folded[-1].bias) for values in inputs]
-    last = network.layers[-1]
-    outputs = [values @ last.weight + last.bias for values in inputs]
-    return Pass(outputs, tuple(moments), MLP((*folded, last), network.activation))

@@ -148,10 +148,8 @@ class OffPolicy(Architecture):
 class TwinCritics(OffPolicy):
     """Hyperparameters that CSAC, SAC and TD3 share, with one actor and two critics (docs/algorithms/critics.md)."""
 
-    critic_normalisation: Literal["none", "batch", "batch_targets", "batch_before"] = "none"
-    """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ);
-    `batch_targets` keeps target critics, normalised over the same pairs (XQC); `batch_before` normalises before each
-    activation instead."""
+    critic_normalisation: Literal["none", "batch"] = "none"
+    """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
     """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
     policy_delay: Annotated[int, COUNT] = 1
@@ -159,7 +157,7 @@ class TwinCritics(OffPolicy):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.critic_normalisation != "none" and self.batch_size == 1:
+        if self.critic_normalisation == "batch" and self.batch_size == 1:
             raise InputError("critic_normalisation batch needs a batch_size of at least 2")
 
     def first_networks(self, key: Key, spec: Spec, steps: int, actor_outputs: int) -> dict[str, Any]:
@@ -168,17 +166,15 @@ class TwinCritics(OffPolicy):
         actor_adam = self.optimiser(self.actor_learning_rate, planned // self.policy_delay)
         actor_key, critics_key = jax.random.split(key)
         actor = learnable(self.make_actor(actor_key, spec, actor_outputs), spec.observation_size, actor_outputs)
-        first_key, second_key = jax.random.split(critics_key)
         pair = spec.observation_size + spec.action_size
-        first, second = (learnable(self.make_critic(key, spec), pair, 1) for key in (first_key, second_key))
-        critics = first, second
-        if self.critic_normalisation != "none" and not isinstance(critics[0], MLP):
+        critics = tuple(learnable(self.make_critic(one, spec), pair, 1) for one in jax.random.split(critics_key))
+        if self.critic_normalisation == "batch" and not isinstance(critics[0], MLP):
             raise InputError(f"critic_normalisation batch is for MLPs, not for {type(critics[0]).__name__}")
         statistics = Statistics.create((spec.observation_size,)) if self.normalise_observations else None
         return {
             "actor": actor,
             "critics": critics,
-            "target_critics": copy_tree(critics) if self.critic_normalisation in ("none", "batch_targets") else None,
+            "target_critics": copy_tree(critics) if self.critic_normalisation == "none" else None,
             "actor_optimiser": init_optimiser(actor_adam, actor),
             "critic_optimiser": init_optimiser(self.optimiser(self.critic_learning_rate, planned), critics),
             "observation_statistics": statistics,
