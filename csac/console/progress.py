@@ -36,9 +36,11 @@ class _Seed:
     """The progress of one run: its step, and the mean return of each evaluation, keyed by step."""
 
     def __init__(self, run: RunDirectory) -> None:
-        self.begin = self.step = run.manifest.steps_done
+        manifest, origin = run.manifest, run.manifest.forked_from
+        resumes_at = max(manifest.last_checkpoint, origin.step if origin else 0)
+        self.begin = self.step = manifest.steps_done if manifest.state == "finished" else resumes_at
         self.failure = ""
-        rows = run.evaluations
+        rows = run.evaluations[run.evaluations["step"] <= self.step]  # later ones are rolled back
         self.returns = {
             int(step): float(rows["return"][rows["step"] == step].mean()) for step in np.unique(rows["step"])
         }

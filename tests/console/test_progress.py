@@ -53,7 +53,7 @@ def test_silence_is_broken_after_half_a_minute(plain, clock, watch):
 
 def test_until_the_first_step_of_its_own_a_run_compiles(plain, terminal, clock, watch):
     for console in (plain, terminal):
-        reporter = watch(console, steps_done=500)
+        reporter = watch(console, last_checkpoint=500, steps_done=600)  # 100 of these are lost
         clock.now += 45
         reporter.progress({0: 500, 1: 500})
         reporter.close()
