@@ -20,6 +20,7 @@ from csac.console.tables import Fitted
 from csac.record.config import differences
 from csac.record.files import closed_in_children, is_locked, take, writing
 from csac.record.rendering import Cell, Row, Table, number
+from csac.record.run import RunDirectory
 from csac.record.sets import RunSet
 from csac.record.statistics import last_evaluations
 from csac.studies.arms import plain
@@ -181,6 +182,10 @@ def _run(
         study.tell(trial, state=TrialState.PRUNED)
         console.print(f"{label}: {error}", soft_wrap=True)
         return
+    if not search.config.checkpoint_interval:  # an interrupted run cannot go on: it is trained anew
+        for path in folder.glob("seed-*"):
+            if RunDirectory.open(path).manifest.state != "finished":
+                shutil.rmtree(path)
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # failed seeds are reported below
             runs = train(

@@ -56,7 +56,7 @@ class Trained:
         for seed in range(first_seed, first_seed + seeds):
             one = RunConfig(task=task, algorithm=algorithm.name, seed=seed, steps=steps)
             if not is_run(directory / f"seed-{seed}"):
-                write_run(directory / f"seed-{seed}", one, points=0).checkpoints.mkdir()
+                write_run(directory / f"seed-{seed}", one, points=0, state="interrupted").checkpoints.mkdir()
         for step in range(evaluation_interval, steps + 1, evaluation_interval):
             if step == self.interrupted_at:
                 self.interrupted_at = None
@@ -186,14 +186,19 @@ def test_hopeless_trials_are_pruned_and_failed_ones_too(tmp_path, trained):
     assert len(np.unique(RunSet.open(tmp_path / "trial-7").evaluations["step"])) < 10
 
 
-def test_an_interrupted_trial_goes_on_where_it_was(tmp_path, trained, capsys):
+@pytest.mark.parametrize(("checkpoint_interval", "evaluations"), [(50_000, 14), (0, 10)])
+def test_an_interrupted_trial_goes_on_where_it_was_or_begins_anew(
+    tmp_path, trained, capsys, checkpoint_interval, evaluations
+):
     trained.interrupted_at = 500
-    assert tune(search(), tmp_path, 2, "csac tune", make_console()) == 130
+    again = search(checkpoint_interval=checkpoint_interval)
+    assert tune(again, tmp_path, 2, "csac tune", make_console()) == 130
     assert "go on" in capsys.readouterr().err
     assert states(tmp_path) == ["FAIL", "WAITING"]
-    tune(search(), tmp_path, 1, None, make_console())
+    tune(again, tmp_path, 1, None, make_console())
     assert states(tmp_path) == ["FAIL", "COMPLETE"]
     assert [directory.name for _, directory, _ in trained.found] == ["trial-0", "trial-0"]
+    assert len(RunSet.open(tmp_path / "trial-0").evaluations) == 2 * evaluations  # the stand-in repeats its own
 
 
 def test_a_trial_whose_process_died_is_taken_up_again(tmp_path, trained):
