@@ -38,6 +38,8 @@ class Origin:
     directory: str
     step: int
     changes: tuple[str, ...] = ()
+    earlier: tuple[str, ...] = ()
+    """What earlier forks changed, if that run was forked too."""
     task_since: int = 0
     """The step of the last fork, this one or an earlier one, that changed the task or its arguments."""
 

@@ -134,7 +134,8 @@ def read_arms(
             seen.add(run.path)
             config = run.config
             origin = run.manifest.forked_from
-            fork = [origin.step, origin.changes] if origin and origin.changes else []
+            changes = [*origin.earlier, *origin.changes] if origin else []
+            fork = [origin.step, changes] if origin and changes else []
             alike = json.dumps([config.algorithm, settings(config), fork], sort_keys=True)
             key = label, alike * (not label), config.task, config.perturbations
             folders = found.setdefault(key, {})

@@ -317,16 +317,18 @@ def provenance(arms: Sequence[Arm], commands: Sequence[str]) -> Iterator[Part]:
         yield f"Machines: {', '.join(sorted(machines))}{time}."
     yield Heading("Commands")
     yield Commands(tuple(commands))
-    trained = [command for arm in arms if arm.runs and (command := _command_of(arm))]
+    trained = [command for arm in arms if arm.runs for command in _commands_of(arm) if command]
     if trained:
         yield "Each method by itself:"
         yield Commands(tuple(dict.fromkeys(trained)))
 
 
-def _command_of(arm: Arm) -> str | None:
-    """Return the command that trains an arm; of what no such command names, the one typed, if any."""
+def _commands_of(arm: Arm) -> list[str | None]:
+    """Return the commands that train an arm's seeds; of what no such command names, the one typed, if any."""
     config, manifest = arm.config, arm.runs[0].manifest
     is_default = config.evaluation_seed == EVALUATION_SEED  # no option sets another
     if config.task_is_callable or config.demonstrations or manifest.forked_from or not is_default:
-        return manifest.command
-    return train_command(config, sorted(run.seed for run in arm.runs))
+        return [manifest.command]
+    seeds = np.sort([run.seed for run in arm.runs])
+    consecutive = np.split(seeds, np.flatnonzero(np.diff(seeds) > 1) + 1)
+    return [train_command(config, some.tolist()) for some in consecutive]

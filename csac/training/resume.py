@@ -270,7 +270,8 @@ class Source(NamedTuple):
         """Return the manifest of a new run, with its origin."""
         before = self.runs[manifest.config.seed]
         changes = tuple(differences(_fixed(before.config), _fixed(manifest.config)))
-        earlier, origin = before.manifest.forked_from, Origin(str(before.path), self.step, changes)
+        earlier = before.manifest.forked_from
+        origin = Origin(str(before.path), self.step, changes, (*earlier.earlier, *earlier.changes) if earlier else ())
         is_other = origin.changed("task ", "environment_arguments")
         origin = replace(origin, task_since=self.step if is_other else earlier.task_since if earlier else 0)
         restarts = before.manifest.restarts_episode or origin.changed("task ")

@@ -112,7 +112,9 @@ def test_forks_are_an_arm_of_their_own(tmp_path):
     write_run(tmp_path / "a" / "seed-0", config(seed=0))
     forked = write_run(tmp_path / "b" / "seed-1", config(seed=1))
     forked.update_manifest(forked_from=Origin("c/seed-1", 900, ("discount is 0.9, not 0.99",)))
-    assert [seeds for *_, seeds in labels(tmp_path)] == [[0], [1]]
+    again = write_run(tmp_path / "b" / "seed-2", config(seed=2))
+    again.update_manifest(forked_from=Origin("b/seed-1", 1_000, (), ("discount is 0.9, not 0.99",)))
+    assert [seeds for *_, seeds in labels(tmp_path)] == [[0], [1], [2]]
 
 
 def test_a_study_knows_its_seeds_that_have_not_begun(tmp_path):

@@ -126,6 +126,13 @@ def test_a_fork_is_repeated_by_the_command_that_made_it(tmp_path):
     assert commands == [("csac report",), ("csac train Ant-v4 --from a",)]
 
 
+def test_seeds_with_a_gap_are_trained_by_several_commands(tmp_path):
+    for seed in (0, 1, 100):
+        write_run(tmp_path / f"seed-{seed}", config(seed=seed))
+    (*_, commands) = [part for part in provenance(read_arms([tmp_path]), []) if isinstance(part, Commands)]
+    assert ["--seeds 2" in commands.lines[0], "--seeds 1 --first-seed 100" in commands.lines[1]] == [True, True]
+
+
 def test_methods_are_compared_over_all_tasks_with_common_seeds(mujoco, tmp_path):
     arms = [arm for arm in mujoco if arm.label in ("CSAC (paper)", "SAC")]
     parts = list(over_tasks(arms))
