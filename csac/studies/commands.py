@@ -98,7 +98,7 @@ class Run(Show):
         "processes"
     )
     """local: one run at a time, on all cores. processes: several at once. ray: on a Ray cluster (docs/cluster.md)."""
-    workers: Annotated[int | None, arg(help_behavior_hint="(default: one per core)")] = None
+    workers: Annotated[int | None, arg(help_behavior_hint="(default: one per core, or one on a GPU)")] = None
     """Number of runs that train in parallel, each with its share of the cores."""
     cell: Annotated[int | None, arg(help_behavior_hint="(default: all)")] = None
     """Only the run with this number in csac study show, for example as one job of a job array."""
@@ -128,12 +128,14 @@ class Run(Show):
 
         workers = cores_to_use() if self.workers is None else self.workers
         check_whole("--workers", workers, 1, 10_000)
-        if self.workers is not None and self.engine != "processes":
-            raise InputError(f"--workers is for --engine processes, not {self.engine}")
+        if self.workers is not None and (self.engine != "processes" or self.cell is not None):
+            raise InputError("--workers is for --engine processes without --cell")
         cluster = Cluster(self.address, self.cell_cores, self.cell_gpus, self.cell_memory)
         if self.engine != "ray" and cluster != Cluster():
             raise InputError("--address and --cell-cores, -gpus and -memory are for Ray: add --engine ray")
         check_whole("--cell-cores", self.cell_cores, 1, 10_000)
+        if not (self.cell_gpus >= 0 and self.cell_memory >= 0):
+            raise InputError("--cell-gpus and --cell-memory must be 0 or more")
         if self.wandb:
             import_wandb()
         one_at_a_time = self.engine == "local" or self.cell is not None or (self.device == "gpu" and not self.workers)

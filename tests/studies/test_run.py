@@ -144,7 +144,9 @@ def test_show_says_how_long_such_runs_took(tmp_path, capsys):
     [
         (["--workers", "0"], "--workers"),
         (["--workers", "2", "--engine", "local"], "--workers"),
+        (["--workers", "2", "--cell", "0"], "--workers"),
         (["--cell-cores", "2"], "--cell-cores"),
+        (["--cell-memory", "-1", "--engine", "ray"], "--cell-memory"),
         (["--cell", "4"], "--cell"),
         (["--scale", "0"], "scale"),
         (["--seeds", "0"], "seeds"),
