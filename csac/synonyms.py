@@ -42,6 +42,9 @@ NAMES: Mapping[str, str] = {
     "--eval-freq": "--evaluation-interval",
     "--n-eval-episodes": "--evaluation-episodes",
     "--env-kwargs": "--environment-arguments",  # in Python
+    "--environment-arguments": "--env-kwargs",  # of Python, on the command line
+    "--perturbations": "--perturb",
+    "--start-from": "--from",
     "--groups": "--seeds-per-process",
     "--cuda": "--device gpu",
     "--track": "--wandb",

@@ -9,7 +9,7 @@ import os
 import re
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
 from unittest.mock import patch
 
 import tyro
@@ -122,10 +122,11 @@ def _whole(text: str) -> int:
 
 def options_of(kind: type[Any]) -> set[str]:
     """Return the options that tyro derives from a dataclass; those of a nested dataclass have no prefix."""
-    options = set()
+    options, hints = set(), get_type_hints(kind, include_extras=True)
     for item in dataclasses.fields(kind):
-        within = dataclasses.is_dataclass(item.default)
-        options |= options_of(type(item.default)) if within else {f"--{item.name.replace('_', '-')}"}
+        given = [name for extra in get_args(hints[item.name])[1:] if (name := getattr(extra, "name", None))]
+        name = given[0] if given else item.name.replace("_", "-")
+        options |= options_of(type(item.default)) if dataclasses.is_dataclass(item.default) else {f"--{name}"}
     return options
 
 

@@ -22,6 +22,7 @@ from typed import csac
         ("train X --tau 1", "--relative-entropy-weight"),
         ("train X --gamma 1", "it is --discount here"),
         ("train X --learning-rate 1", "it is --actor-learning-rate and --critic-learning-rate here"),
+        ("train X --environment-arguments {}", "it is --env-kwargs here"),
         ("train X --seed 3", "it is --first-seed here"),
         ("train X --algorithm ppo --warmup-steps 9", "--algorithm csac or sac or td3 or sd3 has it"),
         ("train X --clip-range 0.1", "--algorithm ppo has it"),
