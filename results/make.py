@@ -23,7 +23,6 @@ from tables import (
     comma,
     compared,
     measure,
-    number,
     overall_table,
     plus_minus,
     recovery_table,
@@ -34,6 +33,7 @@ from tables import (
 )
 
 from csac.record.plots import learning_curve
+from csac.record.rendering import number
 from csac.record.statistics import evaluation_matrix, maximum_average_return, mean_and_interval
 from csac.studies.paper import RETURNS
 

@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy import stats
 
+from csac.record import report_tables
+from csac.record.rendering import Cell, Row, markdown, number
+from csac.record.report_tables import comparison_table
 from csac.record.statistics import (
     FEWEST_FOR_BOOTSTRAP,
-    FEWEST_FOR_INTERVAL,
     Recovery,
     bootstrap_interval,
     drawdown,
     evaluation_matrix,
     interquartile_mean,
-    last_evaluations,
-    maximum_average_return,
-    mean_and_interval,
     probability_of_improvement,
     recovery,
     steps_to_reach,
 )
+from csac.record.summaries import recoveries
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -55,12 +55,6 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[str]], title: str = "
     return "\n".join([f"**{title}**", "", *lines] if title else lines)
 
 
-def number(value: float, largest: float | None = None) -> str:
-    """Format a return, small ones with three digits; `largest` sets the format of a whole column."""
-    size = abs(value if largest is None else largest)
-    return f"{value:.3g}" if 0 < size < 0.1 else f"{value:,.{1 if size >= 100 else 2}f}"
-
-
 def plus_minus(values: np.ndarray) -> str:
     """Return the mean and the standard deviation of the seeds."""
     mean = values.mean()
@@ -89,72 +83,26 @@ def comma(values: Sequence[object]) -> str:
 
 def returns_table(runs: Mapping[str, np.ndarray]) -> str:
     """Return a table of the last three evaluations of each arm, compared with the first arm's."""
-    scores = [np.array(list(last_evaluations(rows).values())) for rows in runs.values()]
-    has_middles = max(map(len, scores)) >= FEWEST_FOR_BOOTSTRAP
-    has_success = not any(np.isnan(rows["success"]).any() for rows in runs.values())
-    headings = ["run", "seeds", "steps", "last three evaluations, mean ± std over seeds", "95 % t-interval"]
-    headings += ["to the first", "maximum average return"]
-    headings += ["IQM, 95 % bootstrap interval", "above the first, probability"] * has_middles
-    headings += ["success, last three evaluations"] * has_success
-    lines = []
-    for (label, rows), own in zip(runs.items(), scores, strict=True):
-        best, step = maximum_average_return(rows)
-        ratio = f"{own.mean() / scores[0].mean():.2f}" if scores[0].mean() > 0 else ""
-        cells = [label, str(len(own)), f"{rows['step'].max():,}", *_mean_and_interval(own), ratio]
-        cells.append(f"{best:{_form(best)}} at {step:,}")
-        cells += _middle_and_above(own, scores[0]) if has_middles else ()
-        cells += [_success(rows)] if has_success else ()
-        lines.append(cells)
-    return table(headings, lines)
+    full = comparison_table([(label, rows, 0) for label, rows in runs.items()]).without_empty_columns()
+    if any(np.isnan(rows["success"]).any() for rows in runs.values()):
+        return markdown(full)
+    lines = [Row((*row.cells, _success(rows))) for row, rows in zip(full.rows, runs.values(), strict=True)]
+    return markdown(full._replace(headings=(*full.headings, "success, last three evaluations"), rows=tuple(lines)))
 
 
-def _mean_and_interval(values: np.ndarray) -> tuple[str, str]:
-    count, (mean, low, high) = len(values), map(float, mean_and_interval(values))
-    if count == 1:
-        return f"{mean:{_form(mean)}}", "1 seed: no interval"
-    std = float(values.std(ddof=1))
-    text = f"{mean:{_form(mean, std)}} ± {std:{_form(mean, std)}}"
-    if count < FEWEST_FOR_INTERVAL:
-        return text, f"{count} seeds: no interval"
-    form = _form(mean, high - low)
-    return text, f"{low:{form}} to {high:{form}}"
-
-
-def _middle_and_above(values: np.ndarray, first: np.ndarray) -> tuple[str, str]:
-    middle = interquartile_mean(values)
-    text = with_interval(middle, bootstrap_interval(interquartile_mean, values), _form(middle))
-    if values is first:
-        return text, ""
-    return text, with_interval(
-        probability_of_improvement(values, first), bootstrap_interval(probability_of_improvement, values, first), ".2f"
-    )
-
-
-def _success(rows: np.ndarray) -> str:
+def _success(rows: np.ndarray) -> Cell:
     last = rows[np.isin(rows["step"], np.unique(rows["step"])[-3:])]
     shares = np.array([last["success"][last["seed"] == seed].mean() for seed in np.unique(last["seed"])])
-    return f"{shares.mean():.0%} ± {shares.std(ddof=1):.0%}"
-
-
-def _form(value: float, spread: float = np.nan) -> str:
-    if abs(value) >= 20:
-        return ",.2f" if 0 < spread < 1 else ",.0f"
-    return ".3g" if 0 < abs(value) < 0.1 else ".2f"
+    return Cell(f"{shares.mean():.0%} ± {shares.std(ddof=1):.0%}", float(shares.mean()))
 
 
 def recovery_table(runs: Mapping[str, np.ndarray], step: int) -> str:
     """Return each seed's loss and recovery after a change at `step`, and a comparison of two arms of five seeds."""
-    headings = ("run", "seed", "before", "drop", "relative", "steps to 90 %", "area lost", "final", "drawdown")
-    lines, told = [], []
-    for label, rows in runs.items():
-        seeds = recovery(rows, step)
-        values = np.array(list(seeds.values()))
-        largest = max(abs(value) for one in seeds.values() for value in (one.before, one.drop, one.final))
-        parts = {**seeds, "mean": Recovery(*values.mean(axis=0)), "± std": Recovery(*values.std(axis=0, ddof=1))}
-        lines += [[label, str(name), *_recovery_cells(one, largest)] for name, one in parts.items()]
-        told.append(values)
+    found = [recoveries(label, rows, step) for label, rows in runs.items()]
+    lines = markdown(report_tables.recovery_table(found))
+    told = [np.array(list(one.seeds.values())) for one in found]
     if len(told) != 2 or min(map(len, told)) < FEWEST_FOR_BOOTSTRAP:
-        return table(headings, lines)
+        return lines
     first, second = (dict(zip(Recovery._fields, values.T, strict=True)) for values in told)
     claims = {
         "has the smaller drop": (-first["relative_drop"], -second["relative_drop"]),
@@ -162,14 +110,7 @@ def recovery_table(runs: Mapping[str, np.ndarray], step: int) -> str:
         "has the higher return at the end": (first["final"], second["final"]),
     }
     rows = [[claim, *compared(*values, 10_000)] for claim, values in claims.items()]
-    return table(headings, lines) + "\n\n" + table([" against ".join(runs), "probability", "so"], rows)
-
-
-def _recovery_cells(one: Recovery, largest: float) -> list[str]:
-    size, suffix = (1e6, "M") if one.area_lost >= 1e6 else (1e3, "k")
-    area = f"{one.area_lost / size:.4g}{suffix}" if one.area_lost >= 1e3 else f"{one.area_lost:.3g}"
-    cells = [number(one.before, largest), number(one.drop, largest), f"{one.relative_drop:.0%}"]
-    return [*cells, f"{one.steps_to_regain:,.0f}", area, *(number(x, largest) for x in (one.final, one.worst_drawdown))]
+    return lines + "\n\n" + table([" against ".join(runs), "probability", "so"], rows)
 
 
 # By the rules of the protocols.
