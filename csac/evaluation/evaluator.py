@@ -42,8 +42,8 @@ class Evaluator:
     whose resets leave state behind or ignore their seed: those get new environments for each batch. `perturbed` is the
     latest argument of `perturb`.
 
-    `environments`, at most ten, are stepped in parallel; their number does not change the results. Alternatively the
-    environment `lent` is used and left open. `events` names what to record from `info` (`csac.tasks.events`).
+    `environments`, at most ten, are stepped in parallel; their number does not change the results, unless the task
+    ignores its seed. Alternatively the environment `lent` is used and left open. `events` names what to record from `info` (`csac.tasks.events`).
     """
 
     def __init__(
