@@ -43,7 +43,8 @@ class Evaluator:
     latest argument of `perturb`.
 
     `environments`, at most ten, are stepped in parallel; their number does not change the results, unless the task
-    ignores its seed. Alternatively the environment `lent` is used and left open. `events` names what to record from `info` (`csac.tasks.events`).
+    ignores its seed. Alternatively the environment `lent` is used and left open. `events` names what to record from
+    `info` (`csac.tasks.events`).
     """
 
     def __init__(
