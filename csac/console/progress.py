@@ -40,7 +40,8 @@ class _Seed:
         resumes_at = max(manifest.last_checkpoint, origin.step if origin else 0)
         self.begin = self.step = manifest.steps_done if manifest.state == "finished" else resumes_at
         self.failure = ""
-        rows = run.evaluations[run.evaluations["step"] <= self.step]  # later ones are rolled back
+        rows = run.evaluations
+        rows = rows[rows["step"] <= self.step]  # later ones are rolled back
         self.returns = {
             int(step): float(rows["return"][rows["step"] == step].mean()) for step in np.unique(rows["step"])
         }

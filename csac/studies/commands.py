@@ -256,9 +256,10 @@ def report(options: Report, command: str) -> int:
             raise InputError(f"--label is written NAME=DIR,DIR, not {text!r}")
         labelled.append((name, [Path(path) for path in paths.split(",")]))
     arms = read_arms(options.runs, labelled, options.until, lambda error: print(f"damaged: {error}", file=sys.stderr))
-    steps = [run.evaluations["step"].min(initial=2**31) for arm in arms for run in arm.runs]
-    if options.until is not None and min(steps) > options.until:
-        raise InputError(f"no run has an evaluation up to --until {options.until:,}")
+    if options.until is not None:
+        steps = [run.evaluations["step"].min(initial=2**31) for arm in arms for run in arm.runs]
+        if min(steps) > options.until:
+            raise InputError(f"no run has an evaluation up to --until {options.until:,}")
     out = options.out or Path("runs", "reports", f"{datetime.now():%Y%m%d-%H%M%S}.html")
     title = options.title or ", ".join(dict.fromkeys(arm.task for arm in arms))
     write(out, title, report_of(arms, [command], ANALYSES))

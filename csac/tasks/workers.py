@@ -149,7 +149,7 @@ def _serve(
 
         connection.send([_outcome(names, make)])
         while calls := connection.recv():
-            connection.send([_outcome(names, getattr(environments[i], method), *of_it) for i, method, of_it in calls])
+            connection.send([_outcome(names, getattr(environments[i], method), *given) for i, method, given in calls])
 
 
 def _outcome(names: set[str], function: Any, *arguments: Any) -> tuple[Any, Exception | None, str]:

@@ -163,10 +163,8 @@ class Loop:
             self.environments.refuse_incompatible(environment, saved.arrays["actions"])
             is_new_task = origin and origin.step == self.step and origin.changed("task ", "environment_arguments")
             if not is_new_task and saved.values.get("action_bounds") not in (None, self.environments.action_bounds):
-                raise InputError(
-                    f"{run.path}: the task's action bounds were {saved.values['action_bounds']}, and are "
-                    f"{self.environments.action_bounds} now"
-                )
+                reason = "resume with the task and the versions of its packages that the manifest names"
+                raise InputError(f"{run.path}: the task's action bounds have changed: {reason}")
             self._evaluation_pending = self._evaluation_pending or saved.values.get("evaluation_owed", False)
             for step in saved.values.get("evaluations_lost", []):
                 self._note_inexact(run, f"seed {run.seed}: the evaluation at step {step:,} was broken off")

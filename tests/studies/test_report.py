@@ -130,7 +130,8 @@ def test_seeds_with_a_gap_are_trained_by_several_commands(tmp_path):
     for seed in (0, 1, 100):
         write_run(tmp_path / f"seed-{seed}", config(seed=seed))
     (*_, commands) = [part for part in provenance(read_arms([tmp_path]), []) if isinstance(part, Commands)]
-    assert ["--seeds 2" in commands.lines[0], "--seeds 1 --first-seed 100" in commands.lines[1]] == [True, True]
+    assert "--seeds 2" in commands.lines[0]
+    assert "--seeds 1 --first-seed 100" in commands.lines[1]
 
 
 def test_methods_are_compared_over_all_tasks_with_common_seeds(mujoco, tmp_path):

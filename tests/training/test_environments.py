@@ -57,7 +57,10 @@ def test_a_rollout_holds_the_steps_of_a_turn_beside_each_other():
 
 @pytest.mark.parametrize(
     ("updates_per_step", "environments", "expected"),
-    [(1, 1, (1, 1)), (1, 4, (4, 4)), (0.25, 1, (4, 1)), (0.25, 3, (12, 3)), (2, 3, (3, 6)), (0.33, 8, (200, 66))],
+    [
+        *[(1, 1, (1, 1)), (1, 4, (4, 4)), (0.25, 1, (4, 1)), (0.25, 4, (4, 1)), (0.25, 3, (12, 3)), (2, 3, (3, 6))],
+        (0.33, 8, (200, 66)),
+    ],
 )
 def test_the_ratio_of_updates_to_steps_is_kept_whatever_the_number_of_environments(
     updates_per_step, environments, expected
