@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from csac.algorithms.networks import MLP, gradient_step
-from csac.algorithms.normalisation import PASSES, Pass, fold
+from csac.algorithms.normalisation import fold, normalised_pass
 from csac.algorithms.shapes import Action, Actions, Observation, Scalar
 from csac.types import Metrics, Transition
 
@@ -56,24 +56,22 @@ def update_critics(
     noise: Actions,
     critic_target: Callable[..., Scalar],
     next_action: Callable[[Observation, Action], Action],
-    normalisation: str,
 ) -> tuple[Any, Critics, Metrics]:
     """Return the state after one gradient step on its critics, these critics as plain MLPs, and the metrics.
 
-    With a `normalisation` over the batch, the critics are their own targets. For one example,
+    Without `target_critics` the critics are normalised over the batch, and are their own targets. For one example,
     `critic_target(transition, noise, targets=...)` returns the target, and `next_action(next_observation, noise)` the
     action at which it evaluates the critics; `noise` is the noise of the next actions.
     """
-    critics, optimiser_state = state.critics, state.critic_optimiser
-    if normalisation == "none":
-        target_values = jax.vmap(partial(critic_target, targets=state.target_critics))(batch, noise)
+    critics, optimiser_state, targets = state.critics, state.critic_optimiser, state.target_critics
+    if targets is not None:
+        target_values = jax.vmap(partial(critic_target, targets=targets))(batch, noise)
         critics, optimiser_state, metrics = gradient_step(
             optimiser, critic_loss, critics, optimiser_state, batch, target_values
         )
         folded = critics
     else:
-        functions = {"one_pass": PASSES[normalisation], "critic_target": critic_target, "next_action": next_action}
-        loss = partial(normalised_critic_loss, **functions)
+        loss = partial(normalised_critic_loss, critic_target=critic_target, next_action=next_action)
         critics, optimiser_state, metrics = gradient_step(optimiser, loss, critics, optimiser_state, batch, noise)
         first, second = map(fold, critics, metrics.pop("moments"))
         folded = first, second
@@ -85,7 +83,6 @@ def normalised_critic_loss(
     transition: Transition,
     noise: Action,
     *,
-    one_pass: Callable[..., Pass],
     critic_target: Callable[..., Scalar],
     next_action: Callable[[Observation, Action], Action],
 ) -> tuple[Scalar, Metrics]:
@@ -98,9 +95,9 @@ def normalised_critic_loss(
         jnp.concatenate([transition.observation, transition.action]),
         jnp.concatenate([transition.next_observation, next_action(transition.next_observation, noise)]),
     )
-    first, second = (one_pass(critic, pairs) for critic in critics)
-    # The pass has computed Q(s', a') for the target already.
-    target = critic_target(transition, noise, targets=(lambda _: first.outputs[1], lambda _: second.outputs[1]))
+    first, second = (normalised_pass(critic, pairs) for critic in critics)
+    # The target needs values that this pass has computed: XLA finds the common products and computes them once.
+    target = critic_target(transition, noise, targets=jax.lax.stop_gradient((first.folded, second.folded)))
     values = first.outputs[0][0], second.outputs[0][0]
     loss, metrics = squared_errors(values, jax.lax.stop_gradient(target))
     return loss, {**metrics, "moments": (first.moments, second.moments)}

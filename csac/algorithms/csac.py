@@ -84,9 +84,7 @@ class CSAC(MaximumEntropy):
         # Lines 16 to 19: a' ~ π(·|s'), then y(s, a, s'), then a gradient step on Σᵢ [Qᵢ(s, a) - y]²
         critic_target = partial(self.critic_target, actor=state.actor, reference=reference, sigma=sigma)
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
-        state, folded_critics, metrics = update_critics(
-            adam, state, batch, target_noise, critic_target, next_action, self.critic_normalisation
-        )
+        state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
         # Line 21: a gradient step on J(φ)
         arguments = (folded_critics, batch.observation, actor_noise, step)
         state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *arguments)

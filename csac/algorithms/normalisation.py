@@ -1,7 +1,7 @@
-"""Batch normalisation of a network's layers: before activations (Ioffe and Szegedy 2015), or after (CrossQ, 2024).
+"""Batch normalisation of a network's layers: Ioffe and Szegedy 2015, placed as CrossQ does (Bhatt et al. 2024).
 
-A normalised layer is still affine, so a normalised network is a plain MLP once the moments are folded into its weights.
-No scale and shift are learnt, since weights and biases can express them (before activations: with relu).
+A layer with normalised inputs is still affine, so a normalised network is a plain MLP once the moments are folded into
+its weights. No scale and shift are learnt, since the layer's weights can express them.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ EPSILON = 1e-3
 
 
 class Moments(NamedTuple):
-    """Mean and variance over a batch of the values that a layer normalises."""
+    """Mean and variance of a layer's inputs over a batch."""
 
-    mean: Float[Array, " n"]
-    variance: Float[Array, " n"]
+    mean: Float[Array, " in"]
+    variance: Float[Array, " in"]
 
 
-def moments_of(several: Sequence[Float[Array, " n"]], centred: bool = True) -> Moments:
-    """Return the moments of values over the axis `BATCH`; each example has one or `several`.
+def moments_of(inputs: Sequence[Float[Array, " in"]], centred: bool = True) -> Moments:
+    """Return the moments of a layer's inputs over the axis `BATCH`; each example has one or several `inputs`.
 
     If not `centred`, they are moments about 0.
     """
-    mean = jax.lax.pmean(sum(several) / len(several), BATCH) * centred
-    return Moments(mean, jax.lax.pmean(sum((values - mean) ** 2 for values in several) / len(several), BATCH))
+    mean = jax.lax.pmean(sum(inputs) / len(inputs), BATCH) * centred
+    return Moments(mean, jax.lax.pmean(sum((values - mean) ** 2 for values in inputs) / len(inputs), BATCH))
 
 
 def fold_layer(layer: Layer, moments: Moments) -> Layer:
@@ -44,16 +44,8 @@ def fold_layer(layer: Layer, moments: Moments) -> Layer:
     return layer._replace(weight=weight, bias=layer.bias - moments.mean @ weight)
 
 
-def fold_outputs(layer: Layer, moments: Moments) -> Layer:
-    """Return the layer x ↦ (xW - mean) / √(variance + ε) + b as one affine layer of x."""
-    scale = _scale(moments)
-    return layer._replace(weight=layer.weight * scale[None], bias=layer.bias - moments.mean * scale)
-
-
 def fold(network: MLP, moments: Sequence[Moments]) -> MLP:
-    """Return the network with its normalisation by these moments folded in: those of a pass below."""
-    if len(moments) < len(network.layers):  # of the hidden layers' outputs
-        return MLP((*map(fold_outputs, network.layers, moments), network.layers[-1]), network.activation)
+    """Return the network whose layers normalise their inputs by these moments, one for each layer."""
     return MLP(tuple(map(fold_layer, network.layers, moments)), network.activation)
 
 
@@ -61,10 +53,11 @@ class Pass(NamedTuple):
     """The result of one pass through a normalised network."""
 
     outputs: Sequence[Float[Array, " out"]]
-    moments: tuple[Moments, ...]  # of each layer
+    moments: tuple[Moments, ...]  # of each layer's inputs
+    folded: MLP  # the network with its normalisation by these moments folded in
 
 
-def pass_after(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> Pass:
+def normalised_pass(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> Pass:
     """Return a network's outputs for `inputs`, with each layer's inputs normalised by their moments over the batch.
 
     It takes one example, which has one or several `inputs`, and is mapped over the axis `BATCH` by `jax.vmap`.
@@ -78,23 +71,4 @@ def pass_after(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> Pass:
         moments.append(moments_of(inputs, centred=layer is not network.layers[-1]))
         folded.append(fold_layer(layer, moments[-1]))
         inputs = [values @ folded[-1].weight + folded[-1].bias for values in inputs]
-    return Pass(inputs, tuple(moments))
-
-
-def pass_before(network: MLP, inputs: Sequence[Float[Array, " in"]]) -> Pass:
-    """Return the same with each hidden layer's outputs normalised before the bias and the activation."""
-    moments = []
-    for layer in network.layers[:-1]:
-        products = [values @ layer.weight for values in inputs]
-        moments.append(moments_of(products))
-        scale, bias = _scale(moments[-1]), fold_outputs(layer, moments[-1]).bias
-        inputs = [network.activate(layer, values * scale + bias) for values in products]
-    last = network.layers[-1]
-    return Pass([values @ last.weight + last.bias for values in inputs], tuple(moments))
-
-
-def _scale(moments: Moments) -> Float[Array, " n"]:
-    return 1.0 / jnp.sqrt(moments.variance + EPSILON)
-
-
-PASSES = {"batch": pass_after, "batch_before": pass_before}
+    return Pass(inputs, tuple(moments), MLP(tuple(folded), network.activation))

@@ -148,9 +148,8 @@ class OffPolicy(Architecture):
 class TwinCritics(OffPolicy):
     """Hyperparameters that CSAC, SAC and TD3 share, with one actor and two critics (docs/algorithms/critics.md)."""
 
-    critic_normalisation: Literal["none", "batch", "batch_before"] = "none"
-    """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ);
-    `batch_before` normalises before the activations instead of after."""
+    critic_normalisation: Literal["none", "batch"] = "none"
+    """`batch` normalises the inputs of the critics' layers over each batch, without target critics (CrossQ)."""
     normalise_observations: bool = False
     """Whether to normalise observations to mean 0 and standard deviation 1 by running statistics."""
     policy_delay: Annotated[int, COUNT] = 1
@@ -158,8 +157,8 @@ class TwinCritics(OffPolicy):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.critic_normalisation != "none" and self.batch_size == 1:
-            raise InputError(f"critic_normalisation {self.critic_normalisation} needs a batch_size of at least 2")
+        if self.critic_normalisation == "batch" and self.batch_size == 1:
+            raise InputError("critic_normalisation batch needs a batch_size of at least 2")
 
     def first_networks(self, key: Key, spec: Spec, steps: int, actor_outputs: int) -> dict[str, Any]:
         """Return the initial state's fields that the three share: random networks, with copies as targets."""
@@ -169,10 +168,8 @@ class TwinCritics(OffPolicy):
         actor = learnable(self.make_actor(actor_key, spec, actor_outputs), spec.observation_size, actor_outputs)
         pair = spec.observation_size + spec.action_size
         critics = tuple(learnable(self.make_critic(one, spec), pair, 1) for one in jax.random.split(critics_key))
-        if self.critic_normalisation != "none" and not isinstance(critics[0], MLP):
-            raise InputError(
-                f"critic_normalisation {self.critic_normalisation} is for MLPs, not for {type(critics[0]).__name__}"
-            )
+        if self.critic_normalisation == "batch" and not isinstance(critics[0], MLP):
+            raise InputError(f"critic_normalisation batch is for MLPs, not for {type(critics[0]).__name__}")
         statistics = Statistics.create((spec.observation_size,)) if self.normalise_observations else None
         return {
             "actor": actor,

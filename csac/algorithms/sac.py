@@ -74,9 +74,7 @@ class SAC(MaximumEntropy):
 
         critic_target = partial(self.critic_target, actor=state.actor, temperature=temperature)
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(action_at, state.actor)
-        state, folded_critics, metrics = update_critics(
-            adam, state, batch, target_noise, critic_target, next_action, self.critic_normalisation
-        )
+        state, folded_critics, metrics = update_critics(adam, state, batch, target_noise, critic_target, next_action)
 
         arguments = (folded_critics, batch.observation, actor_noise, step)
         state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *arguments)

@@ -70,9 +70,7 @@ class TD3(TwinCritics):
 
         critic_target = partial(self.critic_target, target_actor=state.target_actor)
         adam, next_action = self.optimiser(self.critic_learning_rate), partial(self.smoothed_action, state.target_actor)
-        state, folded_critics, metrics = update_critics(
-            adam, state, batch, noise, critic_target, next_action, self.critic_normalisation
-        )
+        state, folded_critics, metrics = update_critics(adam, state, batch, noise, critic_target, next_action)
 
         arguments = (folded_critics, batch.observation)
         state, actor_metrics = improve_delayed(self.policy_delay, step, self.improve, state, *arguments)

@@ -12,7 +12,7 @@ import numpy as np
 from csac.algorithms.critics import q_value
 from csac.algorithms.memory import row_width, unpack
 from csac.algorithms.networks import BATCH
-from csac.algorithms.normalisation import PASSES, fold
+from csac.algorithms.normalisation import normalised_pass
 from csac.algorithms.statistics import normalise
 from csac.checks import check_whole
 from csac.deploy.choosing import choose_run, load_run
@@ -100,11 +100,11 @@ class Learnt:
         if any(critic is None for critic in critics):
             raise InputError(f"{self.run.config.algorithm} has no critics Q(s, a); CSAC, SAC, TD3 and SD3 have")
         statistics = getattr(self.state, "observation_statistics", None)
-        if (kind := getattr(self.algorithm, "critic_normalisation", "none")) != "none":
-            critics = self._folded(critics, statistics, PASSES[kind])
+        if getattr(self.algorithm, "critic_normalisation", "none") == "batch":
+            critics = self._folded(critics, statistics)
         return critics, statistics
 
-    def _folded(self, critics: list[Any], statistics: Any, one_pass: Any) -> list[Any]:
+    def _folded(self, critics: list[Any], statistics: Any) -> list[Any]:
         """Return batch-normalised critics as plain ones, with the statistics of the newest transitions."""
         newest = jax.tree.map(lambda array: array[-STATISTICS_TRANSITIONS:], self._transitions())
 
@@ -112,7 +112,7 @@ class Learnt:
             next_action = self.algorithm.act(self.state, one.next_observation, jax.random.key(0), explore=False)
             pairs = [(one.observation, one.action), (one.next_observation, next_action)]
             inputs = [jax.numpy.concatenate([normalise(statistics, seen), action]) for seen, action in pairs]
-            return fold(critic, one_pass(critic, inputs).moments)
+            return normalised_pass(critic, inputs).folded
 
         return [jax.vmap(of_one, (None, 0), out_axes=None, axis_name=BATCH)(critic, newest) for critic in critics]
 

@@ -22,7 +22,7 @@ from csac.algorithms.critics import (
 )
 from csac.algorithms.distributions import policy_at
 from csac.algorithms.networks import BATCH, make_mlp
-from csac.algorithms.normalisation import EPSILON, PASSES, Moments, fold, fold_layer, fold_outputs, moments_of
+from csac.algorithms.normalisation import EPSILON, Moments, fold, fold_layer, moments_of, normalised_pass
 from csac.types import Layer, Transition
 
 SMALL: dict[str, Any] = {"actor_hidden_sizes": (5,), "critic_hidden_sizes": (8, 8), "batch_size": 16}
@@ -30,11 +30,8 @@ NORMALISED = [
     CSAC(critic_normalisation="batch", **SMALL),
     SAC(critic_normalisation="batch", **SMALL),
     TD3(critic_normalisation="batch", policy_delay=1, **SMALL),
-    CSAC(critic_normalisation="batch_before", **SMALL),
-    SAC(critic_normalisation="batch_before", **SMALL),
 ]
-NAMES = [f"{algorithm.name}, {algorithm.critic_normalisation}" for algorithm in NORMALISED]
-KINDS = pytest.mark.parametrize("kind", PASSES)
+NAMES = [algorithm.name for algorithm in NORMALISED]
 NOISE = jnp.asarray(np.random.default_rng(4).normal(size=(16, 2)), jnp.float32)
 
 
@@ -66,29 +63,13 @@ def test_a_folded_layer_normalises_its_inputs():
     assert float((jnp.array([6.0, 1.0]) @ weight + bias)[0]) == pytest.approx(-3.0)
 
 
-def test_a_folded_layer_normalises_its_outputs():
-    # (6 · 2 + 1 · 3 - 13) / 2 + 1 = 2
-    moments = Moments(jnp.array([13.0]), jnp.array([4.0]) - EPSILON)
-    weight, bias, *_ = fold_outputs(Layer(jnp.array([[2.0], [3.0]]), jnp.array([1.0])), moments)
-    assert float((jnp.array([6.0, 1.0]) @ weight + bias)[0]) == pytest.approx(2.0)
-
-
 def test_a_unit_that_is_silent_in_the_batch_is_not_blown_up():
     weight, *_ = fold_layer(Layer(jnp.ones((1, 1)), jnp.zeros(1)), Moments(jnp.zeros(1), jnp.zeros(1)))
     assert float(weight[0, 0]) == pytest.approx(1 / math.sqrt(1e-3))
 
 
-def normalised_values(critic: Any, inputs: Any, kind: str) -> Any:
-    """What one critic says of inputs [example, in], each layer's at mean 0, but for the last's, and mean square 1.
-
-    Before activations it is each hidden layer's outputs, to which the bias is added.
-    """
-    if kind == "batch_before":
-        for weight, bias, *_ in critic.layers[:-1]:
-            outputs = inputs @ weight
-            mean, variance = outputs.mean(0, keepdims=True), outputs.var(0, keepdims=True)
-            inputs = jnp.maximum((outputs - mean) / jnp.sqrt(variance + EPSILON) + bias[None], 0.0)
-        return (inputs @ critic.layers[-1].weight)[:, 0] + critic.layers[-1].bias[0]
+def normalised_values(critic: Any, inputs: Any) -> Any:
+    """What one critic says of inputs [example, in], each layer's at mean 0, but for the last's, and mean square 1."""
     for weight, bias, *_ in critic.layers[:-1]:
         inputs = inputs - inputs.mean(0, keepdims=True)
         inputs = inputs / jnp.sqrt((inputs**2).mean(0, keepdims=True) + EPSILON)
@@ -103,16 +84,16 @@ def pairs_of(batch: Transition, next_actions: Any) -> Any:
     return jnp.concatenate([now, jnp.concatenate([batch.next_observation, next_actions], axis=1)])
 
 
-@KINDS
-def test_a_network_with_the_moments_folded_in_says_what_the_normalised_one_does(kind):
+def test_a_network_with_the_moments_folded_in_says_what_the_normalised_one_does():
     (critic, _), batch = two_critics(), FAR
     inputs = pairs_of(batch, jnp.tanh(NOISE))
-    passes = jax.jit(jax.vmap(partial(PASSES[kind], critic), axis_name=BATCH))
+    passes = jax.jit(jax.vmap(partial(normalised_pass, critic), axis_name=BATCH))
     ours = passes([inputs[:16], inputs[16:]])
-    folded = fold(critic, jax.tree.map(lambda leaf: leaf[0], ours.moments))
+    moments, folded = jax.tree.map(lambda leaf: leaf[0], (ours.moments, ours.folded))
     close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
-    close(jnp.concatenate(ours.outputs)[:, 0], normalised_values(critic, inputs, kind))
-    close(jax.vmap(folded)(inputs)[:, 0], normalised_values(critic, inputs, kind))
+    close(jnp.concatenate(ours.outputs)[:, 0], normalised_values(critic, inputs))
+    close(jax.vmap(folded)(inputs)[:, 0], normalised_values(critic, inputs))
+    jax.tree.map(close, fold(critic, moments), folded)
 
 
 def soft_target(transition: Transition, noise: Any, *, targets: Critics) -> Any:
@@ -125,19 +106,17 @@ def next_action(observation: Any, noise: Any) -> Any:
     return jnp.tanh(noise)
 
 
-@KINDS
-def test_loss_and_gradient_are_those_of_one_pass_over_both_batches(kind):
+def test_loss_and_gradient_are_those_of_one_pass_over_both_batches():
     critics, batch = two_critics(), FAR
 
     def ours(critics):
-        functions = {"one_pass": PASSES[kind], "critic_target": soft_target, "next_action": next_action}
-        loss = partial(normalised_critic_loss, **functions)
+        loss = partial(normalised_critic_loss, critic_target=soft_target, next_action=next_action)
         losses, metrics = jax.vmap(loss, (None, 0, 0), axis_name=BATCH)(critics, batch, NOISE)
         return losses.mean(), metrics["q_mean"].mean()
 
     def theirs(critics):
         inputs = pairs_of(batch, jnp.tanh(NOISE))
-        first, second = (normalised_values(critic, inputs, kind) for critic in critics)
+        first, second = (normalised_values(critic, inputs) for critic in critics)
         future = jnp.minimum(first[16:], second[16:]) - NOISE.sum(1)
         target = jax.lax.stop_gradient(batch.reward + 0.9 * (1.0 - batch.terminated) * future)
         losses = (first[:16] - target) ** 2 + (second[:16] - target) ** 2
@@ -149,12 +128,11 @@ def test_loss_and_gradient_are_those_of_one_pass_over_both_batches(kind):
     jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-3, atol=2e-5), our_gradient, their_gradient)
 
 
-@KINDS
-def test_one_pass_gives_values_targets_and_moments(kind):
+def test_one_pass_gives_values_targets_and_moments():
     # In products of a hidden layer SAC needs 16 (benchmarks/products.py). Normalised critics need 2 + 2 forward and
     # twice as many backward, where plain ones with targets have 2 + 2 and 4: 20. Each further pass would cost 2 or 4.
     # XLA counts 23 in all: layers of other sizes and what is no product are 3.
-    algorithm = SAC(actor_hidden_sizes=(256, 256), critic_hidden_sizes=(256, 256), critic_normalisation=kind)
+    algorithm = SAC(actor_hidden_sizes=(256, 256), critic_hidden_sizes=(256, 256), critic_normalisation="batch")
     state = jax.eval_shape(lambda key: algorithm.init(key, SPEC, 1000), jax.random.key(0))
     counted: Any = jax.jit(algorithm.update).lower(state, FAR, jax.random.key(0), 0).compile().cost_analysis()
     assert 20 < counted["flops"] / (2 * 16 * 256 * 256) < 24
@@ -184,9 +162,8 @@ def test_actor_loss_is_of_the_updated_critics_by_the_moments_of_the_batch(algori
     @jax.jit
     def mean_loss():
         inputs, critics = pairs_of(batch, jax.vmap(next_action)(batch.next_observation, noise)), []
-        one_pass = PASSES[algorithm.critic_normalisation]
         for old, new in zip(state.critics, after.critics, strict=True):
-            passed = jax.vmap(partial(one_pass, old), axis_name=BATCH)([inputs[:16], inputs[16:]])
+            passed = jax.vmap(partial(normalised_pass, old), axis_name=BATCH)([inputs[:16], inputs[16:]])
             critics.append(fold(new, jax.tree.map(lambda leaf: leaf[0], passed.moments)))
         return jax.vmap(partial(loss, critics))(batch.observation, actor_noise).mean()
 

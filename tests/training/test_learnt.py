@@ -15,7 +15,7 @@ import csac
 from csac import InputError
 from csac.algorithms import SAC, SD3
 from csac.algorithms.networks import BATCH
-from csac.algorithms.normalisation import pass_after
+from csac.algorithms.normalisation import normalised_pass
 from csac.algorithms.statistics import normalise
 from csac.seeds import training_seed
 
@@ -84,7 +84,7 @@ def test_critics_that_are_normalised_over_batches_are_asked_by_the_replay(tmp_pa
     def asked(observation, action, next_observation, next_action):
         seen = [normalise(state.observation_statistics, one) for one in (observation, next_observation)]
         pairs = [jnp.concatenate(pair) for pair in zip(seen, (action, next_action), strict=True)]
-        return pass_after(state.critics[0], pairs).outputs[0][0]
+        return normalised_pass(state.critics[0], pairs).outputs[0][0]
 
     given = replay["observations"], replay["actions"], replay["next_observations"], following
     expected = jax.vmap(asked, axis_name=BATCH)(*given)
