@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import platform
 import re
 import shutil
 import subprocess
@@ -126,7 +127,8 @@ class Library:
             source, library = Path(name, "artefact.c"), Path(name, "artefact.so")
             Path(name, "policy.h").write_text(text)
             source.write_text(_LIBRARY)
-            native = ("-march=native",) if optimise else ()
+            # On Arm it gains nothing, and older versions of clang refuse it.
+            native = ("-march=native",) if optimise and platform.machine() == "x86_64" else ()
             compile_c(*STRICT, "-fPIC", "-shared", "-O3", *native, source, "-o", library, "-lm")
             self._library = ctypes.CDLL(str(library))  # stays loaded when its file is deleted
         self._step = self._library.artefact_step

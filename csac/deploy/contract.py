@@ -130,6 +130,8 @@ class Contract:
             if (flat := _flat(array, shape)) is None:
                 raise InputError(f"observation[{key!r}] has shape {array.shape}; the policy takes {shape}, or a batch")
             parts.append(flat)
+        if len({part.shape[:-1] for part in parts}) > 1:
+            raise InputError("the observation's parts are not all batches of one size")
         return np.concatenate(parts, axis=-1)
 
 

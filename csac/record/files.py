@@ -16,6 +16,7 @@ from csac.types import InputError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+TEMPORARY = f".*.{'[0-9a-f]' * 8}.[0-9]*"  # what `temporary_path` returns
 SECONDS_FOR_LOCK = 0.2  # `is_locked` in another process holds a lock for an instant
 
 # Files whose locks this process holds; closed ones may stay in the set.

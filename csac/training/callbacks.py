@@ -284,7 +284,7 @@ class Notifier:
             indices = [episode.seed_index for episode in episodes]
             self._notify("on_episode", step, indices, [(episode,) for episode in episodes])
         due = tuple(interval for interval in self._interests.intervals if step % interval < stride)
-        if due:
+        if due and alive.any():
             indices = np.flatnonzero(alive).tolist()
             self._notify("on_step", step, indices, [()] * len(indices), due)
         return bool(self.stopped_by)

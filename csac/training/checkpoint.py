@@ -162,10 +162,10 @@ class Writer:
 def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:
     """Write a folder next to `path`, sync and rename it, so that it is complete or absent. Raises OSError."""
     aside = temporary_path(path)
-    shutil.rmtree(path, ignore_errors=True)
     aside.mkdir()
     for name, content in contents.items():
         write_atomically(aside / name, content)
+    shutil.rmtree(path, ignore_errors=True)  # only now: the disk may have been full
     aside.rename(path)
     for folder in (path, path.parent, path.parent / REPLAY):
         descriptor = os.open(folder, os.O_DIRECTORY)

@@ -92,7 +92,9 @@ def programs_of(
     Raises InputError for numbers out of range, and for a task or an algorithm that cannot be sent to another process.
     """
     cores = cores_to_use()
-    threads = threads_of(existing.values(), cores, max(1, cores // len(directories)))
+    ahead = groups_ahead(directories, existing, config.steps)
+    begun = [run for run in existing.values() if any(run.path in group for group in ahead)]
+    threads = threads_of(begun, cores, max(1, cores // len(ahead)))
     has_processes = can_be_sent(template.task) and may_be_imported()
     spare, batches = cores - len(directories), len(directories[0]) * -(-config.evaluation_episodes // 10)
     processes = template.evaluation_processes
@@ -116,6 +118,14 @@ def programs_of(
         )
     settings = {"threads": threads, "evaluation_processes": processes, "environment_processes": stepping}
     return [template._replace(directories=tuple(group), **settings) for group in directories]
+
+
+def groups_ahead(
+    directories: Sequence[Sequence[Path]], existing: Mapping[int, RunDirectory], steps: int
+) -> list[Sequence[Path]]:
+    """Return the groups of directories that have steps to make, or all if none has."""
+    over = {run.path for run in existing.values() if run.manifest.steps_done >= steps}
+    return [group for group in directories if not over.issuperset(group)] or list(directories)
 
 
 def threads_of(existing: Iterable[RunDirectory], cores: int, default: int) -> int:

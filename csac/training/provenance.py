@@ -39,7 +39,7 @@ def _versions(task: Task, on_gpu: bool) -> dict[str, str]:
         with suppress(PackageNotFoundError):
             versions[package] = version(package)
     if on_gpu:
-        names = (distribution.name for distribution in distributions())
+        names = filter(None, (distribution.name for distribution in distributions()))  # None: a broken installation
         versions |= {name: version(name) for name in sorted(names) if name.startswith(("jax-cuda", "nvidia-"))}
     return versions
 

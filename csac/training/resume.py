@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from csac.algorithms import ALGORITHMS
 from csac.record.config import differences
-from csac.record.files import write_atomically
+from csac.record.files import TEMPORARY, write_atomically
 from csac.record.manifest import Continuation, Manifest, Origin
 from csac.record.run import TABLES, RunDirectory, now
 from csac.record.sets import RunSet, split_step
@@ -155,7 +155,7 @@ def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
 def _remove_unfinished(run: RunDirectory) -> None:
     """Remove the files that a process was writing when it was killed."""
     for folder in (run.path, run.policies, run.checkpoints, run.checkpoints / REPLAY):
-        for path in folder.glob(".*.*"):
+        for path in folder.glob(TEMPORARY):
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 

@@ -71,4 +71,6 @@ def _note_begin(run: RunDirectory, point: ResumePoint, current: dict[str, Any], 
         for line in lines:
             run.log(line)
             watcher.note(f"seed {run.seed}: {line}")
-    run.update_manifest(**current, state="running", failure="", history=history, steps_done=point.step)
+    run.update_manifest(
+        **current, state="running", failure="", history=history, steps_done=point.step, last_checkpoint=point.step
+    )

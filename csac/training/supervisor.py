@@ -103,7 +103,9 @@ def _replace(worker: _Worker, watcher: Watcher, restarted: set[Path], errors: li
     if worker.is_stopping:  # `resume` continues its runs from their newest checkpoint
         return []
     runs = [RunDirectory.open(path) for path in worker.program.directories]
-    sound = [run for run in runs if run.manifest.state != "failed"]
+    # Before its first turn a worker may have died with the states that its runs had when they were resumed.
+    over = ("failed",) if worker.has_turn is None else ("failed", "finished")
+    sound = [run for run in runs if run.manifest.state not in over]
     is_first = restarted.isdisjoint(worker.program.directories)
     if sound and is_first and all(map(can_resume, sound)):
         restarted.update(worker.program.directories)
@@ -112,11 +114,10 @@ def _replace(worker: _Worker, watcher: Watcher, restarted: set[Path], errors: li
         watcher.note(f"{name_seeds([run.seed for run in sound])}: {reason}; restarting from the newest checkpoint")
         return [worker.program._replace(directories=tuple(run.path for run in sound))]
     for run in sound:
-        if run.manifest.steps_done < run.config.steps:
-            step = run.manifest.steps_done
-            run.log(f"stopped at step {step}: {reason}")
-            run.update_manifest(state="failed", failure=f"step {step}: {reason}")
-            watcher.failed(run.seed, step, reason if is_first else f"{reason}, for the second time")
+        step = run.manifest.steps_done
+        run.log(f"stopped at step {step}: {reason}")
+        run.update_manifest(state="failed", failure=f"step {step}: {reason}")
+        watcher.failed(run.seed, step, reason if is_first else f"{reason}, for the second time")
     return []
 
 

@@ -23,7 +23,7 @@ from csac.training.callbacks import Callbacks
 from csac.training.compilation import tidy_programs
 from csac.training.config import algorithm_of, check_algorithm, make_configs, seed_range
 from csac.training.devices import begin_with, choose_device
-from csac.training.program import Program, choose_groups, memory_needed, programs_of
+from csac.training.program import Program, choose_groups, groups_ahead, memory_needed, programs_of
 from csac.training.resume import Source, find_resume_point, fork_options, refuse_differences, refuse_mixed
 from csac.training.running import train_program
 from csac.training.signals import Interrupted, stop_requested
@@ -132,7 +132,8 @@ def train(
     template = Program((), algorithm, task, 1, *settings)
     directories = [[run_path(place, seed) for seed in group] for group in groups]
     programs = programs_of(template, directories, existing, configs[0])
-    notes = [memory_needed(programs, configs[0], spec, _workers()), *task_notes]
+    at_once = min(_workers(), len(groups_ahead(directories, existing, configs[0].steps)))
+    notes = [memory_needed(programs, configs[0], spec, at_once), *task_notes]
     notes += [*_warmup_note(algorithm, configs[0]), *_effect_notes(algorithm)]
     if watch.callbacks.interests.evaluations and not configs[0].evaluation_interval:
         notes.append("note: evaluation_interval is 0: no callback receives evaluations, and none ends a run by them")
@@ -176,11 +177,9 @@ def resume(
     watch = Watch(progress, Callbacks(callbacks, on_evaluation, stop_when))
     choose_device(config.device)
     algorithm = algorithm_of(config, runs.path, trust_task)
-    if steps is not None:
-        configs = [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
-        for run, config in zip(runs.runs, configs, strict=True):
-            refuse_differences(run, config, algorithm.cadence.has_schedule)
-        _set_configs(runs.runs, configs)
+    configs = [] if steps is None else [dataclasses.replace(run.config, steps=steps) for run in runs.runs]
+    for run, config in zip(runs.runs, configs, strict=False):
+        refuse_differences(run, config, algorithm.cadence.has_schedule)
     existing = {run.seed: run for run in runs.runs}
     groups = choose_groups(runs.seeds, existing, None, config.device, config.task)
     tensorboard = any(run.tensorboard.exists() for run in runs.runs)
@@ -188,6 +187,8 @@ def resume(
     settings = evaluation_processes, environment_processes, tensorboard, wandb, watch.callbacks.interests, command
     template = Program((), algorithm, config.task, 1, *settings)
     programs = programs_of(template, [[existing[seed].path for seed in group] for group in groups], existing, config)
+    if configs:
+        _set_configs(runs.runs, configs)
     return _run(runs, programs, watch, [])
 
 

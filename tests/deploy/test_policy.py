@@ -121,6 +121,7 @@ def test_predict_takes_dicts_dicts_of_batches_and_flat_observations():
     [
         (((None, (3,)),), np.zeros(4), r"shape \(4,\); the policy takes \(3,\)"),
         (((None, (3,)),), np.zeros((2, 2, 3)), r"shape \(2, 2, 3\)"),
+        ((("a", (3,)), ("b", (2,))), {"a": np.zeros((4, 3)), "b": np.zeros(2)}, "batches of one size"),
         (((None, (3,)),), ["a", "b", "c"], "not an array of numbers"),
         (((None, (3,)),), {"speed": 1.0}, r"the keys \['speed'\]; the policy takes one array"),
         (DICT_PARTS, {"speed": 1.0}, r"the keys \['speed'\]; the policy takes \['achieved', 'position', 'speed'\]"),

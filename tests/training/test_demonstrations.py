@@ -158,6 +158,7 @@ def test_a_minari_data_set_is_read_or_what_to_install_is_told(tmp_path, monkeypa
         ({"rewards": np.full(30, 1e300)}, "rewards holds what is not finite"),
         ({"rewards": np.full(30, "one")}, "rewards: could not convert string to float"),
         ({"rewards": np.zeros(0)}, "no transitions"),
+        ({"rewards": np.array(1.0)}, "no transitions"),
         ({"terminations": np.full(30, 0.5)}, "are 0 or 1"),
         ({"truncations": np.zeros(3)}, "truncations has shape"),
         ({"truncation": np.zeros(30)}, "did you mean truncations"),

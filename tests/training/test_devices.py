@@ -135,7 +135,8 @@ def test_a_gpu_that_is_not_to_be_had_leaves_no_setting_behind(a_gpu, monkeypatch
 
 def test_a_gpu_s_libraries_are_recorded(monkeypatch):
     installed = {"nvidia-cublas": "13.1", "jax-cuda13-plugin": "0.11", "nvidia": "1", "rich": "14"}
-    monkeypatch.setattr(provenance_module, "distributions", lambda: [SimpleNamespace(name=name) for name in installed])
+    named = [SimpleNamespace(name=name) for name in (*installed, None)]  # None: an installation that was broken off
+    monkeypatch.setattr(provenance_module, "distributions", lambda: named)
     monkeypatch.setattr(provenance_module, "version", lambda name: installed.get(name, "2"))
     monkeypatch.setattr(provenance_module, "in_use", lambda: {"gpu": "GPU A"})
     on_gpu = provenance_module.provenance("Pendulum-v1", None, 1)["versions"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import shutil
 import signal
@@ -19,10 +20,12 @@ import csac
 from csac import InputError
 from csac.algorithms import SAC
 from csac.record.config import EVALUATION_SEED
+from csac.record.files import temporary_path
 from csac.record.run import RunDirectory
 from csac.record.sets import find_sets
-from csac.training import evaluations
-from csac.training.checkpoint import Writer, newest_sound, steps_in
+from csac.training import checkpoint, evaluations
+from csac.training.checkpoint import Writer, newest_sound, steps_in, write_folder
+from csac.training.resume import roll_back
 from csac.training.signals import Interrupted
 
 CHANGES = ("friction=1.5@150", "action_noise=0.05@210", "observation_noise=0.01@330")
@@ -126,6 +129,32 @@ def test_a_resume_with_other_settings_is_refused(finished, whole, changes, name)
     with pytest.raises(InputError, match=name):
         run(finished.path.parent, resume=True, **changes)
     assert contents(finished) == whole
+
+
+def test_a_refused_resume_does_not_lengthen_the_run(finished):
+    with pytest.raises(InputError, match="environment_processes"):
+        csac.resume(finished.path, steps=600, environment_processes=3)
+    assert RunDirectory.open(finished.path).config.steps == 500
+
+
+def test_a_resume_removes_half_written_files_and_no_others(stopped):
+    half_written, own = temporary_path(stopped.path / "metrics.csv"), stopped.path / ".log.txt.swp"
+    half_written.touch()
+    own.touch()
+    roll_back([stopped])
+    assert (half_written.exists(), own.exists()) == (False, True)
+
+
+def test_a_checkpoint_that_cannot_be_written_again_stays(stopped, monkeypatch):
+    def full(path, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "write_atomically", full)
+    with pytest.raises(OSError, match="No space"):
+        write_folder(stopped.checkpoints / "step_360", {"state.safetensors": b""})
+    sound, complaints = newest_sound(stopped.checkpoints)
+    assert sound
+    assert (sound.step, complaints) == (360, [])
 
 
 def test_an_interrupt_breaks_off_a_long_evaluation_and_the_resume_repeats_it(tmp_path, monkeypatch, whole):

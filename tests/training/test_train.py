@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import multiprocessing
 import os
 import random
+import signal
 import sys
 import types
 import warnings
@@ -22,10 +24,11 @@ from resuming import LEARNERS, SMALL, contents, run
 import csac
 from csac import InputError
 from csac.algorithms import SAC
+from csac.processes import cores_to_use
 from csac.record.sets import RunSet
 from csac.seeds import training_seed
 from csac.training.checkpoint import steps_in
-from csac.training.program import can_be_sent, choose_groups
+from csac.training.program import Program, can_be_sent, choose_groups, programs_of
 
 
 class Falling(Probe):
@@ -40,6 +43,14 @@ class Falling(Probe):
         if self.steps == 60:
             raise RuntimeError("the arm fell off")
         return super().step(action)
+
+
+class DeadlyToClose(Probe):
+    """Kills a process of several that closes it."""
+
+    def close(self):
+        if multiprocessing.parent_process():
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.fixture(scope="module")
@@ -179,6 +190,20 @@ def test_callbacks_hear_of_each_evaluation_and_may_end_a_run_early(tmp_path):
 def test_stop_when_is_asked_by_processes_too(tmp_path):
     runs = run(tmp_path / "set", steps=1_500, seeds=2, stop_when=lambda step, returns: step >= 200)
     assert all(one.evaluations["step"].max() == 200 for one in runs.runs)
+
+
+def test_a_process_that_dies_once_its_run_was_ended_changes_nothing(tmp_path):
+    settings: Any = {"task": DeadlyToClose, "steps": 1_500, "seeds": 2, "evaluation_environments": 0}
+    runs = run(tmp_path / "set", SAC(**SMALL), stop_when=lambda step, returns: step >= 200, **settings)
+    assert not runs.failures
+    assert [(one.manifest.state, one.manifest.steps_done < 1_500) for one in runs.runs] == [("finished", True)] * 2
+
+
+def test_seeds_that_are_over_have_no_share_of_the_cores(apart):
+    existing = {one.seed: one for one in apart.runs}
+    directories = [*([one.path] for one in apart.runs), [apart.path / "seed-5"]]
+    programs = programs_of(Program((), LEARNERS[0], "Hopper-v4", 1), directories, existing, apart.config)
+    assert programs[-1].threads == cores_to_use()
 
 
 def test_a_dead_seed_without_checkpoints_fails_alone(tmp_path):
