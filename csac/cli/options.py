@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
@@ -265,6 +266,8 @@ class List:
 def parse_training(base: type[Any], words: list[str], program: str) -> Any:
     """Return the parsed `Train` or `Tune`; its defaults come from the preset or from the runs given by `--from`."""
     first = "" if not words or words[0].startswith("-") else words[0]
+    if bare := [word for word, after in pairwise([*words, "-"]) if word.endswith("-sizes") and after.startswith("-")]:
+        raise InputError(f"{bare[0]} needs numbers ({program} --help)")
     options = parse(_with_algorithm(base, words, first), words, program, _other_algorithms_hint)
     if options.preset and options.task != first:  # a preset's values can depend on the task
         options = parse(_with_algorithm(base, words, options.task), words, program, _other_algorithms_hint)

@@ -135,7 +135,8 @@ def _rows(arrays: dict[str, Any], names: list[str], contract: Contract) -> np.nd
     if missing := [name for name in REQUIRED if name not in arrays]:
         raise InputError(f"demonstrations lacks {', '.join(missing)}: it has {', '.join(map(str, names)) or 'nothing'}")
     spec, bounds = contract.spec, contract.bounds
-    number = len(arrays["rewards"]) if np.iterable(arrays["rewards"]) else 0
+    rewards = arrays["rewards"]
+    number = len(rewards) if hasattr(rewards, "__len__") and getattr(rewards, "shape", True) else 0  # () is a number
     if not number:
         raise InputError("demonstrations has no transitions")
 

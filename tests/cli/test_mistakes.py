@@ -27,6 +27,7 @@ from typed import csac
         ("train X --algorithm ppo --warmup-steps 9", "--algorithm csac or sac or td3 or sd3 has it"),
         ("train X --clip-range 0.1", "--algorithm ppo has it"),
         ("train X --actor-hidden-sizes 400,300", "--actor-hidden-sizes"),
+        ("train X --critic-hidden-sizes --seeds 1", "--critic-hidden-sizes"),
         ("train X Y", "there is no Y here"),
         ("train X --wandb True", "there is no True here"),
         ("train X --device tpu", "'tpu'"),
