@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from multiprocessing.context import SpawnProcess
 
+SECONDS_BETWEEN_CHECKS = 1.0  # of whether a process that does not answer is alive
 # How long to wait for the exit code of a process whose pipe has closed.
 SECONDS_TO_END = 10.0
 # Time for an environment to close itself and the simulator that it started.

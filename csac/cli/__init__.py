@@ -87,8 +87,8 @@ def _prepare_streams() -> None:
 
 
 def _flush() -> None:
-    """Flush stdout; a pipe that its reader closed (`csac runs | head`) is no error."""
+    """Flush stdout; a pipe that its reader closed (`csac runs | head`), or a full disk, is no error."""
     try:
         sys.stdout.flush()
-    except BrokenPipeError:
+    except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

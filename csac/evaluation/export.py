@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from csac.tasks.registry import Task
 
 IMPLAUSIBLE = 1e-4  # a p-value below this rejects the artefact
-# Files that an artefact folder may hold, and the cache that Python leaves after importing the loader.
-_ARTEFACT_FILES = {CONTRACT, POLICY, CARD, CURVE, "__pycache__", *FILES.values()}
+# Files that an artefact folder may hold, with what Python leaves after importing the loader, and macOS's Finder.
+_ARTEFACT_FILES = {CONTRACT, POLICY, CARD, CURVE, "__pycache__", ".DS_Store", *FILES.values()}
 
 
 class Exported(NamedTuple):
@@ -168,7 +168,7 @@ def _learnt_weights(run: RunDirectory, steps: int) -> dict[str, float]:
     rows = run.rows("metrics")
     rows = rows[rows["step"] <= steps]
     learnt = [name for name, value in run.config.hyperparameters.items() if value == "auto"]
-    columns = {name: "temperature" if run.config.algorithm == "sac" else name for name in learnt}
+    columns = {name: name if name in (rows.dtype.names or ()) else "temperature" for name in learnt}  # SAC's
     values = {name: rows[column] for name, column in columns.items() if column in (rows.dtype.names or ())}
     known = {name: of[~np.isnan(of)] for name, of in values.items()}  # a callback's rows have no such value
     return {name: float(of[-1]) for name, of in known.items() if len(of)}

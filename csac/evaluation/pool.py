@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from csac.checks import check_whole
 from csac.evaluation.episode import EvaluationEpisode, EvaluationFailure, NotMade
-from csac.processes import Child, cores_to_use, end
+from csac.processes import SECONDS_BETWEEN_CHECKS, Child, cores_to_use, end
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     OnProgress = Callable[[int, int], None]  # episodes done, episodes in total
 
 _BATCHES_PER_PROCESS = 2  # at least: starting a process takes as long as a short batch
-_SECONDS_BETWEEN_STOP_CHECKS = 1.0
 
 Batch = tuple[int, int]  # policy index, number of the first episode
 Result = list[EvaluationEpisode] | EvaluationFailure
@@ -73,18 +72,20 @@ class Pending:
         while self._busy:
             if should_stop and should_stop():
                 raise EvaluationStopped
-            self._receive(_SECONDS_BETWEEN_STOP_CHECKS if should_stop else None)
+            self._receive(SECONDS_BETWEEN_CHECKS)
         for batch in self._evaluator.batches(len(self._policies)):
             if batch not in self._answers and not self._is_skipped(batch):
                 self._store(batch, self._evaluator.try_batch(*self._request(batch), should_stop))
         return [self._result(index) for index in range(len(self._policies))]
 
-    def _receive(self, seconds: float | None) -> None:
-        """Wait for answers, at most so many `seconds` (None: until one arrives), and hand out waiting batches."""
+    def _receive(self, seconds: float) -> None:
+        """Wait for answers, at most so many `seconds`, and hand out waiting batches."""
         ready = wait([worker.connection for worker in self._busy], seconds) if self._busy else []
-        for worker in [worker for worker in self._busy if worker.connection in ready]:
+        for worker in [one for one in self._busy if one.connection in ready or one.process.exitcode is not None]:
             batch = self._busy.pop(worker)
             try:
+                if not worker.connection.poll():  # it is dead, and a process that its task forked holds the pipe open
+                    raise EOFError
                 answer = worker.connection.recv()
             except (EOFError, OSError):
                 self.notes.append(f"evaluation: {worker.cause_of_death()}; its episodes are run by this one instead")

@@ -188,5 +188,5 @@ def is_run(path: str | Path) -> bool:
 
 def _manifest_copies(path: Path) -> list[Path]:
     """Return the paths of the manifest's copies in a run's checkpoints, newest first."""
-    steps = {int(copy.parent.name[5:]): copy for copy in path.glob(f"checkpoint/step_[0-9]*/{MANIFEST}")}
-    return [steps[step] for step in sorted(steps, reverse=True)]
+    copies = [copy for copy in path.glob(f"checkpoint/step_*/{MANIFEST}") if copy.parent.name[5:].isdecimal()]
+    return sorted(copies, key=lambda copy: int(copy.parent.name[5:]), reverse=True)

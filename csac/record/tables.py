@@ -65,7 +65,7 @@ def check_new(path: Path) -> None:
     """Raise InputError if no new table can be created at `path`, before anything has been computed for it."""
     if path.exists():
         raise InputError(f"{path} exists: give another name, or remove it first")
-    if not os.access(path.parent, os.W_OK):
+    if not (path.parent.is_dir() and os.access(path.parent, os.W_OK)):
         raise InputError(f"cannot write into {path.parent}: choose a folder that exists and is yours to write")
 
 

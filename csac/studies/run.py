@@ -93,8 +93,10 @@ def _program(path: Path, run: StudyRun, execution: Execution) -> Program:
     if is_run(path):
         existing = RunDirectory.open(path)
         if run.config != existing.config:
+            # A run that is over has to look unfinished until its turn comes, which a signal may prevent.
+            state = existing.manifest.state
             with existing.locked():
-                existing.update_manifest(config=run.config)
+                existing.update_manifest(config=run.config, state="interrupted" if state == "finished" else state)
         threads = threads_of([existing], cores, threads)
     else:
         RunDirectory.create(path, Manifest(config=run.config, program=(run.config.seed,)))

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import jax
+
 from csac.algorithms import ALGORITHMS
 from csac.checks import did_you_mean, without_controls
 from csac.presets import hyperparameters as preset_of
@@ -21,7 +23,7 @@ from csac.tasks.perturbations import perturbations_of, refuse_late
 from csac.tasks.registry import check_events, events_of
 from csac.training.config import algorithm_of, seed_range
 from csac.training.resume import refuse_differences
-from csac.types import InputError
+from csac.types import InputError, Spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -157,9 +159,9 @@ class Study:
         seeds = seed_range(self.seeds, self.first_seed)
         parts = itertools.product(self.tasks, self.conditions, self.methods)
         firsts = [self._run(task, condition, method, seeds[0]) for task, condition, method in parts]
-        if len({run.folder for run in firsts}) < len(firsts):
-            twice = next(run for run in firsts if sum(run.folder == other.folder for other in firsts) > 1)
-            raise InputError(f"two methods, tasks or conditions have the folder {twice.folder.parent}: rename one")
+        folders = [str(run.folder).casefold() for run in firsts]  # a Mac's disk ignores case
+        if twice := [run for run, name in zip(firsts, folders, strict=True) if folders.count(name) > 1]:
+            raise InputError(f"two methods, tasks or conditions have the folder {twice[0].folder.parent}: rename one")
         return [
             run._replace(config=dataclasses.replace(run.config, seed=seed), folder=run.folder.with_name(f"seed-{seed}"))
             for seed in seeds
@@ -176,6 +178,7 @@ class Study:
             changes = [dataclasses.replace(change, step=round(change.step * self.scale)) for change in changes]
             algorithm = _with_short_warmup(algorithm, steps)
         refuse_late(changes, steps)
+        jax.eval_shape(lambda: algorithm.memory(Spec(1, 1, self.environments), steps))  # refuses what does not fit
         config = RunConfig(
             task=task,
             algorithm=method.algorithm,

@@ -6,6 +6,7 @@ Any number of processes may share a directory: Optuna's study is a journal in it
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
 import sys
 import warnings
@@ -27,7 +28,7 @@ from csac.studies.arms import plain
 from csac.studies.run import try_tasks
 from csac.studies.search import Search, sample
 from csac.training.config import RUN_OPTIONS
-from csac.training.signals import Interrupted, stop_requested
+from csac.training.signals import Interrupted, stop_requested, storage_failures
 from csac.training.train import train
 from csac.types import InputError
 
@@ -52,13 +53,14 @@ def tune(search: Search, directory: Path, trials: int, command: str | None, cons
     check_whole("trials", trials, 1, 100_000)
     directory = directory.absolute()
     try_tasks([search.config])
-    study = _open(search, directory)
-    with stop_requested(lambda text: console.print(text)) as request:
-        while not request.is_set() and (found := _next(study, search, directory, trials)):
-            trial, lock = found
-            with lock:
-                _run(study, search, trial, _folder(directory, trial), command, console)
-    _conclude(study, search, directory, console)
+    with storage_failures(directory):
+        study = _open(search, directory)
+        with stop_requested(lambda text: console.print(text)) as request:
+            while not request.is_set() and (found := _next(study, search, directory, trials)):
+                trial, lock = found
+                with lock:
+                    _run(study, search, trial, _folder(directory, trial), command, console)
+        _conclude(study, search, directory, console)
     if request.is_set():
         print(f"csac: stopped; the trial is saved. To go on, type the same line again: {command}", file=sys.stderr)
         return 128 + request.received[0]
@@ -74,11 +76,15 @@ def _open(search: Search, directory: Path) -> optuna.Study:
         raise InputError("Optuna is not installed: pip install '.[tune]' in a clone of csac") from None
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     journal = directory / "journal.log"
-    if directory.exists() and not journal.exists() and (directory.is_file() or any(directory.iterdir())):
+    if directory.exists() and not journal.exists() and (directory.is_file() or any(directory.glob("[!.]*"))):
         raise InputError(f"{directory} is not empty and holds no search: choose another --directory")
     with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
-    backend = JournalFileBackend(str(journal), JournalFileOpenLock(str(journal)))
+    lock = JournalFileOpenLock(str(journal))
+    backend = JournalFileBackend(str(journal), lock)
+    lock.acquire()
+    os.truncate(journal, journal.read_bytes().rfind(b"\n") + 1)  # a full disk cut the last line off
+    lock.release()
     unpruned = max(search.algorithm.cadence.first_update, round(SHARE_UNPRUNED * search.config.steps))
     with _trial_choice_locked(directory):
         study = optuna.create_study(

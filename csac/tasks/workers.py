@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from csac.processes import Child, end
+from csac.processes import SECONDS_BETWEEN_CHECKS, Child, end
 from csac.tasks.environment import Environment
 from csac.tasks.events import info_name, number
 from csac.tasks.failures import EnvironmentFailure
@@ -117,6 +117,9 @@ class Worker(Child):
         """Return the next answer or raise the worker's exception; raise EnvironmentFailure if the process is gone."""
         self.begin()
         try:
+            while not self._answers and not self.connection.poll(SECONDS_BETWEEN_CHECKS):
+                if self.process.exitcode is not None:  # a process that its task forked holds the pipe open
+                    raise EOFError
             if not self._answers:
                 self._answers.extend(self.connection.recv())
         except (EOFError, OSError):

@@ -15,7 +15,7 @@ import probes
 import psutil
 import pytest
 from gymnasium.envs.registration import EnvSpec
-from helped import Helped, ends_of
+from helped import Forking, Helped, end_forks, ends_of
 from played import policy_for, run_of_task
 from policies import contract, random_policy
 
@@ -126,6 +126,11 @@ def test_what_a_dying_process_takes_along_is_made_here(pool_of):
         assert pending.results() == [expected, expected]
         assert len(pending.notes) == 2
         assert all("its process was killed by SIGKILL" in note for note in pending.notes)
+
+
+def test_what_holds_a_dead_process_s_pipe_open_keeps_nobody_waiting(tmp_path, pool_of):
+    (episodes,) = pool_of(Forking, {"folder": str(tmp_path)}, TWO_BATCHES).begin([POLICY]).results()
+    assert (len(episodes), end_forks(tmp_path)) == (TWO_BATCHES, 2)
 
 
 @pytest.mark.parametrize("how", ["alone", "pool"])

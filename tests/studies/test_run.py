@@ -71,6 +71,17 @@ def test_more_steps_later_go_on(tmp_path, supervised):
     write_run(tmp_path / run.folder, run.config, points=0)
     run_study([longer], tmp_path, Execution(), make_console())
     assert RunDirectory.open(tmp_path / run.folder).config.steps == 2_000
+    assert longer.is_over(tmp_path)
+
+
+def test_a_longer_study_that_is_stopped_at_once_has_its_runs_before_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "supervise", lambda *arguments: None)
+    (run, *_), (longer, *_) = tiny_study(tmp_path).runs(), tiny_study(tmp_path, steps=2_000).runs()
+    write_run(tmp_path / run.folder, run.config, points=0)
+    (tmp_path / run.folder / "checkpoint").mkdir()
+    run_study([longer], tmp_path, Execution(), make_console())
+    assert not longer.is_over(tmp_path)
+    assert (tmp_path / run.folder / "checkpoint").exists()
 
 
 def test_a_study_of_several_environments_records_and_shows_them(tmp_path, supervised, capsys):

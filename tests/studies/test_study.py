@@ -125,6 +125,8 @@ def test_the_studies_that_csac_brings(name):
         ('tasks = ["Ant-v4"]\n' + METHOD + "hyperparameters = { discount = 2.0 }", "discount"),
         ('tasks = ["Ant-v4"]\n' + METHOD + "sweep = { discount = 0.9 }", "sweep.discount"),
         ('tasks = ["Ant-v4"]\n' + METHOD + METHOD, "sac/Ant-v4"),
+        ('tasks = ["Ant-v4"]\n' + METHOD + METHOD + 'label = "SAC"', "sac/Ant-v4"),
+        ('tasks = ["Ant-v4"]\nenvironments = 10\n[[methods]]\nalgorithm = "ppo"', "environments must divide"),
         ('tasks = ["Ant-v4", "Ant-v4"]\n' + METHOD, "sac/Ant-v4"),
     ],
 )

@@ -173,6 +173,8 @@ def test_the_same_search_suggests_the_same_and_goes_on(tmp_path, trained):
     trained.found.clear()
     for count in (1, 2, 4, 4):
         assert tune(search(), tmp_path / "parts", count, None, make_console()) == 0
+        with open(tmp_path / "parts" / "journal.log", "a") as journal:
+            journal.write('{"op_code"')  # as a full disk leaves it
     assert [algorithm.discount for algorithm, _, _ in trained.found] == whole
 
 

@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 
 import gymnasium
+import psutil
 from probes import Probe
 
 
@@ -37,6 +38,23 @@ class Helped(Probe):
         self.path.write_text(ends)
 
 
+class Forking(Probe):
+    """Kills its process, if that is one of several, in its first step, and leaves a fork that holds all pipes open."""
+
+    def __init__(self, folder: str) -> None:
+        super().__init__()
+        self.folder = folder
+
+    def step(self, action):
+        if multiprocessing.parent_process():
+            if not (fork := os.fork()):
+                signal.alarm(30)  # ends it in any case
+                signal.pause()
+            Path(self.folder, str(fork)).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
+
+
 if "Helped-v0" not in gymnasium.registry:
     gymnasium.register("Helped-v0", entry_point=f"{__name__}:Helped")
 
@@ -45,3 +63,12 @@ def ends_of(folder: Path) -> tuple[int, set[str]]:
     """How many processes have made such tasks in this folder, and how those have ended."""
     files = list(folder.iterdir())
     return len({path.name.split("-")[0] for path in files}), {path.read_text() for path in files}
+
+
+def end_forks(folder: Path) -> int:
+    """End the forks of `Forking` tasks; return how many had not ended."""
+    forks = [one for one in psutil.process_iter() if Path(folder, str(one.pid)).exists()]
+    alive = [fork for fork in forks if fork.status() != psutil.STATUS_ZOMBIE]
+    for fork in alive:
+        fork.kill()
+    return len(alive)

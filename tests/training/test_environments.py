@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import probes
 import pytest
+from helped import Forking, end_forks
 from resuming import ROLLOUT, SMALL, Crash, contents, crash_at, run_with_copies
 from resuming import run as train
 from test_memory import RolloutWatcher, Watcher, check_story
@@ -126,6 +127,14 @@ def test_the_death_of_a_process_is_the_failure_of_its_seeds():
     assert [len(outcome.failures) for outcome in outcomes] == [0, 0, 1]  # episodes have three steps
     assert "SIGKILL" in outcomes[2].failures[0].reason
     assert not environments.is_any_alive
+
+
+def test_what_holds_a_dead_process_s_pipe_open_keeps_no_step_waiting(tmp_path):
+    environments = SeedEnvironments(Forking, {"folder": str(tmp_path)}, [4], 2, 2)
+    environments.reset()
+    outcome = environments.step(np.zeros((1, 2, 1), np.float32))
+    environments.close()
+    assert ("SIGKILL" in outcome.failures[0].reason, end_forks(tmp_path)) == (True, 2)
 
 
 def test_processes_are_chosen_by_cores_and_by_what_a_step_costs(monkeypatch):

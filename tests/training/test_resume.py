@@ -289,6 +289,7 @@ def test_a_table_that_lost_rows_is_restored_from_the_checkpoint(tmp_path, stoppe
 
 
 def test_a_lost_manifest_is_taken_from_the_newest_checkpoint(tmp_path, stopped, whole):
+    shutil.copytree(stopped.checkpoints / "step_360", stopped.checkpoints / "step_360.bak")
     for kind in ("cut", "missing"):
         damage(stopped.path / "manifest.json", kind)
         with pytest.warns(UserWarning, match=r"manifest\.json is lost or damaged"):
