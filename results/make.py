@@ -189,9 +189,11 @@ def study(
     tasks: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
     same: dict[str, str] | None = None,
+    title: str = "",
 ) -> str:
     """Return all tables of a study, or of some methods, tasks or seeds; `same` maps labels to arms named otherwise."""
     told = tomllib.loads(page.file(file).read_text(encoding="utf-8"))
+    title = title or told["title"]
     labels = methods or [method["label"] for method in told["methods"]]
     first = told.get("first_seed", 0)
     of_study = seeds or range(first, first + told["seeds"])
@@ -203,8 +205,8 @@ def study(
         arms = page.arms({label: (same or {}).get(label, label) for label in labels}, task, [*of_study], steps, changed)
         found[task] = {label: measure(rows, steps, changed_at) for label, rows in arms.items()}
     part = [f"seeds {comma(seeds)}"] * bool(seeds) + [f"on {comma(tasks)}"] * bool(tasks)
-    heading = f"## {told['title']}" + (f": {comma(part)} alone" if part else "")
-    return "\n\n".join([heading, *study_tables(told["title"], found, of_study, bool(changed))])
+    heading = f"## {title}" + (f": {comma(part)} alone" if part else "")
+    return "\n\n".join([heading, *study_tables(title, found, of_study, bool(changed))])
 
 
 def cases(page: Page, data: str) -> str:
