@@ -50,13 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         faulthandler.enable()  # a simulator's native code may crash this process
     warnings.formatwarning = lambda message, *_, **__: f"csac: warning: {message}\n"
     try:
-        return _dispatch(list(sys.argv[1:] if arguments is None else arguments))
+        code = _dispatch(list(sys.argv[1:] if arguments is None else arguments))
     except (InputError, Failure) as error:
-        return complain(error, 2 if isinstance(error, InputError) else 1)
+        code = complain(error, 2 if isinstance(error, InputError) else 1)
     except KeyboardInterrupt as error:
-        return interrupted(error)
-    finally:
-        _flush()
+        code = interrupted(error)
+    return _flush() or code
 
 
 def _dispatch(words: list[str]) -> int:
@@ -86,9 +85,12 @@ def _prepare_streams() -> None:
             stream.reconfigure(errors="replace")
 
 
-def _flush() -> None:
-    """Flush stdout; a pipe that its reader closed (`csac runs | head`), or a full disk, is no error."""
+def _flush() -> int:
+    """Flush stdout and return the exit code; a pipe that its reader closed (`csac runs | head`) is no error."""
     try:
         sys.stdout.flush()
-    except OSError:
+        return 0
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        is_pipe = isinstance(error, BrokenPipeError)
+        return 0 if is_pipe else complain(f"standard output cannot be written: {error.strerror}", 1)

@@ -117,11 +117,11 @@ class Worker(Child):
         """Return the next answer or raise the worker's exception; raise EnvironmentFailure if the process is gone."""
         self.begin()
         try:
-            while not self._answers and not self.connection.poll(SECONDS_BETWEEN_CHECKS):
-                if self.process.exitcode is not None:  # a process that its task forked holds the pipe open
+            while not self._answers:
+                if self.connection.poll(SECONDS_BETWEEN_CHECKS):
+                    self._answers.extend(self.connection.recv())
+                elif self.process.exitcode is not None:  # a process that its task forked holds the pipe open
                     raise EOFError
-            if not self._answers:
-                self._answers.extend(self.connection.recv())
         except (EOFError, OSError):
             raise EnvironmentFailure(f"its environments' process: {self.cause_of_death()}") from None
         answer, error, details = self._answers.popleft()

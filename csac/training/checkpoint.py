@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import safetensors.numpy
 
-from csac.record.files import temporary_path, write_atomically
+from csac.record.files import TEMPORARY, temporary_path, write_atomically
 from csac.types import InputError, Snapshot
 
 if TYPE_CHECKING:
@@ -183,9 +183,9 @@ def prune(folder: Path, keep: int, newest: int | None = None) -> None:
             needed.update(Checkpoint.open(folder, step).files)
         except InputError:  # damaged, or a temporary disk failure: keep whatever it may need
             return
-    for path in [*folder.glob("step_*"), *folder.glob(".step_*")]:
-        if path.name not in {f"step_{step}" for step in kept}:
-            shutil.rmtree(path, ignore_errors=True)
+    others = [folder / f"step_{step}" for step in steps_in(folder) if step not in kept]
+    for path in [*others, *folder.glob(TEMPORARY)]:
+        shutil.rmtree(path, ignore_errors=True)
     for path in (folder / REPLAY).glob("*"):
         if f"{REPLAY}/{path.name}" not in needed:
             path.unlink(missing_ok=True)

@@ -128,8 +128,8 @@ def _restore(run: RunDirectory, point: ResumePoint) -> list[str]:
     checkpoint, notes = point.checkpoint, []
     if checkpoint:
         prune(run.checkpoints, 0, newest=checkpoint.step)
-    for path in run.checkpoints.glob("step_*") if not checkpoint else ():  # of seeds without a common one
-        shutil.rmtree(path)
+    for step in steps_in(run.checkpoints) if not checkpoint else ():  # of seeds without a common one
+        shutil.rmtree(run.checkpoints / f"step_{step}")
     for table in TABLES:
         path = run.table(table)
         if not checkpoint or path.name not in checkpoint.files:

@@ -166,10 +166,11 @@ def test_a_signal_saves_checkpoints_of_all_seeds(tmp_path, number, seeds):
     assert csac("evaluate runs --episodes 1") == 0
 
 
-def test_a_closed_standard_output_is_no_mistake():
-    command = f"{shlex.quote(sys.executable)} -m csac runs >&-"
+@pytest.mark.parametrize(("to", "code", "told"), [(">&-", 0, b""), (">/dev/full", 1, b"csac: standard output cannot")])
+def test_a_closed_standard_output_is_no_mistake_and_a_full_disk_is_one_line(to, code, told):
+    command = f"PYTHONUNBUFFERED= {shlex.quote(sys.executable)} -m csac runs {to}"
     process = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE)
-    assert (process.returncode, process.stderr) == (0, b"")
+    assert (process.returncode, process.stderr[:28]) == (code, told)
 
 
 def test_nobody_reading_is_no_error():

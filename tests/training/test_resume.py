@@ -297,6 +297,7 @@ def test_a_lost_manifest_is_taken_from_the_newest_checkpoint(tmp_path, stopped, 
     with pytest.warns(UserWarning, match=r"manifest\.json is lost or damaged"):
         again = csac.resume(tmp_path / "run")
     assert contents(again.runs[0])["evaluations.csv"] == whole["evaluations.csv"]
+    assert (stopped.checkpoints / "step_360.bak").exists()
 
 
 def test_lost_transitions_are_replaced_by_others_with_a_warning(tmp_path, stopped):
